@@ -1,0 +1,1 @@
+"""Putting source, learner and logs together: runs, sweeps, reproductions."""

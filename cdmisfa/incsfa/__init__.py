@@ -1,0 +1,1 @@
+"""Incremental slow feature analysis."""

@@ -1,0 +1,1 @@
+"""TOML presets that hold the paper's numbers, each with its source."""

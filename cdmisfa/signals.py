@@ -1,0 +1,167 @@
+"""`BlockSignals`: the one record of everything the learner thought in one iteration.
+
+Every consumer walks over its fields: the schema of run.mcap, Rerun's entities and
+layout, the columns of an export, the table of signals in the docs. Adding a signal
+is adding one field here and raising `SCHEMA_VERSION`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Show = Literal["line", "lane", "heat", "text", "hidden"]
+
+SCHEMA_VERSION = 1
+"""Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """What a field of `BlockSignals` is.
+
+    Attributes:
+        name: the field's name.
+        symbol: as the paper (or, in brackets, algorithm step) writes it.
+        equation: number of the paper's equation, or "" where it has none.
+        unit: physical or natural unit; "1" for a pure number.
+        dims: one letter a dimension: T frames of the block (tau), J outputs, M frozen
+            modules, S streams, A actions. "" is a scalar.
+        dtype: numpy name of the element type.
+        show: how a viewer shows it.
+        about: one sentence for a reader.
+    """
+
+    name: str
+    symbol: str
+    equation: str
+    unit: str
+    dims: str
+    dtype: str
+    show: Show
+    about: str
+
+
+def _signal(
+    symbol: str,
+    about: str,
+    *,
+    equation: str = "",
+    unit: str = "1",
+    dims: str = "",
+    dtype: str = "float64",
+    show: Show = "line",
+) -> Any:
+    return dataclasses.field(
+        metadata={
+            "symbol": symbol,
+            "equation": equation,
+            "unit": unit,
+            "dims": dims,
+            "dtype": dtype,
+            "show": show,
+            "about": about,
+        }
+    )
+
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class BlockSignals:
+    """Every internal signal of one iteration, that is of one block of tau frames.
+
+    A signal that does not exist in an iteration (y of a block that was not novel, a
+    reward in the warm-up) is NaN, never a made-up number. `R` has shape (0, 2, 0) when
+    there are more than `DENSE_STREAMS` streams.
+    """
+
+    iteration: int = _signal("k", "Iteration, from 0.", dtype="int64", show="hidden")
+    t: int = _signal("t", "Global frame counter of the block's first frame.", unit="frames", dtype="int64", show="hidden")
+    log_time: int = _signal("", "Log time of the block's first frame.", unit="ns", dtype="int64", show="hidden")
+    stream: int = _signal("s", "Stream that was watched, from 0.", dtype="int64", show="lane")
+    module: int = _signal("i", "Abstraction being learned, from 1.", dtype="int64", show="lane")
+    novel: bool = _signal("", "The gate let the block through to the abstraction.", dtype="bool", show="lane")
+    known_by: int = _signal("", "Frozen module that knows the block, from 1; 0 none, -1 the block is constant.", dtype="int64", show="lane")
+    saved: bool = _signal("", "The abstraction was saved at the end of the block.", dtype="bool", show="lane")
+    share: float = _signal("", "Running share of novel blocks since the abstraction was created.")
+    novel_blocks: int = _signal("", "Novel blocks since the abstraction was created.", unit="blocks", dtype="int64")
+    y: Float = _signal("y", "Output of the adaptive abstraction on the block.", equation="1", dims="TJ")
+    y_frozen: Float = _signal("y_i", "Output of each frozen module on the block.", equation="1", dims="MTJ")
+    eta: Float = _signal("η", "Slowness of each output.", equation="2", unit="1/frame", dims="J")
+    eta_dot: Float = _signal("η̇", "Running mean of the change of slowness; saved below δ.", equation="3", unit="1/frame", dims="J")
+    variance: Float = _signal("v_r", "Recent variance of each output.", dims="J")
+    eta_inst: Float = _signal("η^inst", "Slowness of each output within the block.", equation="4", unit="1/frame", dims="J")
+    gate_mean: Float = _signal("m", "Running mean of η^inst.", unit="1/frame", dims="J")
+    gate_sd: Float = _signal("SD", "Running standard deviation of η^inst.", unit="1/frame", dims="J")
+    eta_inst_frozen: Float = _signal("η_i^inst", "Slowness of each frozen module's outputs within the block.", equation="4", unit="1/frame", dims="MJ")
+    band_mean: Float = _signal("m_i", "Centre of each frozen module's band.", unit="1/frame", dims="MJ")
+    band_sd: Float = _signal("SD_i", "Standard deviation of each frozen module; known within 2 of them.", unit="1/frame", dims="MJ")
+    xi: float = _signal("⟨ξ⟩", "Mean change of the abstraction's weights over the block.", equation="5")
+    xi_dot: float = _signal("⟨ξ̇⟩", "Change of ⟨ξ⟩ since the novel block before.", equation="5")
+    curiosity: float = _signal("-⟨ξ̇⟩", "Curiosity reward.", equation="5")
+    expert: float = _signal("βZ(⟨ξ⟩)", "Expert reward.", equation="5")
+    reward: float = _signal("r", "Reward of the last transition.", equation="5")
+    R: Float = _signal("R", "Running reward function.", equation="6", dims="SAS", show="heat")
+    Q: Float = _signal("Q", "Action value function.", dims="SA", show="heat")
+    policy: Int = _signal("π", "Policy: 0 stay, 1 switch, for each stream.", dims="S", dtype="int64", show="lane")
+    epsilon: float = _signal("ε", "Probability (above 1: certainty) of a random action.")
+    explored: bool = _signal("", "The action was drawn at random.", dtype="bool", show="lane")
+    action: int = _signal("a", "Action taken after the block: 0 stay, 1 switch.", dtype="int64", show="lane")
+    next_stream: int = _signal("s'", "Stream watched next.", dtype="int64", show="lane")
+
+
+DENSE_STREAMS = 64
+"""With more streams than this the signal R is not kept as a dense tensor."""
+
+
+def signal_table() -> tuple[Signal, ...]:
+    """The description of every signal, in the record's order."""
+    return tuple(Signal(name=f.name, **f.metadata) for f in dataclasses.fields(BlockSignals))
+
+
+SIGNALS: Mapping[str, Signal] = {s.name: s for s in signal_table()}
+
+
+def values(signals: BlockSignals) -> Iterator[tuple[Signal, NDArray[Any]]]:
+    """Each signal with its value as an array of the documented type and number of dimensions."""
+    for signal in SIGNALS.values():
+        yield signal, np.asarray(getattr(signals, signal.name), dtype=signal.dtype)
+
+
+class SignalsHash:
+    """SHA-256 over the canonical bytes of all records in order.
+
+    Canonical: for each field, its shape as little-endian int64, then its elements in C
+    order as little-endian float64, int64 or one byte of a bool.
+    """
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+        self.count = 0
+
+    def add(self, signals: BlockSignals) -> None:
+        """Take the next record in."""
+        self._hash.update(canonical_bytes(signals))
+        self.count += 1
+
+    def hexdigest(self) -> str:
+        """The hash of what was taken in so far."""
+        return self._hash.hexdigest()
+
+
+def canonical_bytes(signals: BlockSignals) -> bytes:
+    """The bytes that stand for a record wherever runs are compared."""
+    parts: list[bytes] = []
+    for _, value in values(signals):
+        parts.append(np.array(value.shape, dtype="<i8").tobytes())
+        parts.append(np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<")).tobytes())
+    return b"".join(parts)

@@ -1,0 +1,1 @@
+"""The world: simulated streams, and writing what they show."""
