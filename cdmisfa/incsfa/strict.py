@@ -1,0 +1,158 @@
+"""IncSFA frame by frame, in plain order: the reference, and the fast path for few inputs.
+
+No reassociation, one thread: the same bits on every run, however frames are cut into
+calls. Across CPUs only the contraction of a*b+c may differ, and numba does not contract.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from cdmisfa.incsfa.state import (
+    PIXEL,
+    Float,
+    Params,
+    State,
+    amnesic_weight,
+    mca_step,
+    mean_rate,
+    rank_floor,
+    whitening_scale,
+)
+
+
+@njit(cache=True)
+def centre(frame: NDArray, scale: float, mean: Float, n: int, window: float, u: Float) -> None:  # type: ignore[type-arg]
+    """Take the n-th frame (from 1) into the mean and subtract it; the very first is not centred.
+
+    Args:
+        frame: (I,) as it came, times `scale`.
+        scale: 1 for values, 1/255 for pixels.
+        mean: (I,) updated in place.
+        n: number of this frame.
+        window: frames of the running mean.
+        u: (I,) receives the centred frame.
+    """
+    rate = mean_rate(n, window)
+    for i in range(mean.shape[0]):
+        x = frame[i] * scale
+        mean[i] += rate * (x - mean[i])
+        u[i] = x if n == 1 else x - mean[i]
+
+
+@njit(cache=True)
+def ccipca_step(v: Float, d: Float, weight: float, r: Float) -> None:
+    """Turn the vectors towards the principal components; r is left with what none explains.
+
+    v_j <- (1-w) v_j + w (r.v_j)/|v_j| r, then r <- r - (r.v_j) v_j / |v_j|^2.
+
+    Source: Weng et al. 2003.
+
+    Args:
+        v: (K, I) vectors, in place.
+        d: (K,) their lengths, in place.
+        weight: w, weight of the new frame.
+        r: (I,) the centred frame; overwritten.
+    """
+    K, D = v.shape
+    floor = rank_floor(d)
+    for j in range(K):
+        projection = 0.0
+        for i in range(D):
+            projection += r[i] * v[j, i]
+        keep = 1.0 - weight if d[j] > floor else 1.0
+        gain = weight * projection / d[j]
+        square = 0.0
+        projection = 0.0
+        for i in range(D):
+            v[j, i] = keep * v[j, i] + gain * r[i]
+            square += v[j, i] * v[j, i]
+            projection += r[i] * v[j, i]
+        d[j] = np.sqrt(square)
+        projection /= square
+        for i in range(D):
+            r[i] -= projection * v[j, i]
+
+
+@njit(cache=True)
+def whiten(v: Float, scale: Float, u: Float, z: Float) -> None:
+    """z_j = (u.v_j) |v_j|^-3/2, a component of unit variance.
+
+    Args:
+        v: (K, I) CCIPCA vectors.
+        scale: (K,) |v_j|^-3/2, 0 for rounding noise.
+        u: (I,) centred frame.
+        z: (K,) receives the whitened frame.
+    """
+    for j in range(v.shape[0]):
+        projection = 0.0
+        for i in range(v.shape[1]):
+            projection += u[i] * v[j, i]
+        z[j] = projection * scale[j]
+
+
+@njit(cache=True)
+def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> float:
+    """Set phi to w diag(scale) v; return xi, the length of its change.
+
+    Args:
+        w: (J, K) MCA rows.
+        scale: (K,) whitening scales.
+        v: (K, I) CCIPCA vectors.
+        phi: (J, I) weights, in place.
+        row: (I,) scratch.
+    """
+    xi = 0.0
+    for j in range(w.shape[0]):
+        row[:] = 0.0
+        for k in range(w.shape[1]):
+            factor = w[j, k] * scale[k]
+            for i in range(row.shape[0]):
+                row[i] += factor * v[k, i]
+        for i in range(row.shape[0]):
+            change = row[i] - phi[j, i]
+            xi += change * change
+            phi[j, i] = row[i]
+    return float(np.sqrt(xi))
+
+
+@njit(cache=True)
+def update(state: State, params: Params, frames: NDArray, gap: bool, xi: Float) -> None:  # type: ignore[type-arg]
+    """Learn from consecutive frames.
+
+    The first frame after a gap, and the very first, update mean and whitening only.
+
+    Args:
+        state: changed in place.
+        params: constants of the rule.
+        frames: (n, I) float64 values or uint8 pixels; not changed.
+        gap: the first frame does not follow the last one of the call before.
+        xi: (n,) receives the change of phi at each frame, NaN after a gap.
+    """
+    n_frames, D = frames.shape
+    K = state.d.shape[0]
+    pixel = PIXEL if frames.itemsize == 1 else 1.0
+    u, r, row = np.empty(D), np.empty(D), np.empty(D)
+    z, z_dot, scale, step = np.empty(K), np.empty(K), np.empty(K), np.empty(K)
+    for t in range(n_frames):
+        state.counts[0] += 1
+        n = state.counts[0]
+        centre(frames[t], pixel, state.mean, n, params.mean_window, u)
+        r[:] = u
+        ccipca_step(state.v, state.d, amnesic_weight(n), r)
+        floor = rank_floor(state.d)
+        for k in range(K):
+            scale[k] = whitening_scale(state.d[k], floor)
+        whiten(state.v, scale, u, z)
+        for k in range(K):
+            z_dot[k] = z[k] - state.z_prev[k]
+            state.z_prev[k] = z[k]
+        if n == 1 or (gap and t == 0):
+            xi[t] = np.nan
+            state.counts[1] = 1
+        else:
+            mca_step(state.w, z_dot, params.nu, step)
+            xi[t] = slow_features(state.w, scale, state.v, state.phi, row)
+            state.counts[1] = 0
