@@ -1,0 +1,268 @@
+"""One run: a source, a learner, and the folder that keeps what happened.
+
+RUN/run.mcap signals, RUN/modules.npz frozen modules, RUN/run.json manifest and result,
+RUN/run.rrd the view. The loop knows nothing of where blocks come from.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.config import LearnerConfig, as_table
+from cdmisfa.errors import LogExhaustedError, UsageError
+from cdmisfa.learner import CuriousLearner
+from cdmisfa.modules import Module
+from cdmisfa.signals import SCHEMA_VERSION, SignalsHash
+
+ENDINGS: Mapping[str, str] = {
+    "max_modules": "as many modules as asked for were learned",
+    "max_iterations": "the asked number of iterations is over",
+    "nothing_left": "exploration ended long ago and no further abstraction converged",
+    "log_exhausted": "the recording ended",
+    "interrupted": "it was interrupted",
+}
+"""Why a run ended."""
+
+PACKAGES = ("cdmisfa", "numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a run stands: iterations and frames so far, modules learned, epsilon."""
+
+    iteration: int
+    frames: int
+    modules: int
+    epsilon: float
+    max_iterations: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """What a run came to; `as_json` is the command line's contract."""
+
+    run: str | None
+    source: Mapping[str, Any]
+    streams: tuple[str, ...]
+    seed: int
+    iterations: int
+    frames: int
+    signals_sha256: str
+    modules: tuple[Module, ...]
+    final_policy: tuple[int, ...]
+    epsilon: float
+    ended: str
+    truth: tuple[str, ...] = field(default=())
+
+    def as_json(self) -> dict[str, Any]:
+        """The result as `learn --json` prints it."""
+        return {
+            "schema": 1,
+            "run": self.run,
+            "source": dict(self.source),
+            "seed": self.seed,
+            "iterations": self.iterations,
+            "frames": self.frames,
+            "signals_sha256": self.signals_sha256,
+            "modules": [
+                {
+                    "index": m.index,
+                    "stream": self.streams[m.stream],
+                    "stream_index": m.stream,
+                    "iteration": m.iteration,
+                    "policy": m.policy.tolist(),
+                    "eta": m.eta.tolist(),
+                }
+                for m in self.modules
+            ],
+            "final_policy": list(self.final_policy),
+            "epsilon": self.epsilon,
+            "ended": self.ended,
+        }
+
+
+def learn(
+    source: FrameSource,
+    config: LearnerConfig,
+    out: Path | None = None,
+    *,
+    seed: int = 0,
+    max_iterations: int | None = None,
+    max_modules: int | None = None,
+    sections: Mapping[str, Any] | None = None,
+    force: bool = False,
+    rerun: bool = True,
+    progress: Callable[[Progress], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> RunResult:
+    """Learn from a source until nothing is left to learn, and log every signal.
+
+    Args:
+        source: live or recorded; left open.
+        config: the learner's configuration.
+        out: folder of the run, or None to log nothing.
+        seed: seed of the policy and of the abstractions' first weights.
+        max_iterations: end after so many.
+        max_modules: end after so many modules; by default as many as there are streams.
+        sections: further configuration tables (`scene`, `record`) for the manifest.
+        force: replace an existing run.
+        rerun: also build the Rerun view.
+        progress: called after every iteration.
+        stop: asked after every iteration; true ends the run cleanly.
+
+    Raises:
+        UsageError: `out` exists and `force` is not set.
+        LogExhaustedError: a recording ended first; what was learned is saved.
+    """
+    learner = CuriousLearner(config, source.spec, seed)
+    limit = max_modules if max_modules is not None else len(source.spec.streams)
+    digest = SignalsHash()
+    tables = {**(sections or {}), "learner": as_table(config)}
+    exhausted: LogExhaustedError | None = None
+    with _run_log(out, source, tables, seed, force) as log:
+        while True:
+            ended = _ending(learner, limit, max_iterations, stop)
+            if ended:
+                break
+            try:
+                block = source.take(learner.stream, learner.tau)
+            except LogExhaustedError as error:
+                ended, exhausted = "log_exhausted", error
+                break
+            learned = len(learner.modules)
+            signals = learner.step(block)
+            digest.add(signals)
+            if log is not None:
+                log.block(signals, block, learner.modules[-1].phi if signals.saved else learner.phi)
+                if len(learner.modules) > learned:
+                    log.event(block.t, signals.iteration, _saved_text(learner, source))
+            if progress is not None:
+                progress(
+                    Progress(
+                        learner.iteration,
+                        learner.iteration * learner.tau,
+                        len(learner.modules),
+                        learner.epsilon,
+                        max_iterations,
+                    )
+                )
+        if log is not None:
+            log.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
+    result = RunResult(
+        run=str(out) if out is not None else None,
+        source=source.describe(),
+        streams=source.spec.streams,
+        seed=seed,
+        iterations=learner.iteration,
+        frames=learner.iteration * learner.tau,
+        signals_sha256=digest.hexdigest(),
+        modules=tuple(learner.modules),
+        final_policy=tuple(learner.policy.tolist()),
+        epsilon=learner.epsilon,
+        ended=ended,
+        truth=source.spec.truth,
+    )
+    if out is not None:
+        _write_run(out, result, tables, rerun)
+    if exhausted is not None:
+        kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {out}"
+        raise LogExhaustedError(f"{exhausted}{kept if out is not None else ''}") from exhausted
+    return result
+
+
+def _ending(
+    learner: CuriousLearner, limit: int, max_iterations: int | None, stop: Callable[[], bool]
+) -> str:
+    if len(learner.modules) >= limit:
+        return "max_modules"
+    if max_iterations is not None and learner.iteration >= max_iterations:
+        return "max_iterations"
+    if learner.exhausted:
+        return "nothing_left"
+    return "interrupted" if stop() else ""
+
+
+def _saved_text(learner: CuriousLearner, source: FrameSource) -> str:
+    module = learner.modules[-1]
+    return (
+        f"module {module.index} saved on stream {source.spec.streams[module.stream]}, "
+        f"policy {module.policy.tolist()}"
+    )
+
+
+@contextlib.contextmanager
+def _run_log(
+    out: Path | None, source: FrameSource, tables: Mapping[str, Any], seed: int, force: bool
+) -> Iterator[Any]:
+    """The run's log, finished on success, a readable prefix on failure; None for no folder."""
+    if out is None:
+        yield None
+        return
+    from replay.runlog import RunWriter
+
+    if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("run.json", "modules.npz", "run.rrd"):
+        (out / name).unlink(missing_ok=True)
+    manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
+    log = RunWriter(out / "run.mcap", source.spec, manifest, force=force)
+    try:
+        yield log
+    except BaseException:
+        log.abandon()
+        raise
+    log.finish()
+
+
+def _write_run(
+    out: Path, result: RunResult, tables: Mapping[str, Any], rerun: bool
+) -> None:
+    from replay.modules import save_modules
+
+    save_modules(out / "modules.npz", result.modules)
+    document = {
+        "schema": 1,
+        "signals_schema": SCHEMA_VERSION,
+        "config": tables,
+        "seed": result.seed,
+        "source": dict(result.source),
+        "streams": list(result.streams),
+        "versions": versions(),
+        "platform": {"system": platform.system(), "machine": platform.machine()},
+        "result": result.as_json(),
+    }
+    write_json(out / "run.json", document)
+    if rerun:
+        from replay.view import build_view
+
+        build_view(out, out / "run.rrd")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages a result may depend on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document so that the file is never seen half written."""
+    partial = path.with_name(path.name + ".partial")
+    with open(partial, "w", encoding="utf-8") as file:
+        json.dump(document, file, indent=2)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
