@@ -1,0 +1,175 @@
+"""The group of commands, and how every way out of them becomes an exit code.
+
+A command's module is imported only when that command runs, so that `--help` and
+completion never wait for numpy, numba, PyBullet or Rerun.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+import click
+
+from cdmisfa.errors import CdmisfaError
+
+INTERRUPTED = 128
+"""Exit code of a process ended by signal N is this plus N: 130 for Ctrl-C, 143 for SIGTERM."""
+
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "record": ("record", "Record what a scene shows, one MCAP file per view."),
+    "learn": ("learn", "Learn slow feature modules from a scene or a recording."),
+    "view": ("view", "Open a run in the Rerun viewer, or save, serve or picture it."),
+    "info": ("logs", "Say what is in a recording, a run or any MCAP file."),
+    "verify": ("logs", "Check that a log is whole: structure, checksums, no gaps."),
+    "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
+    "compare": ("runs", "Check that two runs' signals are the same, bit for bit."),
+    "plot": ("runs", "Draw the figures of a run."),
+    "export": ("runs", "Write a run's signals as Parquet, NumPy, CSV or Arrow."),
+    "signals": ("signals", "List every signal that a run records."),
+    "demo": ("demo", "Record, learn, check and show: the whole story in minutes."),
+    "doctor": ("doctor", "Say what this machine has and what it lacks."),
+}
+"""Each command with its module in this package and its line of help."""
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module only when the command is wanted."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order in which a user meets them."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f"cdmisfa.cli.{COMMANDS[cmd_name][0]}")
+        command: click.Command = getattr(module, f"{cmd_name}_command")
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command, or name the nearest one."""
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            close = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f": did you mean {close[0]}?" if close else ""
+            ctx.fail(f"no command {args[0]!r}{hint}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="cdmisfa", message="cdmisfa %(version)s")
+def cli() -> None:
+    """Record what a curious robot sees, learn from it live or from the log, and look.
+
+    Every command that prints takes --json: one document on stdout, nothing else.
+    """
+
+
+def main() -> NoReturn:
+    """Run the command line of this process."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(args: Sequence[str]) -> int:
+    """Run one command and return its exit code; no exception but SystemExit's comes out.
+
+    With CDMISFA_TRACEBACK=1 in the environment errors keep their traceback.
+    """
+    with _signals_interrupt() as received:
+        try:
+            cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
+            sys.stdout.flush()
+        except click.exceptions.Exit as end:
+            return end.exit_code
+        except (click.Abort, KeyboardInterrupt):
+            number = received[-1] if received else signal.SIGINT
+            return _fail("interrupted", INTERRUPTED + number)
+        except BrokenPipeError:
+            _drop_stdout()
+            return 1
+        except SystemExit as end:
+            return end.code if isinstance(end.code, int) else 1
+        except Exception as error:
+            if os.environ.get("CDMISFA_TRACEBACK") == "1":
+                raise
+            return _explain(error)
+    return 0
+
+
+def _explain(error: Exception) -> int:
+    match error:
+        case CdmisfaError():
+            return _fail(str(error), error.exit_code)
+        case click.exceptions.NoArgsIsHelpError():
+            click.echo(error.format_message(), err=True)
+            return error.exit_code
+        case click.UsageError():
+            command = error.ctx.command_path if error.ctx else "cdmisfa"
+            message = error.format_message().rstrip(".")
+            return _fail(f"{message} (see {command} --help)", error.exit_code)
+        case click.ClickException():
+            return _fail(error.format_message(), error.exit_code)
+        case OSError():
+            where = f"{error.filename}: " if error.filename else ""
+            return _fail(f"{where}{error.strerror or error}", 1)
+        case MemoryError():
+            return _fail("out of memory", 1)
+        case _:
+            return _fail(
+                f"unexpected {type(error).__name__}: {error} "
+                "(please report it; CDMISFA_TRACEBACK=1 shows where)",
+                1,
+            )
+
+
+def _fail(message: str, code: int) -> int:
+    line = " ".join(message.split())
+    click.echo(f"cdmisfa: {line}", err=True)
+    return code
+
+
+def _drop_stdout() -> None:
+    """Keep the interpreter from flushing into the closed pipe when it ends."""
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[list[int]]:
+    """Make SIGTERM and SIGINT raise KeyboardInterrupt, so that open files are finished.
+
+    Yields the numbers of the signals that came.
+    """
+    received: list[int] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        before = {n: signal.signal(n, interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not the main thread: signals are not ours to handle
+        yield received
+        return
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,118 @@
+"""Options that several commands share, and how results are printed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+Decorator = Callable[[Command], Command]
+
+SCHEMA = 1
+"""Version of the JSON documents; rises when a key changes its meaning or goes away."""
+
+
+def as_json(command: Command) -> Command:
+    """`--json`: one JSON document on stdout instead of words."""
+    return click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
+    )(command)
+
+
+def seed(command: Command) -> Command:
+    """`--seed`: where every random generator of the command starts."""
+    return click.option(
+        "--seed",
+        type=click.IntRange(0, 2**63 - 1),
+        default=0,
+        show_default=True,
+        help="Seed of every random choice.",
+    )(command)
+
+
+def settings(command: Command) -> Command:
+    """`--set key=value`, any number of times."""
+    return click.option(
+        "--set",
+        "settings",
+        multiple=True,
+        metavar="KEY=VALUE",
+        help="Set a configuration key, as learner.nu=0.02; may be repeated.",
+    )(command)
+
+
+def preset(command: Command) -> Command:
+    """`--preset`: a named configuration or a TOML file."""
+    return click.option(
+        "--preset",
+        metavar="NAME",
+        help="Preset (icub, oscillatory) or a .toml file; by default the one of the source.",
+    )(command)
+
+
+def force(command: Command) -> Command:
+    """`--force`: permission to overwrite."""
+    return click.option("--force", is_flag=True, help="Overwrite what is already there.")(command)
+
+
+def out(meaning: str, *, required: bool = False) -> Decorator[Command]:
+    """`-o`: where the result goes."""
+    return click.option(
+        "-o", "--out", type=click.Path(path_type=Path), required=required, help=meaning
+    )
+
+
+def jobs(command: Command) -> Command:
+    """`--jobs`: parallel processes."""
+    return click.option(
+        "--jobs",
+        type=click.IntRange(1, 1024),
+        default=1,
+        show_default=True,
+        help="Parallel processes.",
+    )(command)
+
+
+def path_argument(name: str) -> Decorator[Command]:
+    """A path; whether it exists is for the library to say, in its own words."""
+    return click.argument(name, type=click.Path(path_type=Path))
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """One JSON document on stdout; what JSON has no number for (NaN) becomes null."""
+    click.echo(json.dumps(_plain(document), ensure_ascii=False, allow_nan=False))
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """A plain table in aligned columns on stdout."""
+    click.echo(table(head, rows))
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Rows of cells in aligned columns under a ruled head."""
+    cells = [[str(cell) for cell in row] for row in (head, *rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in cells]
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case Mapping():
+            return {str(k): _plain(v) for k, v in value.items()}
+        case float():
+            return value if math.isfinite(value) else None
+        case Path():
+            return str(value)
+        case list() | tuple():
+            return [_plain(v) for v in value]
+        case _ if hasattr(value, "tolist"):
+            return _plain(value.tolist())
+        case _:
+            return value

@@ -1,0 +1,69 @@
+"""Progress on stderr: a bar with rate and time left on a terminal, nothing elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import click
+
+Advance = Callable[[int], None]
+
+
+class Bar:
+    """What a command reports to: how far it is, and lines worth reading."""
+
+    def update(self, done: float, note: str = "") -> None:
+        """So much is done in all; `note` stands behind the bar."""
+
+    def say(self, line: str) -> None:
+        """A line that stays, above the bar."""
+        click.echo(line, err=True)
+
+
+@contextmanager
+def bar(title: str, total: float | None, unit: str) -> Iterator[Bar]:
+    """Show progress while the body runs, if anyone is looking.
+
+    Args:
+        title: what is being done.
+        total: how much there is to do, or None where nobody knows.
+        unit: of what `Bar.update` counts.
+    """
+    if not sys.stderr.isatty():
+        yield Bar()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+    from rich.progress import TimeElapsedColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            speed = task.finished_speed or task.speed
+            return Text("" if speed is None else f"{speed:,.0f} {unit}/s")
+
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:,.0f}"),
+        Rate(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=Console(stderr=True),
+        transient=True,
+    )
+
+    class TerminalBar(Bar):
+        def update(self, done: float, note: str = "") -> None:
+            progress.update(task, completed=done, note=note)
+
+        def say(self, line: str) -> None:
+            progress.console.print(line, markup=False, highlight=False)
+
+    with progress:
+        task = progress.add_task(title, total=total, note="")
+        yield TerminalBar()
