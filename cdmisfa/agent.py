@@ -132,20 +132,27 @@ def rules(config: LearnerConfig, n_streams: int) -> Rules:
 
 def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent:
     """An agent that has seen nothing and will watch `first_stream`."""
-    outputs, dense = config.outputs, n_streams if n_streams <= DENSE_STREAMS else 0
+    outputs = config.outputs
+    dense = n_streams if n_streams <= DENSE_STREAMS else 0
     memory = np.zeros(1, MEMORY)
-    per_output = [np.zeros(outputs) for _ in range(8)]
     agent = Agent(
-        memory,
-        *per_output,
-        np.zeros(1, np.int64),
-        np.zeros(outputs),
-        np.zeros(outputs),
-        np.zeros(n_streams),
-        np.zeros(n_streams),
-        np.zeros((dense, 2, dense)),
-        np.zeros(n_streams, np.int64),
-        np.zeros((n_streams, 2)),
+        memory=memory,
+        eta=np.zeros(outputs),
+        eta_dot=np.zeros(outputs),
+        eta_inst=np.zeros(outputs),
+        gate_mean=np.zeros(outputs),
+        gate_variance=np.zeros(outputs),
+        derivative=np.zeros(outputs),
+        y_sum=np.zeros(outputs),
+        square_sum=np.zeros(outputs),
+        y_frames=np.zeros(1, np.int64),
+        recent_mean=np.zeros(outputs),
+        recent_square=np.zeros(outputs),
+        stay_sum=np.zeros(n_streams),
+        switch_sum=np.zeros(n_streams),
+        dense=np.zeros((dense, 2, dense)),
+        policy=np.zeros(n_streams, np.int64),
+        Q=np.zeros((n_streams, 2)),
     )
     memory["last_stream"] = -1
     memory["stream"] = first_stream
@@ -155,7 +162,7 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
 
 @compiled
 def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
-    """Forget everything that belongs to the abstraction before; R, policy and epsilon start anew."""
+    """Forget everything that belongs to the abstraction before; all statistics start anew."""
     m = agent.memory[0]
     m["module"] += 1
     m["fed_stream"] = -1
@@ -188,7 +195,7 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
 def has_gap(agent: Agent, stream: int, t: int) -> bool:
     """Whether a novel block does not continue the last novel one frame by frame."""
     m = agent.memory[0]
-    return m["fed_stream"] != stream or m["fed_until"] != t
+    return bool(m["fed_stream"] != stream or m["fed_until"] != t)
 
 
 @compiled
@@ -206,7 +213,7 @@ def mean_change(xi: Float) -> float:
 @compiled
 def recent_variance(agent: Agent, j: int) -> float:
     """Variance of output j over the slowness window."""
-    return agent.recent_square[j] - agent.recent_mean[j] ** 2
+    return float(agent.recent_square[j] - agent.recent_mean[j] ** 2)
 
 
 @compiled

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -12,4 +12,4 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def compiled(function: Function) -> Function:
     """Compile strictly (no reordering of floating point) and keep the result on disk."""
-    return numba.njit(cache=True)(function)  # type: ignore[no-any-return]
+    return cast(Function, numba.njit(cache=True)(function))

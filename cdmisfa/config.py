@@ -175,7 +175,9 @@ def build(
                     raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
                 nested.setdefault(name, []).append({rest: value} if dot else value)
             elif dot:
-                raise UsageError(f"unknown key {prefix}.{key}: {prefix}.{name} has no keys of its own")
+                raise UsageError(
+                    f"unknown key {prefix}.{key}: {prefix}.{name} has no keys of its own"
+                )
             else:
                 values[name] = convert(value, hints[name], f"{prefix}.{name}")
     for name, parts in nested.items():
@@ -203,7 +205,11 @@ def convert(value: Any, hint: Any, key: str) -> Any:
             return None
         return convert(value, next(a for a in arguments if a is not types.NoneType), key)
     if origin is tuple:
-        parts = [p for p in value.strip("()[] ").split(",") if p.strip()] if isinstance(value, str) else value
+        parts = (
+            [p for p in value.strip("()[] ").split(",") if p.strip()]
+            if isinstance(value, str)
+            else value
+        )
         if not isinstance(parts, list | tuple):
             raise UsageError(f"{key} is {value}: it must be a list")
         inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)

@@ -85,37 +85,93 @@ class BlockSignals:
     """
 
     iteration: int = _signal("k", "Iteration, from 0.", dtype="int64", show="hidden")
-    t: int = _signal("t", "Global frame counter of the block's first frame.", unit="frames", dtype="int64", show="hidden")
-    log_time: int = _signal("", "Log time of the block's first frame.", unit="ns", dtype="int64", show="hidden")
+    t: int = _signal(
+        "t",
+        "Global frame counter of the block's first frame.",
+        unit="frames",
+        dtype="int64",
+        show="hidden",
+    )
+    log_time: int = _signal(
+        "", "Log time of the block's first frame.", unit="ns", dtype="int64", show="hidden"
+    )
     stream: int = _signal("s", "Stream that was watched, from 0.", dtype="int64", show="lane")
     module: int = _signal("i", "Abstraction being learned, from 1.", dtype="int64", show="lane")
-    novel: bool = _signal("", "The gate let the block through to the abstraction.", dtype="bool", show="lane")
-    known_by: int = _signal("", "Frozen module that knows the block, from 1; 0 none, -1 the block is constant.", dtype="int64", show="lane")
-    saved: bool = _signal("", "The abstraction was saved at the end of the block.", dtype="bool", show="lane")
+    novel: bool = _signal(
+        "", "The gate let the block through to the abstraction.", dtype="bool", show="lane"
+    )
+    known_by: int = _signal(
+        "",
+        "Frozen module that knows the block, from 1; 0 none, -1 the block is constant.",
+        dtype="int64",
+        show="lane",
+    )
+    saved: bool = _signal(
+        "", "The abstraction was saved at the end of the block.", dtype="bool", show="lane"
+    )
     share: float = _signal("", "Running share of novel blocks since the abstraction was created.")
-    novel_blocks: int = _signal("", "Novel blocks since the abstraction was created.", unit="blocks", dtype="int64")
-    y: Float = _signal("y", "Output of the adaptive abstraction on the block.", equation="1", dims="TJ")
-    y_frozen: Float = _signal("y_i", "Output of each frozen module on the block.", equation="1", dims="MTJ")
+    novel_blocks: int = _signal(
+        "", "Novel blocks since the abstraction was created.", unit="blocks", dtype="int64"
+    )
+    y: Float = _signal(
+        "y", "Output of the adaptive abstraction on the block.", equation="1", dims="TJ"
+    )
+    y_frozen: Float = _signal(
+        "y_i", "Output of each frozen module on the block.", equation="1", dims="MTJ"
+    )
     eta: Float = _signal("η", "Slowness of each output.", equation="2", unit="1/frame", dims="J")
-    eta_dot: Float = _signal("η̇", "Running mean of the change of slowness; saved below δ.", equation="3", unit="1/frame", dims="J")
+    eta_dot: Float = _signal(
+        "η̇",
+        "Running mean of the change of slowness; saved below δ.",
+        equation="3",
+        unit="1/frame",
+        dims="J",
+    )
     variance: Float = _signal("v_r", "Recent variance of each output.", dims="J")
-    eta_inst: Float = _signal("η^inst", "Slowness of each output within the block.", equation="4", unit="1/frame", dims="J")
+    eta_inst: Float = _signal(
+        "η^inst",
+        "Slowness of each output within the block.",
+        equation="4",
+        unit="1/frame",
+        dims="J",
+    )
     gate_mean: Float = _signal("m", "Running mean of η^inst.", unit="1/frame", dims="J")
-    gate_sd: Float = _signal("SD", "Running standard deviation of η^inst.", unit="1/frame", dims="J")
-    eta_inst_frozen: Float = _signal("η_i^inst", "Slowness of each frozen module's outputs within the block.", equation="4", unit="1/frame", dims="MJ")
-    band_mean: Float = _signal("m_i", "Centre of each frozen module's band.", unit="1/frame", dims="MJ")
-    band_sd: Float = _signal("SD_i", "Standard deviation of each frozen module; known within 2 of them.", unit="1/frame", dims="MJ")
-    xi: float = _signal("⟨ξ⟩", "Mean change of the abstraction's weights over the block.", equation="5")
+    gate_sd: Float = _signal(
+        "SD", "Running standard deviation of η^inst.", unit="1/frame", dims="J"
+    )
+    eta_inst_frozen: Float = _signal(
+        "η_i^inst",
+        "Slowness of each frozen module's outputs within the block.",
+        equation="4",
+        unit="1/frame",
+        dims="MJ",
+    )
+    band_mean: Float = _signal(
+        "m_i", "Centre of each frozen module's band.", unit="1/frame", dims="MJ"
+    )
+    band_sd: Float = _signal(
+        "SD_i",
+        "Standard deviation of each frozen module; known within 2 of them.",
+        unit="1/frame",
+        dims="MJ",
+    )
+    xi: float = _signal(
+        "⟨ξ⟩", "Mean change of the abstraction's weights over the block.", equation="5"
+    )
     xi_dot: float = _signal("⟨ξ̇⟩", "Change of ⟨ξ⟩ since the novel block before.", equation="5")
     curiosity: float = _signal("-⟨ξ̇⟩", "Curiosity reward.", equation="5")
     expert: float = _signal("βZ(⟨ξ⟩)", "Expert reward.", equation="5")
     reward: float = _signal("r", "Reward of the last transition.", equation="5")
     R: Float = _signal("R", "Running reward function.", equation="6", dims="SAS", show="heat")
     Q: Float = _signal("Q", "Action value function.", dims="SA", show="heat")
-    policy: Int = _signal("π", "Policy: 0 stay, 1 switch, for each stream.", dims="S", dtype="int64", show="lane")
+    policy: Int = _signal(
+        "π", "Policy: 0 stay, 1 switch, for each stream.", dims="S", dtype="int64", show="lane"
+    )
     epsilon: float = _signal("ε", "Probability (above 1: certainty) of a random action.")
     explored: bool = _signal("", "The action was drawn at random.", dtype="bool", show="lane")
-    action: int = _signal("a", "Action taken after the block: 0 stay, 1 switch.", dtype="int64", show="lane")
+    action: int = _signal(
+        "a", "Action taken after the block: 0 stay, 1 switch.", dtype="int64", show="lane"
+    )
     next_stream: int = _signal("s'", "Stream watched next.", dtype="int64", show="lane")
 
 
