@@ -6,22 +6,18 @@ completion never wait for numpy, numba, PyBullet or Rerun.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import os
-import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Mapping, Sequence
 from typing import NoReturn
 
 import click
 
+from cdmisfa.cli.interrupts import interruptible
 from cdmisfa.errors import CdmisfaError
-
-INTERRUPTED = 128
-"""Exit code of a process ended by signal N is this plus N: 130 for Ctrl-C, 143 for SIGTERM."""
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene shows, one MCAP file per view."),
@@ -90,15 +86,14 @@ def run(args: Sequence[str]) -> int:
 
     With CDMISFA_TRACEBACK=1 in the environment errors keep their traceback.
     """
-    with _signals_interrupt() as received:
+    with interruptible() as stop:
         try:
             cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
             sys.stdout.flush()
         except click.exceptions.Exit as end:
             return end.exit_code
         except (click.Abort, KeyboardInterrupt):
-            number = received[-1] if received else signal.SIGINT
-            return _fail("interrupted", INTERRUPTED + number)
+            return _fail("interrupted", stop.exit_code)
         except BrokenPipeError:
             _drop_stdout()
             return 1
@@ -145,31 +140,5 @@ def _fail(message: str, code: int) -> int:
 
 def _drop_stdout() -> None:
     """Keep the interpreter from flushing into the closed pipe when it ends."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, ValueError):
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")
-
-
-@contextmanager
-def _signals_interrupt() -> Iterator[list[int]]:
-    """Make SIGTERM and SIGINT raise KeyboardInterrupt, so that open files are finished.
-
-    Yields the numbers of the signals that came.
-    """
-    received: list[int] = []
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        raise KeyboardInterrupt
-
-    try:
-        before = {n: signal.signal(n, interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not the main thread: signals are not ours to handle
-        yield received
-        return
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 import click
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-Decorator = Callable[[Command], Command]
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -60,7 +59,7 @@ def force(command: Command) -> Command:
     return click.option("--force", is_flag=True, help="Overwrite what is already there.")(command)
 
 
-def out(meaning: str, *, required: bool = False) -> Decorator[Command]:
+def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:
     """`-o`: where the result goes."""
     return click.option(
         "-o", "--out", type=click.Path(path_type=Path), required=required, help=meaning
@@ -78,7 +77,7 @@ def jobs(command: Command) -> Command:
     )(command)
 
 
-def path_argument(name: str) -> Decorator[Command]:
+def path_argument(name: str) -> Callable[[Command], Command]:
     """A path; whether it exists is for the library to say, in its own words."""
     return click.argument(name, type=click.Path(path_type=Path))
 

@@ -38,7 +38,7 @@ def _page(version: int, columns: tuple[str, ...], rows: list[list[str]]) -> str:
         [
             "# Signals",
             "",
-            "Made by `cdmisfa signals --markdown`; a test fails when this page and the code differ.",
+            "Made by `cdmisfa signals --markdown`; a test fails when page and code differ.",
             f"Version {version} of the record. One record is one iteration, that is one block of",
             "T = `learner.tau` frames. A signal that does not exist in an iteration is NaN.",
             "",

@@ -1,0 +1,120 @@
+"""`cdmisfa doctor`: what this machine has, what it lacks, and what to do about it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+
+PACKAGES = ("numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
+"""Packages that no command can do without for long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing looked at; `needed_for` is empty where everything needs it."""
+
+    what: str
+    ok: bool
+    detail: str
+    needed_for: str = ""
+
+
+@click.command("doctor")
+@options.as_json
+@click.pass_context
+def doctor_command(ctx: click.Context, as_json: bool) -> None:
+    """Say what this machine has and what it lacks.
+
+    Exits with 1 when something is missing that every command needs.
+    """
+    checks = [check for look in LOOKS for check in look()]
+    ok = all(check.ok or check.needed_for for check in checks)
+    if as_json:
+        rows = [
+            {"what": c.what, "ok": c.ok, "detail": c.detail, "needed_for": c.needed_for}
+            for c in checks
+        ]
+        options.print_json({"schema": options.SCHEMA, "ok": ok, "checks": rows})
+    else:
+        words = [(("missing", "ok")[c.ok], c.what, c.detail, c.needed_for) for c in checks]
+        options.print_table(("", "what", "detail", "needed for"), words)
+    if not ok:
+        ctx.exit(1)
+
+
+def _python() -> Iterator[Check]:
+    version = platform.python_version()
+    yield Check("python", sys.version_info >= (3, 11), f"{version}, {platform.machine()}")
+
+
+def _packages() -> Iterator[Check]:
+    for name in ("cdmisfa", *PACKAGES):
+        try:
+            yield Check(name, True, metadata.version(name))
+        except metadata.PackageNotFoundError:
+            yield Check(name, False, f"pip install {name}")
+
+
+def _simulator() -> Iterator[Check]:
+    for name, module in (("pybullet", "pybullet"), ("icub-models", "icub_models")):
+        if importlib.util.find_spec(module) is not None:
+            try:
+                detail = metadata.version(name)
+            except metadata.PackageNotFoundError:
+                detail = "unknown version"
+            yield Check(name, True, detail, "the icub scene")
+        else:
+            remedy = f"pip install {name} (PyBullet has wheels for Python 3.11 and older)"
+            yield Check(name, False, remedy, "the icub scene")
+
+
+def _kernel_cache() -> Iterator[Check]:
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "__pycache__")
+    nearest = next(p for p in (folder, *folder.parents) if p.exists())
+    writable = os.access(nearest, os.W_OK)
+    detail = str(folder) if writable else f"{folder} is read-only: set NUMBA_CACHE_DIR"
+    yield Check("kernel cache", writable, detail, "a quick start the second time")
+
+
+def _vulkan() -> Iterator[Check]:
+    drivers = sorted(vulkan_drivers())
+    detail = ", ".join(d.stem for d in drivers) or "apt-get install mesa-vulkan-drivers"
+    yield Check("vulkan driver", bool(drivers), detail, "view --screenshot without a screen")
+
+
+def vulkan_drivers() -> Iterator[Path]:
+    """Manifests of the Vulkan drivers that a loader would find."""
+    chosen = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    if chosen:
+        yield from (p for p in map(Path, chosen.split(os.pathsep)) if p.exists())
+        return
+    shared = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    for folder in ("/etc", *shared.split(os.pathsep)):
+        yield from Path(folder, "vulkan", "icd.d").glob("*.json")
+
+
+def _screen() -> Iterator[Check]:
+    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    has = bool(shown) or sys.platform in ("darwin", "win32")
+    detail = shown or ("native" if has else "none: use view --web, --save or --screenshot")
+    yield Check("screen", has, detail, "view in a window")
+
+
+LOOKS: tuple[Callable[[], Iterator[Check]], ...] = (
+    _python,
+    _packages,
+    _simulator,
+    _kernel_cache,
+    _vulkan,
+    _screen,
+)

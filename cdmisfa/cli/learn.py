@@ -1,0 +1,131 @@
+"""`cdmisfa learn`: learn modules from a live scene or a recording."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.progress import Bar, bar
+
+if TYPE_CHECKING:
+    from cdmisfa.experiments.run import Progress, RunResult
+
+TICK = 0.1
+"""Seconds between two updates of the bar: a block may take only microseconds."""
+
+
+@click.command("learn")
+@click.argument("source", nargs=-1, required=True)
+@options.out("Folder of the run; without it nothing is written.")
+@options.seed
+@options.preset
+@options.settings
+@click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
+@click.option(
+    "--max-modules",
+    type=click.IntRange(1),
+    help="End after so many modules; by default as many as there are streams.",
+)
+@click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@click.option("--salvage", is_flag=True, help="Go on over damaged parts of a recording.")
+@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@options.force
+@options.as_json
+@click.pass_context
+def learn_command(
+    ctx: click.Context,
+    source: tuple[str, ...],
+    out: Path | None,
+    seed: int,
+    preset: str | None,
+    settings: tuple[str, ...],
+    max_iterations: int | None,
+    max_modules: int | None,
+    loop: bool,
+    salvage: bool,
+    no_rerun: bool,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Learn slow feature modules from a scene or a recording.
+
+    SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
+    files of its views. The same seed gives the same signals, bit for bit, from each.
+    """
+    from cdmisfa.experiments.run import learn
+    from cdmisfa.experiments.sources import open_source
+
+    frames, configuration = open_source(
+        source, preset=preset, settings=settings, seed=seed, loop=loop, salvage=salvage
+    )
+    try:
+        with bar("learning", max_iterations, "iterations") as shown, stoppable() as stop:
+            result = learn(
+                frames,
+                configuration.learner,
+                out,
+                seed=seed,
+                max_iterations=max_iterations,
+                max_modules=max_modules,
+                sections=configuration.tables(),
+                force=force,
+                rerun=not no_rerun,
+                progress=Reporter(shown),
+                stop=stop,
+            )
+    finally:
+        frames.close()
+    if as_json:
+        options.print_json(result.as_json())
+    else:
+        click.echo(summary(result))
+    if stop():
+        ctx.exit(stop.exit_code)
+
+
+class Reporter:
+    """Shows a run's progress: every module once, the rest a few times a second."""
+
+    def __init__(self, shown: Bar) -> None:
+        self._shown = shown
+        self._modules = 0
+        self._next = 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        """Take in where the run stands."""
+        if progress.modules > self._modules:
+            self._modules = progress.modules
+            self._shown.say(f"module {progress.modules} saved at iteration {progress.iteration}")
+        now = time.monotonic()
+        if now >= self._next:
+            self._next = now + TICK
+            note = f"{progress.modules} modules, epsilon {progress.epsilon:.3f}"
+            self._shown.update(progress.iteration, note)
+
+
+def summary(result: RunResult) -> str:
+    """What a run came to, in words for a person."""
+    from cdmisfa.experiments.run import ENDINGS
+
+    rows = [
+        (
+            module.index,
+            result.streams[module.stream],
+            module.iteration,
+            " ".join(("stay", "switch")[action] for action in module.policy),
+            ", ".join(f"{eta:.4f}" for eta in module.eta),
+        )
+        for module in result.modules
+    ]
+    head = ("module", "stream", "iteration", "policy", "eta")
+    lines = [options.table(head, rows)] if rows else ["no module was learned"]
+    lines.append(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
+    lines.append(f"signals sha256 {result.signals_sha256}")
+    if result.run is not None:
+        lines.append(f"run {result.run}    look at it: cdmisfa view {result.run}")
+    return "\n".join(lines)
