@@ -1,0 +1,354 @@
+"""run.mcap: what the learner thought in every iteration, with the frames it watched.
+
+One file holds the whole story of a run: its configuration, every `BlockSignals`,
+watched frames, ground truth, the abstraction's weights now and then, and what
+happened as text. It is readable while it is being written, and up to the cut when
+the writing was cut short.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import numpy as np
+from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
+from google.protobuf import message
+from numpy.typing import NDArray
+
+from cdmisfa.blocks import NANOSECONDS, Block, SourceSpec
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.signals import SCHEMA_VERSION, BlockSignals
+from recorder.logfile import PARTIAL, LogFile, partial_path
+from recorder.messages import ENCODING, ImageEncoder, descriptor_set
+from replay import matrix_message, signals_message
+from replay.reader import LogReader
+
+RUN_FILE = "run.mcap"
+"""Name of the log in a run's folder."""
+
+METADATA = "cdmisfa.run"
+"""Name of the metadata record with the run's configuration."""
+
+SIGNALS_TOPIC = "/signals"
+WATCHED_TOPIC = "/watched"
+PHI_TOPIC = "/phi"
+TRUTH_TOPIC = "/truth"
+EVENT_TOPIC = "/event"
+
+_ITERATION = re.compile(r"iteration (\d{1,18})")
+
+
+@dataclass(frozen=True, slots=True)
+class RunHeader:
+    """What stands at the beginning of a run's log.
+
+    Attributes:
+        schema: version of `BlockSignals` it was written with.
+        spec: what the learner's source delivered.
+        manifest: what the run was started with: `config` by sections, `seed`, `source`.
+        watched_every: every how many frames an image was kept.
+    """
+
+    schema: int
+    spec: SourceSpec
+    manifest: Mapping[str, Any]
+    watched_every: int
+
+    def setting(self, section: str, key: str, default: Any = None) -> Any:
+        """A value of the run's configuration, as `setting("learner", "delta")`."""
+        config = self.manifest.get("config")
+        table = config.get(section) if isinstance(config, Mapping) else None
+        return table.get(key, default) if isinstance(table, Mapping) else default
+
+    def frame_at(self, log_time: int) -> int:
+        """Global frame counter at a log time."""
+        return round((log_time - self.spec.start_ns) * self.spec.fps / NANOSECONDS)
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened, in words, at the end of an iteration's block."""
+
+    t: int
+    iteration: int
+    text: str
+    level: str
+
+
+class RunWriter:
+    """Writes run.mcap; a context manager that finishes on success.
+
+    Args:
+        path: the file's name.
+        spec: what the source delivers.
+        manifest: what the run was started with, JSON values: `config` by sections, `seed`,
+            `source`.
+        force: overwrite what is there.
+        watched_every: keep every this many frames of images; vectors are all kept.
+        phi_every: keep the weights every this many iterations, and on each save.
+
+    Raises:
+        UsageError: the file exists and `force` is not set.
+        LogWriteError: it cannot be written, here or in any later call.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        spec: SourceSpec,
+        manifest: Mapping[str, Any],
+        *,
+        force: bool = False,
+        watched_every: int = 10,
+        phi_every: int = 50,
+    ) -> None:
+        self.spec = spec
+        self._watched_every = max(watched_every, 1)
+        self._phi_every = max(phi_every, 1)
+        # Values hardly compress, so the quicker codec; of images a tenth is left.
+        codec: Literal["zstd", "lz4"] = "zstd" if _is_image(spec) else "lz4"
+        self._log = LogFile(path, force=force, library="cdmisfa", compression=codec)
+        self._log.add_metadata(
+            METADATA,
+            {
+                "schema": str(SCHEMA_VERSION),
+                "spec": json.dumps(asdict(spec)),
+                "manifest": json.dumps(manifest, sort_keys=True),
+                "watched_every": str(self._watched_every),
+            },
+        )
+        matrix = (matrix_message.MESSAGE, matrix_message.schema_data())
+        self._signals = self._channel(
+            SIGNALS_TOPIC, signals_message.MESSAGE, signals_message.schema_data()
+        )
+        self._phi = self._channel(PHI_TOPIC, *matrix)
+        self._truth = self._channel(TRUTH_TOPIC, *matrix)
+        self._event = self._channel(
+            EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR)
+        )
+        self._images: dict[int, ImageEncoder] = {}
+        if _is_image(spec):
+            height, width = spec.frame_shape
+            encoders = [ImageEncoder(height, width, name) for name in spec.streams]
+            self._images = dict(enumerate(encoders))
+            self._watched = self._channel(
+                WATCHED_TOPIC, ImageEncoder.schema, encoders[0].schema_data()
+            )
+        else:
+            self._watched = self._channel(WATCHED_TOPIC, *matrix)
+
+    @property
+    def path(self) -> Path:
+        """The file's name once it is finished."""
+        return self._log.path
+
+    def block(self, signals: BlockSignals, block: Block, phi: NDArray[np.float64]) -> None:
+        """Write what one iteration gave.
+
+        Args:
+            signals: the iteration's record.
+            block: the frames it is about.
+            phi: (J, I) weights of the abstraction after the block.
+        """
+        time, k = signals.log_time, signals.iteration
+        sequence = k & 0xFFFFFFFF
+        self._log.write(self._signals, time, signals_message.encode(signals), sequence)
+        if block.truth.shape[1]:
+            self._log.write(
+                self._truth, time, matrix_message.encode(block.t, block.truth), sequence
+            )
+        if self._images:
+            encode = self._images[block.stream]
+            for i in range(-block.t % self._watched_every, len(block), self._watched_every):
+                at = self.spec.time_ns(block.t + i)
+                self._log.write(self._watched, at, encode(at, block.frames[i]), sequence)
+        else:
+            frames = block.frames.reshape(len(block), -1)
+            self._log.write(self._watched, time, matrix_message.encode(block.t, frames), sequence)
+        if k % self._phi_every == 0 or signals.saved:
+            self._log.write(self._phi, time, matrix_message.encode(block.t, phi), sequence)
+
+    def event(
+        self,
+        t: int,
+        iteration: int,
+        text: str,
+        level: Literal["INFO", "WARNING", "ERROR"] = "INFO",
+    ) -> None:
+        """Write in words what happened at frame t."""
+        entry = Log_pb2.Log(
+            level=Log_pb2.Log.Level.Value(level), message=text, name=f"iteration {iteration}"
+        )
+        time = self.spec.time_ns(t)
+        entry.timestamp.FromNanoseconds(time)
+        self._log.write(self._event, time, entry.SerializeToString(), iteration & 0xFFFFFFFF)
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+        self._log.flush()
+
+    def finish(self) -> None:
+        """Write the index and give the file its name."""
+        self._log.finish()
+
+    def abandon(self) -> None:
+        """Leave a readable NAME.partial."""
+        self._log.abandon()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._log.__exit__(kind, error, trace)
+
+    def _channel(self, topic: str, name: str, data: bytes) -> int:
+        return self._log.add_channel(topic, self._log.add_schema(name, ENCODING, data))
+
+
+def run_log(path: Path) -> Path:
+    """The log of a run, given its folder or the log itself; a partial one where it was cut short.
+
+    Raises:
+        UsageError: there is none.
+    """
+    path = Path(path)
+    whole = path / RUN_FILE if path.is_dir() else path
+    for candidate in (whole, partial_path(whole)):
+        if candidate.is_file():
+            return candidate
+    if path.is_dir():
+        raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
+    raise UsageError(f"{path} does not exist: name a run's folder or its {RUN_FILE}")
+
+
+def read_header(path: Path) -> RunHeader:
+    """What stands at the beginning of a run's log.
+
+    Raises:
+        UsageError: the file is no run's log, or of a later version of this software.
+        LogDamagedError: it cannot be read.
+    """
+    log = run_log(path)
+    found = _metadata(log)
+    try:
+        spec = json.loads(found["spec"])
+        for name in ("streams", "frame_shape", "truth"):
+            spec[name] = tuple(spec[name])
+        header = RunHeader(
+            schema=int(found["schema"]),
+            spec=SourceSpec(**spec),
+            manifest=json.loads(found["manifest"]),
+            watched_every=int(found["watched_every"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogDamagedError(f"{log}: its metadata {METADATA} is broken ({error})") from error
+    if header.schema > SCHEMA_VERSION:
+        raise UsageError(
+            f"{log} was written with version {header.schema} of the signals, this is version "
+            f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
+        )
+    return header
+
+
+def read_signals(path: Path) -> Iterator[BlockSignals]:
+    """Every iteration's record, in order.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: a record is damaged, or a finished file is cut short.
+    """
+    log = run_log(path)
+    for _, data in _messages(log, SIGNALS_TOPIC):
+        yield signals_message.decode(data, f"{log} {SIGNALS_TOPIC}")
+
+
+def read_watched(path: Path) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Watched frames as (t of the first, (n, *frame_shape)), in order."""
+    log = run_log(path)
+    header = read_header(log)
+    shape = header.spec.frame_shape
+    for time, data in _messages(log, WATCHED_TOPIC):
+        if _is_image(header.spec):
+            yield header.frame_at(time), _pixels(data, shape, log)[None]
+        else:
+            t, values = matrix_message.decode(data, f"{log} {WATCHED_TOPIC}")
+            yield t, _reshaped(values, (-1, *shape), log)
+
+
+def read_truth(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Ground truth of each block as (t of its first frame, (n, D)), in order."""
+    log = run_log(path)
+    columns = len(read_header(log).spec.truth)
+    for _, data in _messages(log, TRUTH_TOPIC):
+        t, values = matrix_message.decode(data, f"{log} {TRUTH_TOPIC}")
+        yield t, _reshaped(values, (-1, columns), log)
+
+
+def read_phi(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """The abstraction's weights as (t of the block's first frame, (J, I)), in order."""
+    log = run_log(path)
+    for _, data in _messages(log, PHI_TOPIC):
+        yield matrix_message.decode(data, f"{log} {PHI_TOPIC}")
+
+
+def read_events(path: Path) -> Iterator[Event]:
+    """What happened, in order."""
+    log = run_log(path)
+    header = read_header(log)
+    for time, data in _messages(log, EVENT_TOPIC):
+        try:
+            entry = Log_pb2.Log.FromString(data)
+        except message.DecodeError as error:
+            raise LogDamagedError(f"{log} {EVENT_TOPIC}: not a foxglove.Log message") from error
+        match = _ITERATION.fullmatch(entry.name)
+        level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
+        iteration = int(match[1]) if match else -1
+        yield Event(header.frame_at(time), iteration, entry.message, level)
+
+
+def _is_image(spec: SourceSpec) -> bool:
+    return spec.dtype == "uint8" and len(spec.frame_shape) == 2
+
+
+def _pixels(data: bytes, shape: tuple[int, ...], log: Path) -> NDArray[np.uint8]:
+    try:
+        pixels = RawImage_pb2.RawImage.FromString(data).data
+    except message.DecodeError as error:
+        raise LogDamagedError(f"{log} {WATCHED_TOPIC}: not a foxglove.RawImage") from error
+    image: NDArray[np.uint8] = _reshaped(np.frombuffer(pixels, np.uint8), shape, log)
+    return image
+
+
+def _reshaped(values: NDArray[Any], shape: tuple[int, ...], log: Path) -> NDArray[Any]:
+    try:
+        return values.reshape(shape)
+    except ValueError as error:
+        raise LogDamagedError(f"{log}: {values.size} values do not fill {shape}") from error
+
+
+def _metadata(log: Path) -> Mapping[str, str]:
+    with LogReader(log) as reader:
+        for record in reader.metadata:
+            if record.name == METADATA:
+                return record.values
+    raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
+
+
+def _messages(log: Path, topic: str) -> Iterator[tuple[int, bytes]]:
+    """Log time and bytes of each message on a topic, in the order of writing."""
+    with LogReader(log) as reader:
+        for entry in reader.messages({topic}, ordered=False):
+            yield entry.log_time, entry.data
+        if not reader.complete and not log.name.endswith(PARTIAL):
+            raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")

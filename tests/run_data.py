@@ -1,0 +1,111 @@
+"""Synthetic runs: records with every shape a learner can give, without a learner."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.blocks import Block, SourceSpec, freeze
+from cdmisfa.signals import BlockSignals
+from replay.runlog import RunWriter
+
+START_NS = 1_451_606_400_000_000_000
+DELTA = 0.0008
+IMAGE = SourceSpec(
+    ("left", "center", "right"), (12, 16), "uint8", ("box_y", "ball_y"), 50.0, START_NS
+)
+VECTOR = SourceSpec(("x1", "x2", "x3"), (2,), "float64", ("theta",), 50.0, START_NS)
+
+
+def block_of(spec: SourceSpec, stream: int, t: int, tau: int, rng: np.random.Generator) -> Block:
+    """A block whose frames tell which stream and frame they are."""
+    shape = (tau, *spec.frame_shape)
+    if spec.dtype == "uint8":
+        frames: NDArray[Any] = np.full(shape, 40 * stream + 20, dtype=np.uint8)
+        frames[np.arange(tau), :, (t + np.arange(tau)) // 10 % spec.frame_shape[1]] = 250
+    else:
+        frames = rng.standard_normal(shape)
+    truth = np.sin((t + np.arange(tau))[:, None] / 50 + np.arange(len(spec.truth)))
+    return Block(stream, t, freeze(frames), freeze(truth))
+
+
+def signals_of(
+    spec: SourceSpec, k: int, rng: np.random.Generator, *, tau: int, modules: int, outputs: int = 1
+) -> BlockSignals:
+    """One record: `modules` frozen modules, NaN where a learner has nothing to say."""
+    n, j, t = len(spec.streams), outputs, k * tau
+    novel = bool(rng.random() < 0.8)
+    blank = np.full(j, np.nan)
+
+    def maybe(shape: tuple[int, ...]) -> NDArray[np.float64]:
+        return rng.standard_normal(shape) if novel else np.full(shape, np.nan)
+
+    reward = float(rng.standard_normal()) if novel and k > 20 else float("nan")
+    return BlockSignals(
+        iteration=k,
+        t=t,
+        log_time=spec.time_ns(t),
+        stream=int(rng.integers(n)),
+        module=modules + 1,
+        novel=novel,
+        known_by=0 if novel else int(modules > 0) or -1,
+        saved=False,
+        share=float(rng.random()),
+        novel_blocks=k,
+        y=maybe((tau, j)),
+        y_frozen=rng.standard_normal((modules, tau, j)),
+        eta=maybe((j,)),
+        eta_dot=np.abs(maybe((j,))) * 1e-3,
+        variance=np.abs(maybe((j,))),
+        eta_inst=maybe((j,)) if k else blank,
+        gate_mean=maybe((j,)),
+        gate_sd=np.abs(maybe((j,))),
+        eta_inst_frozen=0.01 + 0.001 * rng.standard_normal((modules, j)),
+        band_mean=np.full((modules, j), 0.01),
+        band_sd=np.full((modules, j), 0.001),
+        xi=float(rng.random()),
+        xi_dot=-reward,
+        curiosity=reward,
+        expert=abs(reward) * 0.1,
+        reward=reward * 1.1,
+        R=rng.standard_normal((n, 2, n)) if n <= 64 else np.empty((0, 2, 0)),
+        Q=rng.standard_normal((n, 2)),
+        policy=rng.integers(0, 2, n),
+        epsilon=1.2 * 0.999**k,
+        explored=bool(rng.random() < 0.5),
+        action=int(rng.integers(2)),
+        next_stream=int(rng.integers(n)),
+    )
+
+
+def run_of(
+    spec: SourceSpec, iterations: int, *, tau: int = 40, seed: int = 0, outputs: int = 1
+) -> Iterator[tuple[BlockSignals, Block]]:
+    """A run in which a module is frozen after every third of it."""
+    rng = np.random.default_rng(seed)
+    for k in range(iterations):
+        modules = 3 * k // max(iterations, 1)
+        signals = signals_of(spec, k, rng, tau=tau, modules=modules, outputs=outputs)
+        yield signals, block_of(spec, signals.stream, signals.t, tau, rng)
+
+
+def write_run(
+    path: Path, spec: SourceSpec, iterations: int, *, tau: int = 40, seed: int = 0, **options: Any
+) -> list[BlockSignals]:
+    """Write such a run to a file and return its records."""
+    config = {"learner": {"tau": tau, "delta": DELTA}}
+    manifest = {"config": config, "seed": seed, "source": {"kind": "test"}}
+    writer = RunWriter(path, spec, manifest, **options)
+    phi_size = int(np.prod(spec.frame_shape))
+    records = []
+    for signals, block in run_of(spec, iterations, tau=tau, seed=seed):
+        phi = np.full((1, phi_size), float(signals.iteration))
+        writer.block(signals, block, phi)
+        records.append(signals)
+    writer.event(iterations * tau, iterations - 1, "stopped: the test is over")
+    writer.finish()
+    return records
