@@ -1,0 +1,471 @@
+"""Reading any MCAP file, strictly: whole or cut, with or without an index.
+
+`LogReader` gives every message that is there, in the order of log time (ties in file
+order), and never one whose checksum does not match. Memory holds a few chunks.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.errors import LogDamagedError
+from replay.records import (
+    MAX_CHUNK,
+    Channel,
+    MalformedRecord,
+    Schema,
+    decompress,
+    decompress_prefix,
+)
+from replay.structure import Attachment, Metadata, RandomFile, Segment, Structure
+from replay.tables import MessageTable, indexed_table, walked_table
+
+CACHE_BYTES: Final = 32 * 1024 * 1024
+"""Decoded chunks that are kept."""
+
+Crc = Literal["ok", "absent", "bad", "unchecked"]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A damage: where it is, and what it is."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a log; times in nanoseconds."""
+
+    channel: Channel
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class LogReader:
+    """An MCAP file, read by its content and not by what its index claims.
+
+    Damage is an error that names the file, the chunk and its time range. With
+    `salvage` the damaged chunk is left out and noted in `problems` instead, and the
+    unverifiable part of a chunk in which the file ends is read too.
+
+    Attributes:
+        path: the file.
+        problems: what was found damaged and left out (with `salvage`), and an index that
+            contradicts its chunk.
+    """
+
+    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+        """Open a log and walk over its structure.
+
+        Raises:
+            LogDamagedError: not an MCAP file, or its structure is damaged.
+        """
+        self.path = Path(path)
+        self.salvage = salvage
+        self.problems: list[Problem] = []
+        self._failed: set[int] = set()
+        self._cache: OrderedDict[int, MessageTable] = OrderedDict()
+        self._cached = 0
+        self._defined = 0
+        self._file = RandomFile(self.path)
+        try:
+            self._structure = Structure(self._file, self._refuse)
+            self._check_data_crc()
+        except MalformedRecord as error:
+            self.close()
+            raise LogDamagedError(f"{self.path}: {error}") from None
+        except BaseException:
+            self.close()
+            raise
+
+    # What the file holds
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._file.size
+
+    @property
+    def profile(self) -> str:
+        """The writer's profile, as "ros2"."""
+        return self._structure.profile
+
+    @property
+    def library(self) -> str:
+        """What wrote the file."""
+        return self._structure.library
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file has its end."""
+        return self._structure.complete
+
+    @property
+    def missing(self) -> str:
+        """What a file that was cut lacks, in words; "" for a whole one."""
+        structure = self._structure
+        if structure.tail is not None and not self.salvage and structure.tail.crc:
+            return f"{structure.missing}; recover can save part of the last chunk, unverified"
+        return structure.missing
+
+    @property
+    def segments(self) -> list[Segment]:
+        """Chunks and runs of messages outside chunks, in file order."""
+        tail = self._structure.tail
+        if tail is None or (tail.crc and not self.salvage):
+            return self._structure.segments
+        return [*self._structure.segments, tail]
+
+    @property
+    def metadata(self) -> list[Metadata]:
+        """The metadata records."""
+        return self._structure.metadata
+
+    @property
+    def attachments(self) -> list[Attachment]:
+        """The attachments; their CRCs were checked."""
+        return self._structure.attachments
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Every channel of the file; reads the chunks where nothing else names them."""
+        self._define()
+        return self._structure.definitions.channels
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Every schema of the file; reads the chunks where nothing else names them."""
+        self._define()
+        return self._structure.definitions.schemas
+
+    def attachment_data(self, attachment: Attachment) -> bytes:
+        """Read an attachment's bytes.
+
+        Raises:
+            LogDamagedError: it is larger than is read at once.
+        """
+        if attachment.size > MAX_CHUNK:
+            raise LogDamagedError(
+                f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
+                f"above the limit of {MAX_CHUNK}"
+            )
+        return self._file.read(attachment.offset, attachment.size)
+
+    def crc_absent(self) -> int:
+        """Count the chunks and runs of messages that no CRC protects."""
+        if self._structure.data_crc:
+            return 0
+        return sum(1 for s in self.segments if s.crc == 0 and s.size)
+
+    # Messages
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        start: int | None = None,
+        stop: int | None = None,
+        ordered: bool = True,
+    ) -> Iterator[Message]:
+        """Give the messages by log time, ties in file order.
+
+        Args:
+            topics: only these; None for all.
+            start: from this log time on, in nanoseconds.
+            stop: up to before this log time.
+            ordered: by log time; otherwise in file order.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        for segment, table in self.tables(start=start, stop=stop, ordered=ordered):
+            numbers = np.unique(table.channel)
+            known = {int(c): self._channel(int(c), segment) for c in numbers}
+            wanted = {
+                c: k
+                for c, k in known.items()
+                if k is not None and (topics is None or k.topic in topics)
+            }
+            data = memoryview(table.data.data)
+            for number, sequence, log_time, publish_time, at, size in zip(
+                table.channel.tolist(),
+                table.sequence.tolist(),
+                table.log_time.tolist(),
+                table.publish_time.tolist(),
+                table.at.tolist(),
+                table.size.tolist(),
+                strict=True,
+            ):
+                if number in wanted:
+                    yield Message(
+                        wanted[number],
+                        sequence,
+                        log_time,
+                        publish_time,
+                        bytes(data[at : at + size]),
+                    )
+
+    def tables(
+        self, *, start: int | None = None, stop: int | None = None, ordered: bool = True
+    ) -> Iterator[tuple[Segment, MessageTable]]:
+        """Give the messages chunk by chunk as columns, in the order of `messages`.
+
+        Chunks whose times overlap come in pieces.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        low, high = start or 0, 2**64 if stop is None else stop
+        segments = list(enumerate(self.segments))
+        chosen = [(i, s) for i, s in segments if s.end >= low and s.start < high]
+        groups = _overlapping(chosen) if ordered else [[pair] for pair in chosen]
+        for group in groups:
+            if len(group) > 1:
+                yield from self._merged(group, low, high)
+                continue
+            table = self.table(group[0][1])
+            if table is None:
+                continue
+            if ordered and (table.log_time[1:] < table.log_time[:-1]).any():
+                table = table.select(np.argsort(table.log_time, kind="stable"))
+            yield group[0][1], _within(table, low, high)
+
+    def table(self, segment: Segment) -> MessageTable | None:
+        """Decode a chunk and check it; the last few are kept.
+
+        Returns:
+            Its messages in file order, or None where it is damaged and `salvage` is on.
+
+        Raises:
+            LogDamagedError: it is damaged, without `salvage`.
+        """
+        key = segment.offset
+        if key in self._cache:
+            self._cache.move_to_end(key)
+            return self._cache[key]
+        if key in self._failed:
+            return None
+        if segment.size <= MAX_CHUNK:
+            self._make_room(segment.size)
+        try:
+            table = self._decode(segment)
+        except MalformedRecord as error:
+            self._failed.add(key)
+            self._refuse(segment.name, str(error))
+            return None
+        self._cache[key] = table
+        self._cached += len(table.data)
+        return table
+
+    def index(self, segment: Segment) -> list[tuple[int, NDArray[np.uint64]]]:
+        """Read a chunk's message indexes: channel, and (n, 2) of log time and offset."""
+        if not segment.indexes:
+            return []
+        first, last = segment.indexes[0], segment.indexes[-1]
+        stop = last.offset + 16 * last.count
+        if stop - first.offset > MAX_CHUNK:
+            raise MalformedRecord("its message index is larger than any chunk")
+        raw = self._file.read(first.offset, stop - first.offset)
+        return [
+            (
+                part.channel,
+                np.frombuffer(raw, "<u8", 2 * part.count, part.offset - first.offset).reshape(
+                    -1, 2
+                ),
+            )
+            for part in segment.indexes
+        ]
+
+    def check(self) -> None:
+        """Decode every chunk, so that every checksum and length is checked."""
+        for segment in self.segments:
+            self.table(segment)
+
+    def refresh(self) -> bool:
+        """Look for what a recorder wrote since; whether the file grew.
+
+        Raises:
+            LogDamagedError: what was written is damaged.
+        """
+        if self.complete or not self._file.grow():
+            return False
+        try:
+            self._structure = Structure(self._file, self._refuse)
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self.path}: {error}") from None
+        self._forget()
+        return True
+
+    def close(self) -> None:
+        """Let go of the file; harmless when called twice."""
+        self._file.close()
+        self._forget()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # Inside
+
+    def _forget(self) -> None:
+        self._cache.clear()
+        self._failed.clear()
+        self._cached = self._defined = 0
+
+    def _refuse(self, where: str, what: str) -> None:
+        if not self.salvage:
+            raise LogDamagedError(
+                f"{self.path}: {where}: {what}; go on without it with --salvage, or save the rest "
+                "with cdmisfa recover"
+            )
+        problem = Problem(where, what)
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+    def _check_data_crc(self) -> None:
+        structure = self._structure
+        if not structure.data_crc:
+            return
+        if self._file.crc(0, structure.data_end) == structure.data_crc:
+            return
+        if not self.salvage:
+            self.check()
+        self._refuse("data section", "its CRC does not match: damaged")
+
+    def _make_room(self, size: int) -> None:
+        while self._cache and self._cached + size > CACHE_BYTES:
+            _, old = self._cache.popitem(last=False)
+            self._cached -= len(old.data)
+
+    def _decode(self, segment: Segment) -> MessageTable:
+        stored = self._file.read(segment.data_offset, segment.stored)
+        if segment.cut:
+            raw = decompress_prefix(stored, segment.compression, min(segment.size, MAX_CHUNK))
+            table, definitions = walked_table(raw, cut=True)
+        else:
+            raw = decompress(stored, segment.compression, segment.size)
+            if segment.crc and zlib.crc32(raw) != segment.crc:
+                raise MalformedRecord("its CRC does not match: damaged")
+            table, definitions = self._table_of(segment, raw)
+            self._check_times(segment, table)
+        del stored
+        for opcode, start, stop in definitions:
+            self._structure.definitions.add(opcode, raw[start:stop], segment.name)
+        return table
+
+    def _table_of(
+        self, segment: Segment, raw: bytes
+    ) -> tuple[MessageTable, list[tuple[int, int, int]]]:
+        if segment.indexes:
+            try:
+                return indexed_table(raw, self.index(segment))
+            except MalformedRecord as error:
+                found = walked_table(raw)
+                problem = Problem(segment.name, f"{error} (the index is not used)")
+                if problem not in self.problems:
+                    self.problems.append(problem)
+                return found
+        return walked_table(raw)
+
+    def _check_times(self, segment: Segment, table: MessageTable) -> None:
+        if len(table) and not (
+            segment.start <= int(table.log_time.min()) and int(table.log_time.max()) <= segment.end
+        ):
+            raise MalformedRecord("it holds messages outside the time range it states")
+
+    def _channel(self, number: int, segment: Segment) -> Channel | None:
+        definitions = self._structure.definitions
+        channel = definitions.channels.get(number)
+        if channel is None:
+            self._define()
+            channel = definitions.channels.get(number)
+        if channel is None:
+            self._refuse(segment.name, f"it holds messages of channel {number}, never defined")
+        elif channel.schema_id and channel.schema_id not in definitions.schemas:
+            self._refuse(
+                segment.name, f"schema {channel.schema_id} of {channel.topic!r} is never defined"
+            )
+        return channel
+
+    def _define(self) -> None:
+        """Decode chunks until every channel that has messages is known."""
+        known = self._structure.definitions.channels
+        segments = self.segments
+        while self._defined < len(segments):
+            segment = segments[self._defined]
+            counts = segment.channel_counts()
+            if counts is None or not counts.keys() <= known.keys():
+                self.table(segment)
+            self._defined += 1
+
+    def _merged(
+        self, group: list[tuple[int, Segment]], low: int, high: int
+    ) -> Iterator[tuple[Segment, MessageTable]]:
+        times: list[NDArray[np.uint64]] = []
+        members: list[NDArray[np.int64]] = []
+        rows: list[NDArray[np.int64]] = []
+        for member, (_, segment) in enumerate(group):
+            table = self.table(segment)
+            if table is not None:
+                times.append(table.log_time)
+                members.append(np.full(len(table), member))
+                rows.append(np.arange(len(table)))
+        if not times:
+            return
+        order = np.argsort(np.concatenate(times), kind="stable")
+        member_of, row_of = np.concatenate(members)[order], np.concatenate(rows)[order]
+        changes = np.flatnonzero(np.diff(member_of)) + 1
+        for piece_members, piece_rows in zip(
+            np.split(member_of, changes), np.split(row_of, changes), strict=True
+        ):
+            if not len(piece_members):
+                continue
+            segment = group[int(piece_members[0])][1]
+            table = self.table(segment)
+            if table is not None:
+                yield segment, _within(table.select(piece_rows), low, high)
+
+
+def _within(table: MessageTable, low: int, high: int) -> MessageTable:
+    times = table.log_time
+    if not len(times) or (low <= int(times.min()) and int(times.max()) < high):
+        return table
+    keep = times >= np.uint64(min(low, 2**64 - 1))
+    if high < 2**64:
+        keep &= times < np.uint64(max(high, 0))
+    return table.select(keep)
+
+
+def _overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[tuple[int, Segment]]]:
+    """Group segments so that sorting within each group sorts all."""
+    ordered = sorted(segments, key=lambda pair: (pair[1].start, pair[0]))
+    group: list[tuple[int, Segment]] = []
+    end, last = -1, -1
+    for number, segment in ordered:
+        if group and (segment.start > end or (segment.start == end and number > last)):
+            yield sorted(group, key=lambda pair: pair[0])
+            group, end, last = [], -1, -1
+        group.append((number, segment))
+        end, last = max(end, segment.end), max(last, number)
+    if group:
+        yield sorted(group, key=lambda pair: pair[0])

@@ -1,0 +1,560 @@
+"""Where everything stands in a log: one walk over its outer records, trusting none of them.
+
+The walk needs no index: it finds chunks, loose messages, metadata and attachments in
+whole files, in files without a summary, and in files that were cut anywhere. What the
+summary claims is compared with what was found.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from mcap.opcode import Opcode
+
+from cdmisfa.errors import LogDamagedError
+from replay.records import (
+    MAGIC,
+    MAX_CHUNK,
+    MAX_DEFINITION,
+    RECORD_HEADER,
+    Channel,
+    Fields,
+    MalformedRecord,
+    Schema,
+    Statistics,
+    channel,
+    check_size,
+    chunk_header,
+    schema,
+    statistics,
+)
+
+RUN_BYTES: Final = 1024 * 1024
+"""Messages outside chunks are read in runs of about this many bytes."""
+_PEEK: Final = 4096
+_CHUNK_HEADER: Final = 256
+_LOOSE: Final = struct.Struct("<HIQ")
+_INDEX: Final = struct.Struct("<HI")
+_FOOTER_BYTES: Final = RECORD_HEADER.size + 20
+_OPEN_LENGTH: Final = 2**64 - 1
+_BEFORE_DATA: Final = 1024 * 1024
+
+Refuse = Callable[[str, str], None]
+"""Takes (where, what) of a damage: raises, or notes it where the caller wants to go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class IndexPart:
+    """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
+
+    channel: int
+    offset: int
+    count: int
+
+
+@dataclass(slots=True)
+class Segment:
+    """A chunk, or a run of messages outside chunks.
+
+    Attributes:
+        offset: place in the file of its first record.
+        data_offset: place in the file of its (compressed) records.
+        stored: bytes there.
+        size: bytes once decompressed.
+        crc: CRC-32 of the decompressed bytes, 0 where the writer gave none.
+        start: log time of its earliest message.
+        end: log time of its latest message.
+        indexes: the chunk's message indexes.
+        counts: messages of each channel where a walk counted them.
+        cut: the file ends within it.
+    """
+
+    offset: int
+    data_offset: int
+    stored: int
+    size: int
+    compression: str
+    crc: int
+    start: int
+    end: int
+    chunked: bool
+    indexes: list[IndexPart] = field(default_factory=list)
+    counts: dict[int, int] | None = None
+    cut: bool = False
+
+    @property
+    def name(self) -> str:
+        """How an error names it."""
+        kind = "chunk" if self.chunked else "messages"
+        return f"{kind} at byte {self.offset} (log time {self.start} to {self.end} ns)"
+
+    def channel_counts(self) -> dict[int, int] | None:
+        """Messages of each channel, or None where only decoding can tell."""
+        if self.counts is not None:
+            return self.counts
+        if not self.indexes:
+            return {} if self.size == 0 else None
+        counts: dict[int, int] = {}
+        for part in self.indexes:
+            counts[part.channel] = counts.get(part.channel, 0) + part.count
+        return counts
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """A named map of texts."""
+
+    name: str
+    values: dict[str, str] = field(hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file within the log; `offset` and `size` are those of its bytes."""
+
+    name: str
+    media_type: str
+    log_time: int
+    create_time: int
+    offset: int
+    size: int
+    crc: int
+
+
+class RandomFile:
+    """A file read at any place through one small window; never past its end."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises:
+            LogDamagedError: it cannot be read.
+        """
+        self.path = path
+        try:
+            self._fd: int | None = os.open(path, os.O_RDONLY)
+            self.size = os.fstat(self._fd).st_size
+            if not path.is_file():
+                raise LogDamagedError(f"{path}: not a file")
+        except OSError as error:
+            raise LogDamagedError(f"{path}: {error.strerror}") from None
+        self._window = b""
+        self._window_at = 0
+
+    def grow(self) -> bool:
+        """Look at the file's size again; whether it grew."""
+        before, self.size = self.size, os.fstat(self._descriptor()).st_size
+        self._window = b""
+        return self.size > before
+
+    def peek(self, offset: int, count: int) -> bytes:
+        """Up to `count` (few) bytes, read ahead for the peeks that follow."""
+        at = offset - self._window_at
+        if at < 0 or at + count > len(self._window):
+            self._window = self.read(offset, max(count, _PEEK))
+            self._window_at, at = offset, 0
+        return self._window[at : at + count]
+
+    def read(self, offset: int, count: int) -> bytes:
+        """`count` bytes, fewer only where the file ends."""
+        count = max(min(count, self.size - offset), 0)
+        parts: list[bytes] = []
+        while count:
+            try:
+                part = os.pread(self._descriptor(), min(count, 1 << 30), offset)
+            except OSError as error:
+                raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+            if not part:
+                break
+            parts.append(part)
+            offset, count = offset + len(part), count - len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def blocks(self, offset: int, stop: int) -> Iterator[bytes]:
+        """Give the bytes from `offset` to `stop`, 1 MiB at a time."""
+        while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
+            yield part
+            offset += len(part)
+
+    def crc(self, offset: int, stop: int) -> int:
+        """CRC-32 of the bytes from `offset` to `stop`."""
+        value = 0
+        for block in self.blocks(offset, stop):
+            value = zlib.crc32(block, value)
+        return value
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._fd is not None:
+            os.close(self._fd)
+            self._fd = None
+
+    def _descriptor(self) -> int:
+        if self._fd is None:
+            raise ValueError(f"{self.path} is closed")
+        return self._fd
+
+
+class Definitions:
+    """The schemas and channels of a log; an id has one meaning."""
+
+    def __init__(self, refuse: Refuse) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._refuse = refuse
+        self._seen: set[tuple[int, bytes]] = set()
+        self._bytes = 0
+
+    def add(self, opcode: int, content: bytes, where: str) -> None:
+        """Take a Schema or Channel record in.
+
+        Raises:
+            MalformedRecord: it is broken.
+            LogDamagedError: its id already means something else.
+        """
+        key = (opcode, content)
+        if key in self._seen:
+            return
+        self._bytes += len(content)
+        if self._bytes > MAX_DEFINITION:
+            raise MalformedRecord(f"schemas and channels take more than {MAX_DEFINITION} bytes")
+        if opcode == Opcode.SCHEMA:
+            new = schema(content)
+            if self.schemas.setdefault(new.id, new) != new:
+                self._refuse(where, f"schema {new.id} is defined twice with different content")
+        else:
+            other = channel(content)
+            if self.channels.setdefault(other.id, other) != other:
+                self._refuse(where, f"channel {other.id} is defined twice with different content")
+        self._seen.add(key)
+
+
+class Structure:
+    """What the walk found.
+
+    Attributes:
+        segments: chunks and runs of loose messages, in file order.
+        tail: the segment within which the file ends, or None.
+        complete: the file has its end, and nothing is missing.
+        missing: what a file that was cut lacks, in words; "" for a whole one.
+        data_crc: CRC of the data section, 0 for none, None where the file ends before it.
+        data_end: place where the data section ends.
+    """
+
+    def __init__(self, file: RandomFile, refuse: Refuse) -> None:
+        self._file = file
+        self._refuse = refuse
+        self.definitions = Definitions(refuse)
+        self.segments: list[Segment] = []
+        self.tail: Segment | None = None
+        self.metadata: list[Metadata] = []
+        self.attachments: list[Attachment] = []
+        self.profile = ""
+        self.library = ""
+        self.statistics: Statistics | None = None
+        self.complete = False
+        self.missing = ""
+        self.data_crc: int | None = None
+        self.data_end = 0
+        self._chunk_offsets: list[int] = []
+        self._limit: int | None = None
+        self._has_indexes = False
+        self._metadata_bytes = 0
+        self._run: Segment | None = None
+        self._last_chunk: Segment | None = None
+        self._at = len(MAGIC)
+        start = file.read(0, len(MAGIC))
+        if not start:
+            raise LogDamagedError(f"{file.path}: empty, nothing was written")
+        if start != MAGIC:
+            raise LogDamagedError(f"{file.path}: not an MCAP file (its first bytes are not MCAP's)")
+        self._read_end()
+        self._walk_data()
+
+    def _walk_data(self) -> None:
+        while self.data_crc is None:
+            limit = self._file.size if self._limit is None else self._limit
+            where = f"byte {self._at}"
+            try:
+                if not self._step(limit):
+                    break
+            except MalformedRecord as error:
+                self._refuse(where, str(error))
+                if not self._resume_after(self._at):
+                    self.missing = f"everything from byte {self._at} on is unreadable"
+                    break
+        self._close_run()
+        if self.data_crc is not None and self._limit is None and not self.missing:
+            self.missing = "the summary at its end is cut, every message is there"
+        self.complete = self._limit is not None and self.data_crc is not None
+        if self.complete:
+            self._compare_with_summary()
+
+    # The outer records
+
+    def _step(self, limit: int) -> bool:
+        head = self._file.peek(self._at, RECORD_HEADER.size) if self._at < limit else b""
+        if len(head) < RECORD_HEADER.size or self._at + RECORD_HEADER.size > limit:
+            return self._cut("the end of the file and its index are missing", limit)
+        opcode, length = RECORD_HEADER.unpack(head)
+        content = self._at + RECORD_HEADER.size
+        end = content + length
+        if opcode == 0:
+            if self._limit is None and self._only_zeros(self._at):
+                return self._cut(f"from byte {self._at} on there are only zeros", limit)
+            raise MalformedRecord("no record (opcode 0)")
+        if end > limit:
+            if opcode == Opcode.CHUNK:
+                self._cut_chunk(content, length, limit)
+            return self._cut(
+                f"the file ends within a record at byte {self._at}, {limit - self._at} bytes of it "
+                "are there",
+                limit,
+            )
+        if self._at == len(MAGIC) and opcode != Opcode.HEADER:
+            raise MalformedRecord("the file does not begin with a header record")
+        self._take(opcode, content, length)
+        self._at = end
+        return True
+
+    def _take(self, opcode: int, content: int, length: int) -> None:
+        if opcode == Opcode.MESSAGE:
+            self._loose_message(content, length)
+            return
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(content, length)
+            return
+        self._last_chunk = None
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self.definitions.add(opcode, self._definition(content, length), f"byte {self._at}")
+            return
+        self._close_run()
+        if opcode == Opcode.CHUNK:
+            self._last_chunk = self._chunk(content, length)
+            self.segments.append(self._last_chunk)
+        elif opcode == Opcode.METADATA:
+            self._take_metadata(self._definition(content, length))
+        elif opcode == Opcode.ATTACHMENT:
+            self._attachment(content, length)
+        elif opcode == Opcode.HEADER:
+            if self._at != len(MAGIC):
+                raise MalformedRecord("a second header, as of two files in one")
+            fields = Fields(self._definition(content, length), "the header")
+            self.profile, self.library = fields.text(), fields.text()
+        elif opcode == Opcode.DATA_END:
+            self.data_end = self._at
+            crc = Fields(self._file.peek(content, min(length, 4)), "the data end").integer(4)
+            if self._limit is not None and content + length != self._limit:
+                raise MalformedRecord("the data section does not end where the summary starts")
+            self.data_crc = crc
+        elif opcode <= max(Opcode):
+            raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
+
+    def _definition(self, content: int, length: int) -> bytes:
+        if length > MAX_DEFINITION:
+            raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
+        return self._file.read(content, length)
+
+    def _chunk(self, content: int, length: int) -> Segment:
+        header = chunk_header(self._file.peek(content, min(length, _CHUNK_HEADER)))
+        if header.length + header.stored > length:
+            raise MalformedRecord("a chunk's length is not that of its data")
+        return Segment(
+            self._at,
+            content + header.length,
+            header.stored,
+            header.size,
+            header.compression,
+            header.crc,
+            header.start,
+            header.end,
+            chunked=True,
+        )
+
+    def _cut_chunk(self, content: int, length: int, limit: int) -> None:
+        try:
+            header = chunk_header(self._file.peek(content, min(_CHUNK_HEADER, limit - content)))
+            check_size(header.compression, 0)
+        except MalformedRecord:
+            return
+        if header.length + header.stored > length:
+            raise MalformedRecord("a chunk's length is not that of its data")
+        data = content + header.length
+        size = header.size if length != _OPEN_LENGTH else MAX_CHUNK
+        self.tail = Segment(
+            self._at,
+            data,
+            limit - data,
+            size,
+            header.compression,
+            header.crc if length != _OPEN_LENGTH else 0,
+            header.start,
+            header.end,
+            chunked=True,
+            cut=True,
+        )
+
+    def _message_index(self, content: int, length: int) -> None:
+        chunk = self._last_chunk
+        if chunk is None:
+            raise MalformedRecord("a message index without its chunk")
+        head = self._file.peek(content, min(length, _INDEX.size))
+        if len(head) < _INDEX.size:
+            raise MalformedRecord("a message index is cut short")
+        number, size = _INDEX.unpack(head)
+        if size + _INDEX.size > length or size % 16:
+            raise MalformedRecord("a message index lies about its length")
+        chunk.indexes.append(IndexPart(number, content + _INDEX.size, size // 16))
+
+    def _loose_message(self, content: int, length: int) -> None:
+        if length < _LOOSE.size + 8:
+            raise MalformedRecord("a message is shorter than its own header")
+        if length > MAX_CHUNK:
+            raise MalformedRecord(f"a message of {length} bytes, above the limit of {MAX_CHUNK}")
+        number, _, time = _LOOSE.unpack(self._file.peek(content, _LOOSE.size))
+        end = content + length
+        run = self._run
+        if run is not None and end - run.offset > RUN_BYTES:
+            self._close_run()
+            run = None
+        if run is None:
+            run = self._run = Segment(
+                self._at, self._at, 0, 0, "", 0, time, time, chunked=False, counts={}
+            )
+            self._last_chunk = None
+        run.stored = run.size = end - run.offset
+        run.start, run.end = min(run.start, time), max(run.end, time)
+        assert run.counts is not None
+        run.counts[number] = run.counts.get(number, 0) + 1
+
+    def _close_run(self) -> None:
+        if self._run is not None:
+            self.segments.append(self._run)
+            self._run = None
+
+    def _take_metadata(self, content: bytes) -> None:
+        self._metadata_bytes += len(content)
+        if self._metadata_bytes > MAX_DEFINITION:
+            raise MalformedRecord(f"metadata takes more than {MAX_DEFINITION} bytes")
+        fields = Fields(content, "metadata")
+        self.metadata.append(Metadata(fields.text(), fields.texts()))
+
+    def _attachment(self, content: int, length: int) -> None:
+        fields = Fields(self._file.read(content, min(length, _BEFORE_DATA)), "an attachment")
+        log_time, create_time = fields.integer(8), fields.integer(8)
+        name, media_type, size = fields.text(), fields.text(), fields.integer(8)
+        if fields.at + size + 4 > length:
+            raise MalformedRecord("an attachment lies about its length")
+        data = content + fields.at
+        crc = int.from_bytes(self._file.read(data + size, 4), "little")
+        found = Attachment(name, media_type, log_time, create_time, data, size, crc)
+        if crc and self._file.crc(content, data + size) != crc:
+            self._refuse(f"attachment {name[:80]!r}", "its CRC does not match: damaged")
+            return
+        self.attachments.append(found)
+
+    # The end of the file
+
+    def _cut(self, what: str, limit: int) -> bool:
+        if self._limit is not None:
+            raise MalformedRecord(
+                "a record runs into the summary"
+                if self._at < limit
+                else "the data section has no end record"
+            )
+        self.missing = what
+        return False
+
+    def _only_zeros(self, at: int) -> bool:
+        return not any(any(block) for block in self._file.blocks(at, self._file.size))
+
+    def _resume_after(self, at: int) -> bool:
+        """Go on at the next chunk the summary knows of."""
+        self._close_run()
+        self._last_chunk = None
+        place = bisect_right(self._chunk_offsets, at)
+        if place == len(self._chunk_offsets):
+            return False
+        self._at = self._chunk_offsets[place]
+        return True
+
+    def _read_end(self) -> None:
+        """Read footer and summary, where the file has them."""
+        file = self._file
+        footer_at = file.size - len(MAGIC) - _FOOTER_BYTES
+        if footer_at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
+            return
+        footer = file.read(footer_at, _FOOTER_BYTES)
+        opcode, length = RECORD_HEADER.unpack_from(footer)
+        if opcode != Opcode.FOOTER or length != 20:
+            self._refuse("footer", "it is no footer record")
+            return
+        start, offsets, crc = struct.unpack_from("<QQI", footer, RECORD_HEADER.size)
+        begin = start or offsets or footer_at
+        if not len(MAGIC) <= begin <= footer_at or (offsets and not begin <= offsets <= footer_at):
+            self._refuse("footer", "it points outside the file")
+            return
+        if crc:
+            value = file.crc(begin, footer_at + _FOOTER_BYTES - 4)
+            if value != crc:
+                self._refuse("summary", "its CRC does not match: damaged")
+                self._limit = begin
+                return
+        self._limit = begin
+        try:
+            self._walk_summary(begin, footer_at)
+        except MalformedRecord as error:
+            self._refuse("summary", str(error))
+
+    def _walk_summary(self, at: int, stop: int) -> None:
+        while at < stop:
+            opcode, length = RECORD_HEADER.unpack(
+                self._file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+            )
+            content, end = at + RECORD_HEADER.size, at + RECORD_HEADER.size + length
+            if opcode == 0 or end > stop:
+                raise MalformedRecord(f"no record at byte {at}")
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self.definitions.add(opcode, self._definition(content, length), "summary")
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = statistics(self._definition(content, length))
+            elif opcode == Opcode.CHUNK_INDEX:
+                self._has_indexes = True
+                fields = Fields(self._file.peek(content, min(length, 24)), "a chunk index")
+                fields.take(16)
+                self._chunk_offsets.append(fields.integer(8))
+            elif opcode <= Opcode.DATA_END and opcode not in (
+                Opcode.ATTACHMENT_INDEX,
+                Opcode.METADATA_INDEX,
+                Opcode.SUMMARY_OFFSET,
+            ):
+                raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
+            at = end
+        self._chunk_offsets.sort()
+
+    def _compare_with_summary(self) -> None:
+        chunks = [s for s in self.segments if s.chunked]
+        if self._has_indexes and [c.offset for c in chunks] != self._chunk_offsets:
+            self._refuse("summary", "its chunk index does not name the chunks that are there")
+        stated = self.statistics
+        if stated is None:
+            return
+        found = {
+            "chunks": (stated.chunks, len(chunks)),
+            "attachments": (stated.attachments, len(self.attachments)),
+            "metadata records": (stated.metadata, len(self.metadata)),
+        }
+        counts = [s.channel_counts() for s in self.segments]
+        if all(c is not None for c in counts):
+            total = sum(sum(c.values()) for c in counts if c is not None)
+            found["messages"] = (stated.messages, total)
+        for what, (said, there) in found.items():
+            if said != there:
+                self._refuse("summary", f"it states {said} {what}, there are {there}")
