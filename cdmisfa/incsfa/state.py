@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cdmisfa.compiled import compiled
 from cdmisfa.config import LearnerConfig
 
 Float = NDArray[np.float64]
@@ -100,7 +100,7 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
     )
 
 
-@njit(cache=True)
+@compiled
 def copy_into(source: State, target: State) -> None:
     """Overwrite one state with another of the same sizes."""
     target.mean[:] = source.mean
@@ -113,13 +113,13 @@ def copy_into(source: State, target: State) -> None:
     target.counts[:] = source.counts
 
 
-@njit(cache=True)
+@compiled
 def mean_rate(n: int, window: float) -> float:
     """Rate of the running mean at the n-th frame (from 1): 1/n, then 2/(window + 1)."""
     return max(2.0 / (window + 1.0), 1.0 / n)
 
 
-@njit(cache=True)
+@compiled
 def amnesic_weight(n: int) -> float:
     """Weight of the new frame in CCIPCA at the n-th frame (from 1); the old vector has the rest.
 
@@ -136,7 +136,7 @@ def amnesic_weight(n: int) -> float:
     return (1.0 + amnesia) / k
 
 
-@njit(cache=True)
+@compiled
 def rank_floor(d: Float) -> float:
     """Variance at or below which a component is rounding noise.
 
@@ -152,13 +152,13 @@ def rank_floor(d: Float) -> float:
     return max(RANK_TOLERANCE * largest, LEAST_VARIANCE)
 
 
-@njit(cache=True)
+@compiled
 def whitening_scale(d: float, floor: float) -> float:
     """Factor that turns u.v into a component of unit variance: d^-3/2, 0 for rounding noise."""
     return 1.0 / (d * np.sqrt(d)) if d > floor else 0.0
 
 
-@njit(cache=True)
+@compiled
 def mca_step(w: Float, z_dot: Float, nu: float, step: Float) -> None:
     """Turn each row of w towards the next slowest direction, in place.
 

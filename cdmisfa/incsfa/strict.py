@@ -7,9 +7,9 @@ calls. Across CPUs only the contraction of a*b+c may differ, and numba does not 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cdmisfa.compiled import compiled
 from cdmisfa.incsfa.state import (
     PIXEL,
     Float,
@@ -23,7 +23,7 @@ from cdmisfa.incsfa.state import (
 )
 
 
-@njit(cache=True)
+@compiled
 def centre(frame: NDArray, scale: float, mean: Float, n: int, window: float, u: Float) -> None:  # type: ignore[type-arg]
     """Take the n-th frame (from 1) into the mean and subtract it; the very first is not centred.
 
@@ -42,7 +42,7 @@ def centre(frame: NDArray, scale: float, mean: Float, n: int, window: float, u: 
         u[i] = x if n == 1 else x - mean[i]
 
 
-@njit(cache=True)
+@compiled
 def ccipca_step(v: Float, d: Float, weight: float, r: Float) -> None:
     """Turn the vectors towards the principal components; r is left with what none explains.
 
@@ -76,7 +76,7 @@ def ccipca_step(v: Float, d: Float, weight: float, r: Float) -> None:
             r[i] -= projection * v[j, i]
 
 
-@njit(cache=True)
+@compiled
 def whiten(v: Float, scale: Float, u: Float, z: Float) -> None:
     """z_j = (u.v_j) |v_j|^-3/2, a component of unit variance.
 
@@ -93,7 +93,7 @@ def whiten(v: Float, scale: Float, u: Float, z: Float) -> None:
         z[j] = projection * scale[j]
 
 
-@njit(cache=True)
+@compiled
 def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> float:
     """Set phi to w diag(scale) v; return xi, the length of its change.
 
@@ -118,7 +118,7 @@ def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> f
     return float(np.sqrt(xi))
 
 
-@njit(cache=True)
+@compiled
 def update(state: State, params: Params, frames: NDArray, gap: bool, xi: Float) -> None:  # type: ignore[type-arg]
     """Learn from consecutive frames.
 
