@@ -24,8 +24,8 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
     """Sum T of the values of all streams under a policy.
 
     Args:
-        stay: (S,) expected reward of staying.
-        switch: (S,) expected reward of switching.
+        stay: (S,) reward of staying.
+        switch: (S,) reward of switching, summed over the n-1 streams it may lead to.
         policy: (S,) 0 stay, 1 switch.
         gamma: discount factor.
     """
@@ -35,25 +35,24 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
     leaving = 0.0
     leavers = 0
     for s in range(n):
-        if policy[s] == 0:
-            staying += stay[s]
-        else:
-            leaving += switch[s]
-            leavers += 1
-    fixed = staying / (1.0 - gamma) + leaving / (1.0 + share)
+        leaves = policy[s]
+        staying += stay[s] * (1 - leaves)
+        leaving += switch[s] * leaves
+        leavers += leaves
+    fixed = staying / (1.0 - gamma) + leaving / (n - 1) / (1.0 + share)
     return fixed / (1.0 - leavers * share / (1.0 + share))
 
 
 @compiled
 def policy_iteration(
-    stay_sum: Float, switch_sum: Float, count: int, gamma: float, policy: Int, Q: Float
+    stay_sum: Float, switch_sum: Float, count: float, gamma: float, policy: Int, Q: Float
 ) -> None:
     """Improve a policy until it is optimal for R; ties go to stay.
 
     Args:
-        stay_sum: (S,) sums of rewards for staying in each stream.
-        switch_sum: (S,) sums of rewards for leaving each stream.
-        count: number t of rewards in the sums; R is sum / t.
+        stay_sum: (S,) R's stay entries times `count`.
+        switch_sum: (S,) sum of R's switch entries from each stream, times `count`.
+        count: common divisor of R; the number t of rewards in the sums.
         gamma: discount factor.
         policy: (S,) read and written: 0 stay, 1 switch.
         Q: (S, 2) written: action values under the policy.
@@ -65,17 +64,21 @@ def policy_iteration(
         Q[0, 1] = Q[0, 0]
         return
     share = gamma / (n - 1)
-    switch = switch_sum / (n - 1)
+    mean = 1.0 / (n - 1)
+    damp = 1.0 / (1.0 + share)
+    horizon = 1.0 / (1.0 - gamma)
+    scale = 1.0 / count
     for _ in range(MAX_SWEEPS):
-        total = value_sum(stay_sum, switch, policy, gamma)
+        total = value_sum(stay_sum, switch_sum, policy, gamma)
         changed = 0
         for s in range(n):
-            leave = (switch[s] + share * total) / (1.0 + share)
-            value = leave if policy[s] == 1 else stay_sum[s] / (1.0 - gamma)
-            q_stay = stay_sum[s] + gamma * value
-            q_switch = switch[s] + share * (total - value)
-            Q[s, 0] = q_stay / count
-            Q[s, 1] = q_switch / count
+            stay = stay_sum[s]
+            switch = switch_sum[s] * mean
+            value = (switch + share * total) * damp if policy[s] == 1 else stay * horizon
+            q_stay = stay + gamma * value
+            q_switch = switch + share * (total - value)
+            Q[s, 0] = q_stay * scale
+            Q[s, 1] = q_switch * scale
             better = 1 if q_switch > q_stay else 0
             changed += better != policy[s]
             policy[s] = better
