@@ -30,7 +30,7 @@ from replay.structure import Attachment, Metadata, RandomFile, Segment, Structur
 from replay.tables import MessageTable, indexed_table, walked_table
 
 CACHE_BYTES: Final = 32 * 1024 * 1024
-"""Decoded chunks that are kept."""
+"""Decoded chunks that are kept, unless told otherwise; one is always."""
 
 Crc = Literal["ok", "absent", "bad", "unchecked"]
 
@@ -67,7 +67,9 @@ class LogReader:
             contradicts its chunk.
     """
 
-    def __init__(self, path: str | Path, *, salvage: bool = False) -> None:
+    def __init__(
+        self, path: str | Path, *, salvage: bool = False, cache_bytes: int | None = None
+    ) -> None:
         """Open a log and walk over its structure.
 
         Raises:
@@ -79,6 +81,7 @@ class LogReader:
         self._failed: set[int] = set()
         self._cache: OrderedDict[int, MessageTable] = OrderedDict()
         self._cached = 0
+        self._cache_bytes = CACHE_BYTES if cache_bytes is None else cache_bytes
         self._defined = 0
         self._file = RandomFile(self.path)
         try:
@@ -353,7 +356,7 @@ class LogReader:
         self._refuse("data section", "its CRC does not match: damaged")
 
     def _make_room(self, size: int) -> None:
-        while self._cache and self._cached + size > CACHE_BYTES:
+        while self._cache and self._cached + size > self._cache_bytes:
             _, old = self._cache.popitem(last=False)
             self._cached -= len(old.data)
 
