@@ -98,6 +98,15 @@ class World:
         """Move the table out of sight for good."""
         self._move(self._table, _AWAY)
 
+    def add_box(
+        self,
+        centre: tuple[float, float, float],
+        half: tuple[float, float, float],
+        colour: tuple[float, float, float],
+    ) -> None:
+        """Add a box that is only scenery; root frame, metres."""
+        self._move(self._body(self._bullet.GEOM_BOX, colour, halfExtents=half), centre)
+
     def render(
         self,
         view: tuple[float, ...],
@@ -180,7 +189,7 @@ class World:
                 )
         place = bullet.getLinkState(self._robot, self._neck_joint, physicsClientId=client)[4]
         # To the micrometre: the rest is rounding noise of the simulator's float32.
-        self.neck: NDArray[np.float64] = np.round(np.asarray(place, dtype=np.float64), 6)
+        self.neck = np.array([round(part, 6) for part in place])
         self._add_bodies(scene)
 
     def _add_bodies(self, scene: SceneConfig) -> None:

@@ -1,0 +1,233 @@
+"""Recording a scene: every view at every frame, one MCAP file for each view."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, cast
+
+from cdmisfa.blocks import FrameSource, SourceSpec
+from cdmisfa.config import as_table
+from cdmisfa.errors import CdmisfaError, UsageError
+from recorder.config import RecordConfig, SceneConfig
+from recorder.eyes import HeadPose
+from recorder.logfile import LogWriteError
+from recorder.rendering import render_here, render_in_processes, requests
+from recorder.scenes import open_scene
+from recorder.viewlog import (
+    Identity,
+    ViewLog,
+    check_identity,
+    earlier_logs,
+    keep,
+    kept_path,
+    sha256,
+    whole_frames,
+)
+
+MAX_JOBS = 256
+
+Progress = Callable[[int, int], None]
+"""Told the frames written so far and the frames wanted, over all views together."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRecording:
+    """One finished file of a recording.
+
+    Attributes:
+        name: of the view.
+        file: the file's path.
+        frames: how many it holds.
+        bytes: its size.
+        sha256: its checksum.
+    """
+
+    name: str
+    file: Path
+    frames: int
+    bytes: int
+    sha256: str
+
+
+def record(
+    kind: str,
+    folder: Path,
+    frames: int,
+    *,
+    scene: SceneConfig | None = None,
+    settings: RecordConfig | None = None,
+    views: Sequence[str] | None = None,
+    jobs: int = 1,
+    force: bool = False,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> list[ViewRecording]:
+    """Record the first frames of a scene into a folder.
+
+    The files depend on the scene's configuration and seed only: not on `jobs`, not on
+    which views are recorded, not on having been interrupted and resumed. Ctrl-C,
+    SIGTERM and errors leave readable `.partial` files.
+
+    Args:
+        kind: name of the scene.
+        folder: made if it does not exist.
+        frames: how many, of each view.
+        scene: the world; a seed of None is 0.
+        settings: the clock and the files.
+        views: which views; by default all.
+        jobs: processes that render.
+        force: overwrite an earlier recording in the folder.
+        resume: go on where an earlier attempt with the same arguments ended.
+        progress: called after every block.
+
+    Raises:
+        UsageError: the folder exists, or an argument is wrong.
+        LogWriteError: the disk does not take it.
+        CdmisfaError: the scene cannot be opened.
+    """
+    scene = dataclasses.replace(scene or SceneConfig(), kind=cast(Any, kind))
+    scene = dataclasses.replace(scene, seed=scene.seed or 0)
+    settings = settings or RecordConfig()
+    folder = Path(folder)
+    if frames < 1:
+        raise UsageError(f"--frames is {frames}: record at least one")
+    if not 1 <= jobs <= MAX_JOBS:
+        raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
+    if force and resume:
+        raise UsageError("--force starts anew and --resume goes on: use one of them")
+    if folder.exists() and not (force or resume) and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(
+            f"{folder} exists: choose another folder, go on with --resume or overwrite with --force"
+        )
+    with contextlib.closing(open_scene(kind, scene, settings)) as source:
+        names = _chosen(source.spec, views)
+        identity = Identity(
+            kind,
+            scene.seed or 0,
+            source.spec,
+            {"scene": as_table(scene), "record": as_table(settings)},
+        )
+        _prepare(folder, source.spec, force=force)
+        with _stoppable() as stopped, ExitStack() as open_logs:
+            logs = []
+            for name in names:
+                pose = _poses(source).get(name)
+                log = _open_log(folder, name, identity, settings, pose, frames, force, resume)
+                open_logs.callback(log.abandon)
+                logs.append(log)
+            by_stream = {log.stream: log for log in logs}
+            wanted = requests({log.stream: log.t for log in logs}, frames)
+            blocks = (
+                render_here(source, wanted)
+                if jobs == 1
+                else render_in_processes(kind, scene, settings, wanted, jobs)
+            )
+            with contextlib.closing(blocks):
+                for block in blocks:
+                    by_stream[block.stream].write(block)
+                    if progress is not None:
+                        progress(sum(log.t for log in logs), frames * len(logs))
+                    if stopped():
+                        raise _StoppedError(f"{folder} is not finished: go on with --resume")
+            for log in logs:
+                log.finish()
+    for log in logs:
+        kept_path(log.path).unlink(missing_ok=True)
+    return [
+        ViewRecording(log.view, log.path, log.t, log.path.stat().st_size, sha256(log.path))
+        for log in logs
+    ]
+
+
+class _StoppedError(CdmisfaError):
+    """A signal asked the recording to end."""
+
+    exit_code = 130
+
+
+def _chosen(spec: SourceSpec, views: Sequence[str] | None) -> list[str]:
+    for view in views or ():
+        if view not in spec.streams:
+            raise UsageError(f"no view {view!r}: the scene has {', '.join(spec.streams)}")
+    return [name for name in spec.streams if not views or name in views]
+
+
+def _poses(source: FrameSource) -> dict[str, HeadPose]:
+    poses: Sequence[HeadPose] = getattr(source, "head_poses", ())
+    return dict(zip(source.spec.streams, poses, strict=False))
+
+
+def _prepare(folder: Path, spec: SourceSpec, *, force: bool) -> None:
+    """Make the folder; where it may be overwritten, remove the recording in it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if force:
+            for name in spec.streams:
+                for old in earlier_logs(folder / f"{name}.mcap"):
+                    old.unlink()
+    except OSError as error:
+        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+
+
+def _open_log(
+    folder: Path,
+    view: str,
+    identity: Identity,
+    settings: RecordConfig,
+    pose: HeadPose | None,
+    frames: int,
+    force: bool,
+    resume: bool,
+) -> ViewLog:
+    path = folder / f"{view}.mcap"
+    earlier = {p: whole_frames(p, view) for p in earlier_logs(path)} if resume else {}
+    best = max(earlier, key=lambda p: earlier[p], default=None)
+    if best is None:
+        return ViewLog(folder, view, identity, settings, pose=pose, force=force)
+    if earlier[best]:
+        check_identity(best, identity.metadata(view))
+    kept = keep(path, best)
+    log = ViewLog(folder, view, identity, settings, pose=pose)
+    try:
+        log.copy(kept, min(earlier[best], frames))
+    except BaseException:
+        log.abandon()
+        raise
+    return log
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[Callable[[], bool]]:
+    """Turn Ctrl-C and SIGTERM into a question asked between blocks.
+
+    An exception in the middle of a write could tear a file. Once the files are closed
+    the signal is sent on to whom it was for. A second signal is not waited for.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    received: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        signal.signal(number, before[number])
+
+    before = {
+        int(number): signal.signal(number, note) or signal.SIG_DFL
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if received:
+            signal.raise_signal(received[0])
