@@ -100,7 +100,9 @@ class Reporter:
         """Take in where the run stands."""
         if progress.modules > self._modules:
             self._modules = progress.modules
-            self._shown.say(f"module {progress.modules} saved at iteration {progress.iteration}")
+            self._shown.say(
+                f"module {progress.modules} saved at iteration {progress.iteration - 1}"
+            )
         now = time.monotonic()
         if now >= self._next:
             self._next = now + TICK

@@ -71,6 +71,23 @@ def configure(
     )
 
 
+def configure_scene(
+    name: str, preset: str | None = None, settings: Sequence[str] = (), seed: int = 0
+) -> Configuration:
+    """`configure` for the name of a scene as a user wrote it.
+
+    Raises:
+        UsageError: no such scene, or as for `configure`.
+    """
+    from recorder.scenes import SCENES
+
+    if name not in SCENES:
+        close = difflib.get_close_matches(name, SCENES, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(SCENES)}"
+        raise UsageError(f"no scene {name!r}: {hint}")
+    return configure(name, preset, settings, seed)
+
+
 def preset_for(spec: SourceSpec, described: Mapping[str, Any]) -> str:
     """The preset for a recording: that of its scene, else by what a frame is."""
     from recorder.scenes import SCENES

@@ -1,0 +1,82 @@
+"""`cdmisfa info`, `verify` and `recover`: what is in a log, is it whole, what can be saved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.errors import LogDamagedError
+
+
+@click.command("info")
+@options.path_argument("path")
+@options.as_json
+def info_command(path: Path, as_json: bool) -> None:
+    """Say what is in a recording, a run or any MCAP file."""
+    from replay.info import describe
+
+    document = describe(path)
+    if as_json:
+        options.print_json(document)
+        return
+    state = "complete" if document["complete"] else "cut short"
+    click.echo(f"{path}: {document['kind']}, {state}, checksums {document['crc']}")
+    options.print_table(
+        ("topic", "messages", "encoding", "schema", "start_ns", "end_ns"),
+        [
+            [c[key] for key in ("topic", "messages", "encoding", "schema", "start_ns", "end_ns")]
+            for c in document["channels"]
+        ],
+    )
+
+
+@click.command("verify")
+@options.path_argument("path")
+@options.as_json
+@click.pass_context
+def verify_command(ctx: click.Context, path: Path, as_json: bool) -> None:
+    """Check that a log is whole: structure, checksums, no gaps.
+
+    Exits with 3 when anything is wrong.
+    """
+    from replay.verify import verify
+
+    document = verify(path)
+    if as_json:
+        options.print_json(document)
+    elif document["ok"]:
+        click.echo(f"{path}: whole")
+    else:
+        options.print_table(
+            ("where", "what"), [(p["where"], p["what"]) for p in document["problems"]]
+        )
+    if not document["ok"]:
+        ctx.exit(LogDamagedError.exit_code)
+
+
+@click.command("recover")
+@options.path_argument("path")
+@options.out("The whole log to write.", required=True)
+@options.force
+@options.as_json
+@click.pass_context
+def recover_command(ctx: click.Context, path: Path, out: Path, force: bool, as_json: bool) -> None:
+    """Save what can be read of a damaged log as a whole one.
+
+    Exits with 3 when something could not be saved.
+    """
+    from replay.recover import recover
+
+    report = recover(path, out, force=force)
+    if as_json:
+        options.print_json(report)
+    else:
+        options.print_table(
+            ("topic", "kept", "lost"),
+            [(c["topic"], c["kept"], c["lost"]) for c in report["channels"]],
+        )
+        click.echo(f"written {out}")
+    if not report["complete"]:
+        ctx.exit(LogDamagedError.exit_code)

@@ -1,0 +1,88 @@
+"""`cdmisfa record`: write what a scene shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.progress import bar
+
+
+@click.command("record")
+@click.argument("scene")
+@options.out("Folder of the recording.")
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    default=1000,
+    show_default=True,
+    help="Frames of each view.",
+)
+@options.seed
+@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
+@options.jobs
+@options.preset
+@options.settings
+@click.option(
+    "--scene-picture",
+    type=click.Path(path_type=Path),
+    metavar="F.png",
+    help="Draw the scene from outside instead of recording it.",
+)
+@options.force
+@options.as_json
+def record_command(
+    scene: str,
+    out: Path | None,
+    frames: int,
+    seed: int,
+    views: tuple[str, ...],
+    jobs: int,
+    preset: str | None,
+    settings: tuple[str, ...],
+    scene_picture: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Record what a scene shows, one MCAP file per view.
+
+    SCENE is icub or oscillatory. The same seed gives the same bytes.
+    """
+    from cdmisfa.experiments.sources import configure_scene
+
+    configuration = configure_scene(scene, preset, settings, seed)
+    if scene_picture is not None:
+        from recorder.picture import scene_picture as draw
+
+        draw(configuration.scene, scene_picture, force=force)
+        click.echo(f"picture {scene_picture}", err=True)
+        if out is None:
+            return
+    if out is None:
+        raise click.UsageError("say -o FOLDER, where the recording goes")
+    from recorder.recording import record
+
+    with bar("recording", frames, "frames") as shown:
+        files = record(
+            scene,
+            out,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            views=views or None,
+            jobs=jobs,
+            force=force,
+            progress=shown.update,
+        )
+    rows = [file.as_json() for file in files]
+    if as_json:
+        options.print_json(
+            {"schema": options.SCHEMA, "recording": str(out), "frames": frames, "views": rows}
+        )
+        return
+    options.print_table(
+        ("view", "file", "frames", "bytes", "sha256"),
+        [(r["name"], r["file"], r["frames"], r["bytes"], r["sha256"]) for r in rows],
+    )

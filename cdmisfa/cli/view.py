@@ -1,0 +1,58 @@
+"""`cdmisfa view`: look at a run in Rerun."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+
+FILE = click.Path(path_type=Path)
+
+
+@click.command("view")
+@options.path_argument("run")
+@click.option("--save", type=FILE, metavar="F.rrd", help="Write the view to a file and end.")
+@click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
+@click.option("--screenshot", type=FILE, metavar="F.png", help="Draw the view without a screen.")
+@click.option("--at", type=click.IntRange(0), metavar="FRAME", help="Frame of the screenshot.")
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=10,
+    show_default=True,
+    help="Show every so many watched frames.",
+)
+@click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
+@options.force
+def view_command(
+    run: Path,
+    save: Path | None,
+    web: bool,
+    screenshot: Path | None,
+    at: int | None,
+    every: int,
+    memory_limit: str,
+    force: bool,
+) -> None:
+    """Open a run in the Rerun viewer, or save, serve or picture it.
+
+    RUN is the folder of a run, or its run.mcap.
+    """
+    if sum((save is not None, web, screenshot is not None)) > 1:
+        raise click.UsageError("choose one of --save, --web and --screenshot")
+    if at is not None and screenshot is None:
+        raise click.UsageError("--at goes with --screenshot")
+    from replay import viewer
+
+    if save is not None:
+        viewer.save(run, save, every=every, force=force)
+        click.echo(f"view {save}", err=True)
+    elif screenshot is not None:
+        viewer.screenshot(run, screenshot, at=at, every=every, force=force)
+        click.echo(f"picture {screenshot}", err=True)
+    elif web:
+        viewer.serve(run, every=every, memory_limit=memory_limit)
+    else:
+        viewer.open_window(run, every=every, memory_limit=memory_limit)
