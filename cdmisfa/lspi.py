@@ -18,6 +18,9 @@ Int = NDArray[np.int64]
 MAX_SWEEPS = 100
 """Policy iteration ends after a handful of sweeps; this only bounds rounding cycles."""
 
+TIE = 1e-12
+"""Share of an action value below which a difference is rounding, so that the tie goes to stay."""
+
 
 @compiled
 def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
@@ -30,7 +33,6 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
         gamma: discount factor.
     """
     n = len(stay)
-    share = gamma / (n - 1)
     staying = 0.0
     leaving = 0.0
     leavers = 0
@@ -39,8 +41,9 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
         staying += stay[s] * (1 - leaves)
         leaving += switch[s] * leaves
         leavers += leaves
-    fixed = staying / (1.0 - gamma) + leaving / (n - 1) / (1.0 + share)
-    return fixed / (1.0 - leavers * share / (1.0 + share))
+    fixed = staying / (1.0 - gamma) * (n - 1 + gamma) + leaving
+    # Written so that nothing cancels when every stream is left and gamma is close to 1.
+    return fixed / (n - leavers + (leavers - 1) * (1.0 - gamma))
 
 
 @compiled
@@ -79,7 +82,7 @@ def policy_iteration(
             q_switch = switch + share * (total - value)
             Q[s, 0] = q_stay * scale
             Q[s, 1] = q_switch * scale
-            better = 1 if q_switch > q_stay else 0
+            better = 1 if q_switch - q_stay > TIE * (abs(q_stay) + abs(q_switch)) else 0
             changed += better != policy[s]
             policy[s] = better
         if changed == 0:

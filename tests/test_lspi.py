@@ -1,0 +1,122 @@
+"""Policy iteration in O(n) against the dense linear solution."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdmisfa.lspi import policy_iteration, value_sum
+
+ACTIONS = 2
+
+
+def transitions(n: int) -> np.ndarray:
+    """P(s, a, s'): stay leads to s, switch to each other stream with 1/(n-1)."""
+    P = np.zeros((n, ACTIONS, n))
+    P[:, 0] = np.eye(n)
+    P[:, 1] = (1 - np.eye(n)) / (n - 1)
+    return P
+
+
+def dense_values(r: np.ndarray, policy: np.ndarray, gamma: float) -> np.ndarray:
+    """V of a policy: (1 - gamma P_pi) V = r_pi, (n,)."""
+    n = len(policy)
+    pick = np.arange(n)
+    P = transitions(n)[pick, policy]
+    return np.linalg.solve(np.eye(n) - gamma * P, r[pick, policy])
+
+
+def dense_q(r: np.ndarray, policy: np.ndarray, gamma: float) -> np.ndarray:
+    """Q of a policy, (n, 2)."""
+    V = dense_values(r, policy, gamma)
+    return r + gamma * transitions(len(policy)) @ V
+
+
+def solve(
+    stay: np.ndarray, switch: np.ndarray, count: int, gamma: float, start: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    n = len(stay)
+    policy = np.zeros(n, np.int64) if start is None else start.copy()
+    Q = np.full((n, ACTIONS), np.nan)
+    policy_iteration(stay, switch, count, gamma, policy, Q)
+    return policy, Q
+
+
+@st.composite
+def problems(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int, float, np.ndarray]:
+    n = draw(st.integers(2, 50))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    scale = 10.0 ** draw(st.integers(-5, 1))
+    gamma = draw(st.sampled_from([0.0, 0.5, 0.9, 0.99, 0.999]))
+    start = rng.integers(0, 2, n)
+    count = draw(st.integers(1, 2000))
+    return scale * rng.standard_normal(n), scale * rng.standard_normal(n), count, gamma, start
+
+
+@settings(deadline=None)
+@given(problems())
+def test_q_is_the_dense_solution_and_the_policy_is_optimal(
+    problem: tuple[np.ndarray, np.ndarray, int, float, np.ndarray],
+) -> None:
+    stay, switch, count, gamma, start = problem
+    n = len(stay)
+    policy, Q = solve(stay, switch, count, gamma, start)
+    r = np.stack([stay, switch / (n - 1)], axis=1) / count
+    expected = dense_q(r, policy, gamma)
+    np.testing.assert_allclose(Q, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    slack = 1e-9 * np.abs(expected).max()
+    assert (expected[np.arange(n), policy] >= expected.max(axis=1) - slack).all()
+
+
+@settings(deadline=None)
+@given(problems())
+def test_the_sum_of_values_is_the_dense_one(
+    problem: tuple[np.ndarray, np.ndarray, int, float, np.ndarray],
+) -> None:
+    stay, switch, _, gamma, policy = problem
+    r = np.stack([stay, switch / (len(stay) - 1)], axis=1)
+    V = dense_values(r, policy, gamma)
+    got = value_sum(stay, switch, policy, gamma)
+    assert got == pytest.approx(V.sum(), rel=1e-9, abs=1e-9 * np.abs(V).sum())
+
+
+@settings(deadline=None)
+@given(problems())
+def test_where_it_starts_does_not_matter(
+    problem: tuple[np.ndarray, np.ndarray, int, float, np.ndarray],
+) -> None:
+    stay, switch, count, gamma, start = problem
+    np.testing.assert_array_equal(
+        solve(stay, switch, count, gamma, start)[0], solve(stay, switch, count, gamma)[0]
+    )
+
+
+def test_one_stream_stays() -> None:
+    policy, Q = solve(np.array([3.0]), np.array([9.0]), 2, 0.5, np.array([1]))
+    assert policy.tolist() == [0]
+    assert Q.tolist() == [[3.0, 3.0]]
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 50])
+@pytest.mark.parametrize("reward", [0.0, 0.1, -0.1, 1 / 3, 1e-7])
+@pytest.mark.parametrize("gamma", [0.5, 0.9, 0.99, 0.999])
+def test_ties_go_to_stay_whatever_the_rounding(n: int, reward: float, gamma: float) -> None:
+    stay = np.full(n, reward)
+    for start in (np.zeros(n, np.int64), np.ones(n, np.int64)):
+        policy, _ = solve(stay, stay * (n - 1), 7, gamma, start)
+        assert policy.tolist() == [0] * n
+
+
+@pytest.mark.parametrize(("best", "policy"), [(0, [0, 1, 1]), (1, [1, 0, 1]), (2, [1, 1, 0])])
+def test_the_papers_policies(best: int, policy: list[int]) -> None:
+    stay = np.full(3, 0.01)
+    stay[best] = 0.05
+    assert solve(stay, np.zeros(3), 10, 0.99)[0].tolist() == policy
+
+
+def test_rewards_are_not_changed() -> None:
+    stay, switch = np.array([0.1, 0.2]), np.array([0.3, 0.1])
+    solve(stay, switch, 3, 0.99)
+    assert (stay.tolist(), switch.tolist()) == ([0.1, 0.2], [0.3, 0.1])
