@@ -19,9 +19,9 @@ SIZE = (960, 720)
 """Width and height of the picture, pixels."""
 
 _SAMPLES = 2
-_CAMERA = np.array([-1.55, -2.35, 0.75])
-_TARGET = np.array([-0.35, 0.0, -0.12])
-_FOV = 33.0
+_CAMERA = np.array([-1.15, -3.1, 0.85])
+_TARGET = np.array([-0.36, 0.0, -0.16])
+_FOV = 29.0
 _LIGHT = (-0.6, -0.8, 1.4)
 _FLOOR = -0.6
 _TABLE_BACK, _TABLE_FRONT, _TABLE_SIDE = -0.3, -0.95, 0.75
@@ -57,7 +57,6 @@ def scene_picture(scene: SceneConfig, path: Path, *, force: bool = False) -> Pat
             width,
             height,
             _LIGHT,
-            shadow=True,
         )
     image = Image.fromarray(colours[..., :3]).resize(SIZE, Image.Resampling.LANCZOS)
     try:
@@ -79,4 +78,4 @@ def _furnish(world: World, scene: SceneConfig) -> None:
     for x in (_TABLE_BACK - 0.05, _TABLE_FRONT + 0.05):
         for y in (-_TABLE_SIDE + 0.05, _TABLE_SIDE - 0.05):
             world.add_box((x, y, _FLOOR + length), (0.02, 0.02, length), (0.35, 0.32, 0.3))
-    world.add_box((0.0, 0.0, _FLOOR - 0.01), (6.0, 6.0, 0.01), (0.82, 0.84, 0.86))
+    world.add_box((0.0, 0.0, _FLOOR - 0.01), (12.0, 12.0, 0.01), (0.82, 0.84, 0.86))

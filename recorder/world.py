@@ -114,8 +114,6 @@ class World:
         width: int,
         height: int,
         light: tuple[float, float, float],
-        *,
-        shadow: bool = False,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """What a camera sees.
 
@@ -133,7 +131,7 @@ class World:
                 view,
                 projection,
                 lightDirection=light,
-                shadow=int(shadow),
+                shadow=0,
                 renderer=bullet.ER_TINY_RENDERER,
                 flags=bullet.ER_NO_SEGMENTATION_MASK,
                 physicsClientId=self._client,
