@@ -56,14 +56,18 @@ class ViewRecording:
     bytes: int
     sha256: str
 
+    def as_json(self) -> dict[str, Any]:
+        """The file as plain JSON values."""
+        return {**dataclasses.asdict(self), "file": str(self.file)}
+
 
 def record(
     kind: str,
     folder: Path,
-    frames: int,
-    *,
     scene: SceneConfig | None = None,
     settings: RecordConfig | None = None,
+    *,
+    frames: int,
     views: Sequence[str] | None = None,
     jobs: int = 1,
     force: bool = False,
@@ -79,9 +83,9 @@ def record(
     Args:
         kind: name of the scene.
         folder: made if it does not exist.
-        frames: how many, of each view.
         scene: the world; a seed of None is 0.
         settings: the clock and the files.
+        frames: how many, of each view.
         views: which views; by default all.
         jobs: processes that render.
         force: overwrite an earlier recording in the folder.
