@@ -47,6 +47,57 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
 
 
 @compiled
+def improve(stay: Float, switch: Float, total: float, gamma: float, policy: Int) -> int:
+    """Make a policy greedy for the values it has; return how many streams changed their mind.
+
+    Args:
+        stay: (S,) reward of staying.
+        switch: (S,) reward of switching, summed over the n-1 streams it may lead to.
+        total: sum T of the values under the policy.
+        gamma: discount factor.
+        policy: (S,) read and written: 0 stay, 1 switch.
+    """
+    n = len(stay)
+    share, mean = gamma / (n - 1), 1.0 / (n - 1)
+    damp, horizon = 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
+    changed = 0
+    for s in range(n):
+        leave = (switch[s] * mean + share * total) * damp
+        value = leave if policy[s] == 1 else stay[s] * horizon
+        q_stay = stay[s] + gamma * value
+        q_switch = switch[s] * mean + share * (total - value)
+        better = 1 if q_switch - q_stay > TIE * (abs(q_stay) + abs(q_switch)) else 0
+        changed += better ^ policy[s]
+        policy[s] = better
+    return changed
+
+
+@compiled
+def action_values(
+    stay: Float, switch: Float, total: float, gamma: float, policy: Int, scale: float, Q: Float
+) -> None:
+    """Values of both actions in every stream under a policy, times `scale`.
+
+    Args:
+        stay: (S,) reward of staying.
+        switch: (S,) reward of switching, summed over the n-1 streams it may lead to.
+        total: sum T of the values under the policy.
+        gamma: discount factor.
+        policy: (S,) 0 stay, 1 switch.
+        scale: common factor.
+        Q: (S, 2) written.
+    """
+    n = len(stay)
+    share, mean = gamma / (n - 1), 1.0 / (n - 1)
+    damp, horizon = 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
+    for s in range(n):
+        leave = (switch[s] * mean + share * total) * damp
+        value = leave if policy[s] == 1 else stay[s] * horizon
+        Q[s, 0] = (stay[s] + gamma * value) * scale
+        Q[s, 1] = (switch[s] * mean + share * (total - value)) * scale
+
+
+@compiled
 def policy_iteration(
     stay_sum: Float, switch_sum: Float, count: float, gamma: float, policy: Int, Q: Float
 ) -> None:
@@ -60,30 +111,14 @@ def policy_iteration(
         policy: (S,) read and written: 0 stay, 1 switch.
         Q: (S, 2) written: action values under the policy.
     """
-    n = len(stay_sum)
-    if n == 1:
+    if len(stay_sum) == 1:
         policy[0] = 0
         Q[0, 0] = stay_sum[0] / count / (1.0 - gamma)
         Q[0, 1] = Q[0, 0]
         return
-    share = gamma / (n - 1)
-    mean = 1.0 / (n - 1)
-    damp = 1.0 / (1.0 + share)
-    horizon = 1.0 / (1.0 - gamma)
-    scale = 1.0 / count
+    total = value_sum(stay_sum, switch_sum, policy, gamma)
     for _ in range(MAX_SWEEPS):
+        if improve(stay_sum, switch_sum, total, gamma, policy) == 0:
+            break
         total = value_sum(stay_sum, switch_sum, policy, gamma)
-        changed = 0
-        for s in range(n):
-            stay = stay_sum[s]
-            switch = switch_sum[s] * mean
-            value = (switch + share * total) * damp if policy[s] == 1 else stay * horizon
-            q_stay = stay + gamma * value
-            q_switch = switch + share * (total - value)
-            Q[s, 0] = q_stay * scale
-            Q[s, 1] = q_switch * scale
-            better = 1 if q_switch - q_stay > TIE * (abs(q_stay) + abs(q_switch)) else 0
-            changed += better != policy[s]
-            policy[s] = better
-        if changed == 0:
-            return
+    action_values(stay_sum, switch_sum, total, gamma, policy, 1.0 / count, Q)
