@@ -59,6 +59,7 @@ class LogFile:
         *,
         force: bool = False,
         library: str = "cdmisfa",
+        profile: str = "",
         compression: Compression = "zstd",
         chunk_size: int = 1024 * 1024,
         flush_ns: int = FLUSH_NS,
@@ -86,7 +87,7 @@ class LogFile:
             enable_data_crcs=True,
         )
         try:
-            self._writer.start(profile="", library=library)
+            self._writer.start(profile=profile, library=library)
         except BaseException:
             self._stream.close()
             raise
@@ -131,23 +132,33 @@ class LogFile:
         self._writer.add_metadata(name, dict(values))
         self._stream.flush()
 
-    def add_attachment(self, name: str, media_type: str, data: bytes, *, log_time: int = 0) -> None:
-        """Write a named file at once, outside the chunks; its creation time is left out.
+    def add_attachment(
+        self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
+    ) -> None:
+        """Write a named file at once, outside the chunks; times in nanoseconds.
 
         Raises:
             LogWriteError: the disk does not take it.
         """
-        self._writer.add_attachment(0, log_time, name, media_type, data)
+        self._writer.add_attachment(create_time, log_time, name, media_type, data)
         self._stream.flush()
 
-    def write(self, channel: int, log_time: int, data: bytes, sequence: int = 0) -> None:
+    def write(
+        self,
+        channel: int,
+        log_time: int,
+        data: bytes,
+        sequence: int = 0,
+        publish_time: int | None = None,
+    ) -> None:
         """Write a message; what is older than a second of log time is flushed first.
 
         Args:
             channel: id from `add_channel`.
-            log_time: nanoseconds; also the publish time.
+            log_time: nanoseconds.
             data: the encoded message.
             sequence: the publisher's counter.
+            publish_time: nanoseconds; the log time where none is given.
 
         Raises:
             LogWriteError: the disk does not take it, now or at any time before.
@@ -158,7 +169,8 @@ class LogFile:
         elif log_time - self._chunk_start >= self._flush_ns:
             self.flush()
             self._chunk_start = log_time
-        self._writer.add_message(channel, log_time, data, log_time, sequence)
+        published = log_time if publish_time is None else publish_time
+        self._writer.add_message(channel, log_time, data, published, sequence)
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import hashlib
 import itertools
 from collections.abc import Iterable, Mapping
@@ -12,7 +13,7 @@ import numpy as np
 
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
 from cdmisfa.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
-from replay.viewfile import ViewFacts, ViewFile
+from replay.viewfile import ViewFacts, ViewFile, intersection
 
 CACHE_BYTES: Final = 128 * 1024 * 1024
 """Decoded chunks that a source keeps, over all its views."""
@@ -51,7 +52,7 @@ class RecordedSource:
             for path in self._files:
                 share = CACHE_BYTES // len(self._files)
                 opened.append(ViewFile(path, salvage=salvage, cache_bytes=share))
-            self._views = _arrange(opened)
+            self._views = _arrange(opened, salvage=salvage)
             self._set_clock()
         except BaseException:
             for view in opened:
@@ -92,9 +93,9 @@ class RecordedSource:
         truth = np.empty((n, len(self._spec.truth)))
         at = 0
         while at < n:
-            view, row, count = self._place(stream, (played + at) % self._count, n - at)
-            view.frames(row, frames[at : at + count])
-            view.truth(row, truth[at : at + count])
+            view, frame, count = self._place(stream, (played + at) % self._count, n - at)
+            view.frames(frame, frames[at : at + count])
+            view.truth(frame, truth[at : at + count])
             at += count
         block = Block(stream, self._t, freeze(frames), freeze(truth))
         self._t += n
@@ -152,41 +153,32 @@ class RecordedSource:
     def _set_clock(self) -> None:
         """Find the frames that every view has, whole."""
         facts = [parts[0].facts for parts in self._views]
-        stops = [parts[-1].facts.first_frame + parts[-1].count for parts in self._views]
-        self._first = max(f.first_frame for f in facts)
-        stop = min(stops)
-        if stop <= self._first:
-            raise LogDamagedError(f"{self._name()}: no frame is there in every view")
-        keep = np.ones(stop - self._first, bool)
-        warnings = [
-            f"{view.path}: {view.reader.missing}"
-            for parts in self._views
-            for view in parts
-            if view.reader.missing
-        ]
-        for parts in self._views:
-            for view in parts:
-                shift = view.facts.first_frame - self._first
-                for low, high in view.lost:
-                    keep[max(low + shift, 0) : max(high + shift, 0)] = False
-                warnings += [f"{view.path}: {p.where}: {p.what}" for p in view.reader.problems]
-        if len(set(stops)) > 1:
-            warnings.append(
-                f"{self._name()}: its views end at different frames, the {stop - self._first} "
-                "frames that all have are used"
-            )
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], keep.astype(np.int8), [0]])))
-        self._ranges = edges.reshape(-1, 2) + self._first
-        self._range_starts = np.concatenate(
-            [[0], np.cumsum(self._ranges[:, 1] - self._ranges[:, 0])]
+        covered = [[r for view in parts for r in view.ranges] for parts in self._views]
+        common = covered[0]
+        for ranges in covered[1:]:
+            common = intersection(common, ranges)
+        if not common:
+            raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
+        self._ranges = _joined(common)
+        self._range_starts = list(
+            itertools.accumulate((stop - start for start, stop in self._ranges), initial=0)
         )
-        self._count = int(self._range_starts[-1])
-        if not self._count:
-            raise LogDamagedError(f"{self._name()}: no frame is whole in every view")
-        if self._count < len(keep):
+        self._first = self._ranges[0][0]
+        self._count = self._range_starts[-1]
+        warnings: list[str] = []
+        for view in itertools.chain.from_iterable(self._views):
+            if view.reader.missing:
+                warnings.append(f"{view.path}: {view.reader.missing}")
+            warnings += [f"{view.path}: {p.where}: {p.what}" for p in view.reader.problems]
+        if len({ranges[-1][1] for ranges in covered}) > 1:
             warnings.append(
-                f"{self._name()}: {len(keep) - self._count} frames are damaged in a view and left "
-                "out in all"
+                f"{self._name()}: its views end at different frames; it ends with the shortest, "
+                f"before frame {self._ranges[-1][1]}"
+            )
+        left_out = self._ranges[-1][1] - self._first - self._count
+        if left_out:
+            warnings.append(
+                f"{self._name()}: {left_out} frames are missing in a view and left out in all"
             )
         self.warnings = tuple(warnings)
         self._t = self._first
@@ -201,14 +193,15 @@ class RecordedSource:
         )
 
     def _place(self, stream: int, played: int, wanted: int) -> tuple[ViewFile, int, int]:
-        """Where the frame `played` from the start lies: file, row there, frames that follow."""
-        number = int(np.searchsorted(self._range_starts, played, side="right")) - 1
-        low, high = (int(edge) for edge in self._ranges[number])
-        frame = low + played - int(self._range_starts[number])
-        parts = self._views[stream]
-        view = next(v for v in reversed(parts) if v.facts.first_frame <= frame)
-        row = frame - view.facts.first_frame
-        return view, row, min(wanted, high - frame, view.count - row)
+        """Find the frame that is `played` frames from the start: file, frame, how many follow."""
+        number = bisect.bisect_right(self._range_starts, played) - 1
+        low, high = self._ranges[number]
+        frame = low + played - self._range_starts[number]
+        for view in self._views[stream]:
+            for start, stop in view.ranges:
+                if start <= frame < stop:
+                    return view, frame, min(wanted, min(high, stop) - frame)
+        raise AssertionError(f"frame {frame} is in no file")
 
 
 def view_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
@@ -251,7 +244,7 @@ def sha256(path: Path) -> str:
         raise CdmisfaError(f"{path}: {error.strerror}") from None
 
 
-def _arrange(opened: list[ViewFile]) -> list[list[ViewFile]]:
+def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
     """Views by stream index, each as its parts by first frame."""
     by_view: dict[tuple[int, str], list[ViewFile]] = {}
     for view in opened:
@@ -273,10 +266,11 @@ def _arrange(opened: list[ViewFile]) -> list[list[ViewFile]]:
     for stream in sorted(by_view):
         parts = sorted(by_view[stream], key=lambda v: v.facts.first_frame)
         for one, two in itertools.pairwise(parts):
-            if one.facts.first_frame + one.count != two.facts.first_frame:
+            end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
+            if end > two.facts.first_frame or (end < two.facts.first_frame and not salvage):
                 raise LogDamagedError(
                     f"{two.path}: begins at frame {two.facts.first_frame}, {one.path.name} ends "
-                    f"at {one.facts.first_frame + one.count}: a part is missing or doubled"
+                    f"before {end}: a part is missing or doubled"
                 )
         arranged.append(parts)
     return arranged
@@ -290,3 +284,14 @@ def _difference(one: ViewFacts, two: ViewFacts) -> str:
         if one.values.get(key) != two.values.get(key):
             return key
     return ""
+
+
+def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Sorted ranges with those that touch made one."""
+    found: list[tuple[int, int]] = []
+    for start, stop in ranges:
+        if found and found[-1][1] == start:
+            found[-1] = (found[-1][0], stop)
+        else:
+            found.append((start, stop))
+    return found

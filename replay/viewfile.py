@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,6 +36,7 @@ from replay.tables import MessageTable
 
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
+MAX_FRAMES: Final = 2**33
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +65,16 @@ class ViewFacts:
     first_frame: int
     values: Mapping[str, str]
 
-    def times(self, start: int, count: int) -> NDArray[np.uint64]:
-        """Log times of `count` frames from frame `start` on, as `SourceSpec.time_ns` gives them."""
-        t = np.arange(start, start + count, dtype=np.int64)
-        offsets = np.rint(t * NANOSECONDS / self.fps).astype(np.int64)
+    def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
+        """Log times of frames, as `SourceSpec.time_ns` gives them."""
+        offsets = np.rint(frames * NANOSECONDS / self.fps).astype(np.int64)
         return (self.start_ns + offsets).astype(np.uint64)
+
+    def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
+        """Frames at log times; one that is not exactly a frame's gets a frame near it."""
+        offsets = times.astype(np.int64) - self.start_ns
+        frames = np.rint(offsets * (self.fps / NANOSECONDS))
+        return np.asarray(np.clip(frames, -1, MAX_FRAMES), dtype=np.int64)
 
 
 def view_facts(path: Path, values: Mapping[str, str]) -> ViewFacts:
@@ -123,9 +131,22 @@ def view_facts(path: Path, values: Mapping[str, str]) -> ViewFacts:
         truth,
         fps,
         number("start_ns", 0, 2**62),
-        number("first_frame", 0, 2**40, "0"),
+        number("first_frame", 0, MAX_FRAMES, "0"),
         dict(values),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Frames `start` to before `stop`, as the messages of a channel from `row` on."""
+
+    start: int
+    stop: int
+    row: int
+
+    def row_of(self, frame: int) -> int:
+        """Number of the message with a frame of the run."""
+        return self.row + frame - self.start
 
 
 class ChannelRows:
@@ -146,29 +167,56 @@ class ChannelRows:
     def __len__(self) -> int:
         return int(self._starts[-1])
 
-    def lost(self) -> list[tuple[int, int]]:
-        """Give the ranges of rows in chunks that are damaged; only decoding tells."""
-        return [
-            (int(self._starts[i]), int(self._starts[i + 1]))
-            for i, segment in enumerate(self._segments)
-            if self._reader.table(segment) is None
-        ]
+    def runs(self, facts: ViewFacts, *, salvage: bool) -> list[Run]:
+        """Number the messages by their log time.
 
-    def times(self, number: int) -> NDArray[np.uint64]:
+        Args:
+            facts: the clock of the recording.
+            salvage: take gaps and damaged chunks as several runs.
+
+        Raises:
+            LogDamagedError: a log time that is no frame's, a frame twice or out of order,
+                and without `salvage` a frame that is missing.
+        """
+        found: list[Run] = []
+        for number in range(len(self._segments)):
+            try:
+                times = self._times(number)
+            except MalformedRecord as error:
+                raise LogDamagedError(f"{self._reader.path}: {error}") from None
+            if salvage and self._reader.table(self._segments[number]) is None:
+                continue
+            first = int(self._starts[number])
+            frames = facts.frames_at(times)
+            exact = facts.times(frames) == times
+            before = found[-1].stop if found else facts.first_frame
+            steps = np.diff(frames, prepend=before - 1)
+            wrong = np.flatnonzero(~exact | (steps < 1 if salvage else steps != 1))
+            if len(wrong):
+                at = int(wrong[0])
+                raise LogDamagedError(
+                    f"{self._reader.path}: {self.channel.topic}: after frame "
+                    f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
+                    f"{frames[at]}: frames are missing or doubled; run cdmisfa verify, or leave "
+                    "out what is missing with --salvage"
+                )
+            edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
+            for low, high in itertools.pairwise(edges):
+                start = int(frames[low])
+                row = first + low
+                if found and found[-1].stop == start and found[-1].row_of(start) == row:
+                    found[-1] = Run(found[-1].start, start + high - low, found[-1].row)
+                else:
+                    found.append(Run(start, start + high - low, row))
+        return found
+
+    def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the messages in the `number`th chunk that holds any."""
         segment = self._segments[number]
         if segment.indexes:
             pairs = [p for c, p in self._reader.index(segment) if c == self.channel.id]
             return np.concatenate(pairs)[:, 0]
         return self._rows(number)[0].log_time
-
-    def chunks(self) -> int:
-        """Count the chunks that hold messages of the channel."""
-        return len(self._segments)
-
-    def span(self, number: int) -> tuple[int, int]:
-        """Rows of the `number`th chunk, from and up to before."""
-        return int(self._starts[number]), int(self._starts[number + 1])
 
     def pieces(self, start: int, count: int) -> list[tuple[MessageTable, int]]:
         """Give `count` messages from row `start` on, chunk by chunk, with where each goes."""
@@ -195,7 +243,7 @@ class ChannelRows:
         if table is None:
             raise LogDamagedError(f"{self._reader.path}: {segment.name} is damaged")
         rows = table.select(np.flatnonzero(table.channel == self.channel.id))
-        first, stop = self.span(number)
+        first, stop = int(self._starts[number]), int(self._starts[number + 1])
         if len(rows) != stop - first:
             raise LogDamagedError(
                 f"{self._reader.path}: {segment.name} holds {len(rows)} messages of "
@@ -210,8 +258,8 @@ class ViewFile:
     Attributes:
         path: the file.
         facts: what it states about itself.
-        count: frames that are there, with their ground truth.
-        lost: ranges of frames that are damaged (only with `salvage`), counted from 0.
+        ranges: the frames that are there with their ground truth, from and up to before;
+            one range, except with `salvage`.
     """
 
     def __init__(
@@ -243,28 +291,33 @@ class ViewFile:
             view_topic(self.facts.view), IMAGE_SCHEMA if image else VECTOR_SCHEMA
         )
         self._truth = self._channel(TRUTH_TOPIC, TRUTH_SCHEMA) if self.facts.truth else None
-        self._check_times(self._frames)
-        self.count = len(self._frames)
+        self._frame_runs = self._frames.runs(self.facts, salvage=salvage)
+        self._truth_runs: list[Run] = []
+        self.ranges = [(run.start, run.stop) for run in self._frame_runs]
         if self._truth is not None:
-            self._check_times(self._truth)
-            self.count = min(self.count, len(self._truth))
-        self.lost: list[tuple[int, int]] = []
-        if salvage:
-            self.lost = self._frames.lost() + (self._truth.lost() if self._truth else [])
-        self._payload = self._find_payload() if self.count else Payload(0, 0, b"")
+            self._truth_runs = self._truth.runs(self.facts, salvage=salvage)
+            self.ranges = intersection(
+                self.ranges, [(run.start, run.stop) for run in self._truth_runs]
+            )
+        self._payload = self._find_payload() if self.ranges else Payload(0, 0, b"")
+
+    @property
+    def count(self) -> int:
+        """Frames that are there."""
+        return sum(stop - start for start, stop in self.ranges)
 
     def frames(self, start: int, out: NDArray[Any]) -> None:
-        """Fill (n, *frame_shape) with the file's frames from its frame `start` on.
+        """Fill (n, *frame_shape) with the frames from `start` on, all in one of `ranges`.
 
         Raises:
             LogDamagedError: a chunk or a message in it is damaged.
         """
         flat = out.reshape(len(out), -1).view(np.uint8)
-        for table, at in self._frames.pieces(start, len(out)):
+        for table, at in self._frames.pieces(_row(self._frame_runs, start), len(out)):
             flat[at : at + len(table)] = self._values(table)
 
     def truth(self, start: int, out: NDArray[np.float64]) -> None:
-        """Fill (n, D) with the ground truth of the file's frames from its frame `start` on.
+        """Fill (n, D) with the ground truth of the frames from `start` on.
 
         Raises:
             LogDamagedError: a chunk or a message in it is damaged.
@@ -272,7 +325,7 @@ class ViewFile:
         if self._truth is None:
             return
         layout, tags = truth_layout(self.facts.truth), truth_tags(self.facts.truth)
-        for table, at in self._truth.pieces(start, len(out)):
+        for table, at in self._truth.pieces(_row(self._truth_runs, start), len(out)):
             raw = self._windows(table, table.at + table.size - layout.itemsize, layout.itemsize)
             rows = np.ascontiguousarray(raw).view(layout)[:, 0]
             for i, (name, tag) in enumerate(zip(self.facts.truth, tags, strict=True)):
@@ -295,31 +348,11 @@ class ViewFile:
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
         return ChannelRows(self.reader, channels[0])
 
-    def _check_times(self, rows: ChannelRows) -> None:
-        for number in range(rows.chunks()):
-            first, stop = rows.span(number)
-            try:
-                times = rows.times(number)
-            except MalformedRecord as error:
-                raise LogDamagedError(f"{self.path}: {error}") from None
-            expected = self.facts.times(self.facts.first_frame + first, stop - first)
-            wrong = np.flatnonzero(times != expected)
-            if len(wrong):
-                row = first + int(wrong[0])
-                raise LogDamagedError(
-                    f"{self.path}: frame {self.facts.first_frame + row} on {rows.channel.topic} is "
-                    f"missing or doubled (log time {times[wrong[0]]} ns instead of "
-                    f"{expected[wrong[0]]}); run cdmisfa verify"
-                )
-
     def _find_payload(self) -> Payload:
         shape = self.facts.frame_shape
         if self.facts.dtype == "float64":
             return vector_payload(shape[0])
-        start = next((b for a, b in [(0, 0), *sorted(self.lost)] if self._good(b)), None)
-        if start is None:
-            return image_payload(shape[0], shape[1], self.facts.view)
-        (table, _), *_ = self._frames.pieces(start, 1)
+        (table, _), *_ = self._frames.pieces(_row(self._frame_runs, self.ranges[0][0]), 1)
         try:
             image = RawImage.FromString(table.payload(0))
         except DecodeError:
@@ -332,9 +365,6 @@ class ViewFile:
         if image.encoding != IMAGE_ENCODING:
             raise LogDamagedError(f"{self.path}: its frames are {image.encoding!r}, not mono8")
         return image_payload(shape[0], shape[1], image.frame_id)
-
-    def _good(self, row: int) -> bool:
-        return row < self.count and not any(a <= row < b for a, b in self.lost)
 
     def _values(self, table: MessageTable) -> Bytes:
         payload = self._payload
@@ -352,3 +382,23 @@ class ViewFile:
             return table.windows(at, size)
         except MalformedRecord as error:
             raise LogDamagedError(f"{self.path}: {error}") from None
+
+
+def intersection(one: list[tuple[int, int]], two: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Give what lies in both of two sorted lists of ranges [start, stop)."""
+    found: list[tuple[int, int]] = []
+    i = j = 0
+    while i < len(one) and j < len(two):
+        low, high = max(one[i][0], two[j][0]), min(one[i][1], two[j][1])
+        if low < high:
+            found.append((low, high))
+        if one[i][1] < two[j][1]:
+            i += 1
+        else:
+            j += 1
+    return found
+
+
+def _row(runs: list[Run], frame: int) -> int:
+    place = bisect.bisect_right(runs, frame, key=lambda run: run.start) - 1
+    return runs[place].row_of(frame)

@@ -1,0 +1,164 @@
+"""What is in a log: channels, times, checksums, and whether it is whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from cdmisfa.errors import LogDamagedError, UsageError
+from recorder.viewlog import METADATA
+from replay.reader import Crc, LogReader
+from replay.records import MalformedRecord
+from replay.runlog import METADATA as RUN_METADATA
+
+SCHEMA: Final = 1
+"""Rises whenever a key of what `describe` gives changes its meaning."""
+CHECK_BYTES: Final = 1024 * 1024 * 1024
+"""Logs with more decompressed bytes are described by their index, not decoded."""
+
+
+@dataclass(slots=True)
+class ChannelSurvey:
+    """How many messages of a channel are there, from when to when (log time, nanoseconds)."""
+
+    messages: int = 0
+    start: int | None = None
+    end: int | None = None
+
+    def add(self, times: Any) -> None:
+        """Take more log times in."""
+        if len(times):
+            low, high = int(times.min()), int(times.max())
+            self.messages += len(times)
+            self.start = low if self.start is None else min(self.start, low)
+            self.end = high if self.end is None else max(self.end, high)
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """Describe a recording's or run's folder, or any MCAP file, as JSON values.
+
+    Torn and damaged files are described as far as they can be read.
+
+    Returns:
+        `schema`, `path`, `kind` ("recording", "run" or "foreign"), `channels` (topic,
+        encoding, schema, messages, start_ns, end_ns, file), `chunks`, `complete`, `crc`
+        ("ok", "absent", "bad" or "unchecked"), `problems` (where, what).
+
+    Raises:
+        UsageError: no such log.
+        LogDamagedError: not an MCAP file.
+    """
+    files = log_files(path)
+    documents = [_describe_file(file) for file in files]
+    kinds = {d["kind"] for d in documents}
+    crcs = [d["crc"] for d in documents]
+    return {
+        "schema": SCHEMA,
+        "path": str(path),
+        "kind": kinds.pop() if len(kinds) == 1 else "foreign",
+        "channels": [c for d in documents for c in d["channels"]],
+        "chunks": sum(d["chunks"] for d in documents),
+        "complete": all(d["complete"] for d in documents),
+        "crc": next(c for c in ("bad", "unchecked", "absent", "ok") if c in crcs),
+        "problems": [p for d in documents for p in d["problems"]],
+        "metadata": {d["file"]: d["metadata"] for d in documents},
+    }
+
+
+def log_files(path: str | Path) -> list[Path]:
+    """The MCAP files of a folder, or the file itself; a `.partial` where nothing else is there.
+
+    Raises:
+        UsageError: there is none.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UsageError(f"{path}: no such file or folder")
+    if not path.is_dir():
+        return [path]
+    whole = sorted(path.glob("*.mcap"))
+    cut = [p for p in sorted(path.glob("*.mcap.partial")) if p.with_suffix("") not in whole]
+    if not whole and not cut:
+        raise UsageError(f"{path}: no .mcap file in this folder")
+    return whole + cut
+
+
+def kind_of(reader: LogReader) -> str:
+    """Tell a recording and a run from other logs by their metadata."""
+    names = {m.name for m in reader.metadata}
+    if METADATA in names:
+        return "recording"
+    return "run" if RUN_METADATA in names else "foreign"
+
+
+def survey(reader: LogReader) -> dict[int, ChannelSurvey]:
+    """Decode every chunk, and count the messages of each channel."""
+    found = {number: ChannelSurvey() for number in reader.channels}
+    for _, table in reader.tables(ordered=False):
+        for number in np.unique(table.channel).tolist():
+            times = table.log_time[table.channel == number]
+            found.setdefault(number, ChannelSurvey()).add(times)
+    return found
+
+
+def survey_index(reader: LogReader) -> dict[int, ChannelSurvey]:
+    """Count the messages of each channel by the message indexes, where there are any."""
+    found = {number: ChannelSurvey() for number in reader.channels}
+    for segment in reader.segments:
+        if segment.indexes:
+            try:
+                for number, pairs in reader.index(segment):
+                    found.setdefault(number, ChannelSurvey()).add(pairs[:, 0])
+            except MalformedRecord as error:
+                raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
+        elif (table := reader.table(segment)) is not None:
+            for number in np.unique(table.channel).tolist():
+                times = table.log_time[table.channel == number]
+                found.setdefault(number, ChannelSurvey()).add(times)
+    return found
+
+
+def crc_state(reader: LogReader, *, decoded: bool) -> Crc:
+    """Say what the checksums of a log amount to."""
+    if any("CRC" in problem.what for problem in reader.problems):
+        return "bad"
+    if not decoded:
+        return "unchecked"
+    return "absent" if reader.crc_absent() else "ok"
+
+
+def _describe_file(path: Path) -> dict[str, Any]:
+    with LogReader(path, salvage=True) as reader:
+        decode = sum(s.size for s in reader.segments) <= CHECK_BYTES
+        surveys = survey(reader) if decode else survey_index(reader)
+        channels = []
+        for number, found in sorted(surveys.items()):
+            channel = reader.channels.get(number)
+            schema = reader.schemas.get(channel.schema_id) if channel else None
+            channels.append(
+                {
+                    "topic": channel.topic if channel else f"(channel {number}, never defined)",
+                    "encoding": channel.encoding if channel else "",
+                    "schema": schema.name if schema else "",
+                    "messages": found.messages,
+                    "start_ns": found.start,
+                    "end_ns": found.end,
+                    "file": path.name,
+                }
+            )
+        problems = [{"where": f"{path}: {p.where}", "what": p.what} for p in reader.problems]
+        if reader.missing:
+            problems.append({"where": str(path), "what": reader.missing})
+        return {
+            "file": path.name,
+            "kind": kind_of(reader),
+            "channels": channels,
+            "chunks": sum(1 for s in reader.segments if s.chunked),
+            "complete": reader.complete,
+            "crc": crc_state(reader, decoded=decode),
+            "problems": problems,
+            "metadata": {m.name: m.values for m in reader.metadata},
+        }
