@@ -34,8 +34,8 @@ from recorder.viewlog import (
 
 MAX_JOBS = 256
 
-Progress = Callable[[int, int], None]
-"""Told the frames written so far and the frames wanted, over all views together."""
+Progress = Callable[[float], None]
+"""Told, after every block, how many frames have been written of every view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def record(
                 for block in blocks:
                     by_stream[block.stream].write(block)
                     if progress is not None:
-                        progress(sum(log.t for log in logs), frames * len(logs))
+                        progress(min(log.t for log in logs))
                     if stopped():
                         raise _StoppedError(f"{folder} is not finished: go on with --resume")
             for log in logs:
