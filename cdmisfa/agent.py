@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from cdmisfa.compiled import compiled
 from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import UsageError
 from cdmisfa.exploration import choose, decay, other_stream
 from cdmisfa.gate import NOVEL
 from cdmisfa.lspi import policy_iteration
-from cdmisfa.reward import add_reward, curiosity_reward, expert_reward
+from cdmisfa.reward import add_reward, add_reward_locally, curiosity_reward, expert_reward
+from cdmisfa.roc import cluster
 from cdmisfa.signals import DENSE_STREAMS
 from cdmisfa.slowness import (
     block_moments,
@@ -41,6 +43,8 @@ MEMORY = np.dtype(
         ("fed_until", "i8"),  # frame after the last novel block
         ("novel_blocks", "i8"),  # since the abstraction was created
         ("rewards", "i8"),  # t of the running reward function
+        ("scale", "f8"),  # what the sums are divided by to give R; 0 before the first reward
+        ("roc_error", "f8"),  # CD-MISFA 1.0: running mean of the clustering error
         ("xi", "f8"),  # mean weight change of the last novel block
         ("share", "f8"),  # running share of novel blocks
         ("epsilon", "f8"),
@@ -79,7 +83,8 @@ class Agent(NamedTuple):
     memory: (1,) of `MEMORY`. Per output (J,): eta, eta_dot, eta_inst, gate_mean, gate_variance,
     the running E(ydot^2) derivative, the sums y_sum and square_sum over y_frames (1,) frames, and
     the recent moments recent_mean, recent_square. Per stream: stay_sum, switch_sum, policy (S,),
-    Q (S, 2), dense (S, 2, S) or (0, 2, 0).
+    Q (S, 2), dense (S, 2, S) or (0, 2, 0). CD-MISFA 1.0 only, else empty: the clustering's
+    centres (S, C, tau, J) and counts (S, C).
     """
 
     memory: NDArray[np.void]
@@ -99,6 +104,8 @@ class Agent(NamedTuple):
     dense: Float
     policy: Int
     Q: Float
+    centres: Float
+    counts: Float
 
 
 class Rules(NamedTuple):
@@ -118,22 +125,34 @@ class Rules(NamedTuple):
     warm_up: float
     min_variance: float
     novel_share: float
+    tabular: bool
+    alpha: float
+    roc_radius: float
+    roc_memory: float
+    roc_error: float
 
 
 def rules(config: LearnerConfig, n_streams: int) -> Rules:
     """The rules of a configuration for n streams."""
+    special = {"beta": config.reward_beta(n_streams), "tabular": config.algorithm == "1.0"}
     return Rules(
-        *(
-            config.reward_beta(n_streams) if name == "beta" else float(getattr(config, name))
-            for name in Rules._fields
-        )
+        **{n: special[n] if n in special else float(getattr(config, n)) for n in Rules._fields}
     )
 
 
 def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent:
-    """An agent that has seen nothing and will watch `first_stream`."""
+    """An agent that has seen nothing and will watch `first_stream`.
+
+    Raises:
+        UsageError: more streams than CD-MISFA 1.0's table of rewards is kept for.
+    """
     outputs = config.outputs
     dense = n_streams if n_streams <= DENSE_STREAMS else 0
+    clusters = (n_streams, config.roc_centres) if config.algorithm == "1.0" else (0, 0)
+    if config.algorithm == "1.0" and not dense:
+        raise UsageError(
+            f"learner.algorithm 1.0 takes at most {DENSE_STREAMS} streams, not {n_streams}"
+        )
     memory = np.zeros(1, MEMORY)
     agent = Agent(
         memory=memory,
@@ -153,6 +172,8 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
         dense=np.zeros((dense, 2, dense)),
         policy=np.zeros(n_streams, np.int64),
         Q=np.zeros((n_streams, 2)),
+        centres=np.zeros((*clusters, config.tau, outputs)),
+        counts=np.zeros(clusters),
     )
     memory["last_stream"] = -1
     memory["stream"] = first_stream
@@ -169,6 +190,8 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
     m["fed_until"] = -1
     m["novel_blocks"] = 0
     m["rewards"] = 0
+    m["scale"] = 0.0
+    m["roc_error"] = math.nan
     m["xi"] = math.nan
     m["share"] = 1.0
     m["epsilon"] = epsilon_start
@@ -189,6 +212,8 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
     agent.dense[:] = 0.0
     agent.policy[:] = 0
     agent.Q[:] = 0.0
+    agent.centres[:] = 0.0
+    agent.counts[:] = 0.0
 
 
 @compiled
@@ -260,7 +285,55 @@ def ready_to_save(agent: Agent, rules: Rules) -> bool:
     for j in range(len(agent.eta)):
         if recent_variance(agent, j) < rules.min_variance:
             return False
+    if rules.tabular:
+        return bool(m["roc_error"] < rules.roc_error)
     return converged(agent.eta_dot, rules.delta)
+
+
+@compiled
+def track_clusters(agent: Agent, rules: Rules, label: int, y: Float) -> None:
+    """CD-MISFA 1.0: take the block's output into the clusters and their running error."""
+    m = agent.memory[0]
+    error = cluster(agent.centres, agent.counts, label, y, rules.roc_radius, rules.roc_memory)
+    if math.isnan(m["roc_error"]):
+        m["roc_error"] = error
+    else:
+        m["roc_error"] += window_rate(rules.eta_dot_window, m["novel_blocks"]) * (
+            error - m["roc_error"]
+        )
+
+
+@compiled
+def estimate_reward(agent: Agent, rules: Rules, stream: int, reward: float) -> None:
+    """Take the reward of the last transition into R and improve the policy."""
+    m = agent.memory[0]
+    m["rewards"] += 1
+    if rules.tabular:
+        m["scale"] = add_reward_locally(
+            agent.stay_sum,
+            agent.switch_sum,
+            agent.dense,
+            m["last_stream"],
+            m["last_action"],
+            stream,
+            reward,
+            rules.alpha,
+        )
+    else:
+        add_reward(
+            agent.stay_sum,
+            agent.switch_sum,
+            agent.dense,
+            m["last_stream"],
+            m["last_action"],
+            stream,
+            reward,
+        )
+        m["scale"] = m["rewards"]
+    if m["scale"] > 0.0:
+        policy_iteration(
+            agent.stay_sum, agent.switch_sum, m["scale"], rules.gamma, agent.policy, agent.Q
+        )
 
 
 @compiled
@@ -319,23 +392,13 @@ def think(
         for j in range(y.shape[1]):
             track_output(agent, rules, j, y[:, j])
         agent.y_frames[0] += y.shape[0]
+        if rules.tabular:
+            track_clusters(agent, rules, stream, y)
         o["saved"] = ready_to_save(agent, rules)
     o["share"] = m["share"]
     o["novel_blocks"] = m["novel_blocks"]
     if not o["saved"] and not math.isnan(o["reward"]):
-        m["rewards"] += 1
-        add_reward(
-            agent.stay_sum,
-            agent.switch_sum,
-            agent.dense,
-            m["last_stream"],
-            m["last_action"],
-            stream,
-            o["reward"],
-        )
-        policy_iteration(
-            agent.stay_sum, agent.switch_sum, m["rewards"], rules.gamma, agent.policy, agent.Q
-        )
+        estimate_reward(agent, rules, stream, o["reward"])
     if o["saved"]:
         epsilon = rules.epsilon_start
         greedy = 0

@@ -53,13 +53,19 @@ class LearnerConfig:
     min_variance: float = 0.1
     novel_share: float = 0.9
     patience: int = 1000
+    alpha: float = 0.1
+    roc_centres: int = 10
+    roc_radius: float = 0.3
+    roc_memory: int = 40
+    roc_error: float = 0.1
 
     def __post_init__(self) -> None:
         positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
         positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
-        positive(self, "learner", "patience")
-        within(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance")
+        positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
+        within(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
         within(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
+        within(self, "learner", 1e-6, 1.0, "alpha")
         within(self, "learner", 0.0, math.inf, "epsilon_knee")
         within(self, "learner", 0.0, 0.999999, "gamma")
         if self.tau < 3:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.compiled import compiled
+from cdmisfa.incsfa.projection import project
+from cdmisfa.roc import known_to
 from cdmisfa.slowness import instantaneous_slowness
 
 Float = NDArray[np.float64]
@@ -23,6 +25,26 @@ NOVEL = 0
 
 CONSTANT = -1
 """Verdict: the block carries nothing to learn."""
+
+
+class Frozen(NamedTuple):
+    """All frozen modules in one stack, so that one pass over a block serves them all.
+
+    Attributes:
+        phi: (M J, I) weights.
+        offset: (M J,) phi times the mean.
+        band_mean: (M, J) centres of the bands of known slowness.
+        band_sd: (M, J) their standard deviations.
+        centres: (M, S, C, n, J) clusters; (M, 0, 0, 0, 0) but for CD-MISFA 1.0.
+        counts: (M, S, C).
+    """
+
+    phi: Float
+    offset: Float
+    band_mean: Float
+    band_sd: Float
+    centres: Float
+    counts: Float
 
 
 @compiled
@@ -82,3 +104,53 @@ def verdict(y_frozen: Float, band_mean: Float, band_sd: Float, eta_inst: Float) 
         if inside and known_by == NOVEL:
             known_by = m + 1
     return known_by
+
+
+@compiled
+def mean_output(phi: Float, mean: Float) -> Float:
+    """What phi gives out on the mean input, (J,): the offset of a centred projection.
+
+    Args:
+        phi: (J, I) weights.
+        mean: (I,) mean of the input.
+    """
+    offset = np.zeros(phi.shape[0])
+    for j in range(phi.shape[0]):
+        for i in range(phi.shape[1]):
+            offset[j] += phi[j, i] * mean[i]
+    return offset
+
+
+@compiled
+def recognise(
+    frozen: Frozen,
+    roc_error: float,
+    stream: int,
+    frames: NDArray[Any],
+    x: NDArray[Any],
+    scale: float,
+    y_frozen: Float,
+    eta_inst: Float,
+) -> int:
+    """The gate's verdict on a block: NOVEL, CONSTANT, or the module that knows it.
+
+    Args:
+        frozen: the frozen modules.
+        roc_error: threshold of the clusters; used by CD-MISFA 1.0 only.
+        stream: stream of the block.
+        frames: (n, I) as they came.
+        x: (n, I') expanded.
+        scale: factor from a frame's values to the learner's.
+        y_frozen: (M, n, J) written: outputs of the frozen modules.
+        eta_inst: (M, J) written: their instantaneous slowness.
+    """
+    modules, n, outputs = y_frozen.shape
+    y = project(frozen.phi, frozen.offset, x)
+    for m in range(modules):
+        for t in range(n):
+            for j in range(outputs):
+                y_frozen[m, t, j] = y[t, m * outputs + j]
+    known_by = verdict(y_frozen, frozen.band_mean, frozen.band_sd, eta_inst)
+    if frozen.counts.shape[1] > 0:
+        known_by = known_to(frozen.centres, frozen.counts, stream, y_frozen, roc_error)
+    return CONSTANT if is_constant(frames, scale) else known_by

@@ -6,6 +6,8 @@ blocks give the same signals, bit for bit.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from cdmisfa.agent import OUTCOME, begin_abstraction, has_gap, mean_change, new_
 from cdmisfa.blocks import Block, SourceSpec
 from cdmisfa.config import LearnerConfig
 from cdmisfa.expansion import expanded_size, quadratic
-from cdmisfa.gate import CONSTANT, is_constant, verdict
+from cdmisfa.gate import Frozen, mean_output, recognise
 from cdmisfa.incsfa import IncSFA, project
 from cdmisfa.modules import Module
 from cdmisfa.signals import BlockSignals
@@ -26,8 +28,36 @@ POLICY_KEY, WEIGHTS_KEY = 1, 2
 """Spawn keys of the learner's two random generators, beneath the run's seed."""
 
 
+@dataclass(frozen=True, slots=True)
+class LearnerState:
+    """Everything that changes in a learner, so that it can be put away and taken up again.
+
+    Attributes:
+        arrays: the agent's memory and the adaptive abstraction, by name.
+        modules: what was learned so far.
+        policy_rng: state of the policy's random generator, as its `bit_generator.state`.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    modules: tuple[Module, ...]
+    policy_rng: Mapping[str, Any]
+
+
 class CuriousLearner:
     """The paper's agent: adaptive abstraction, gating system and curiosity-driven learner.
+
+    Attributes:
+        config: what it was told.
+        spec: the source it learns from.
+        seed: where its random generators started.
+        modules: what it learned so far.
+        scale: factor from a frame's values to the learner's (1/255 for pixels).
+        policy_rng: three draws an iteration, whatever is done with them.
+        rules: the configuration's numbers, for compiled code.
+        agent: memory of the agent; changed in place.
+        abstraction: the adaptive abstraction.
+        frozen: the modules in one stack.
+        out: (1,) of `OUTCOME`, what the last iteration came to.
 
     Example:
         >>> from cdmisfa.streams import OscillatorySource
@@ -44,17 +74,17 @@ class CuriousLearner:
         self.seed = seed
         self.modules: list[Module] = []
         self._n_inputs = expanded_size(config.expansion, int(np.prod(spec.frame_shape)))
-        self._scale = 1.0 / 255.0 if spec.dtype == "uint8" else 1.0
-        self._policy_rng = np.random.Generator(
+        self.scale = 1.0 / 255.0 if spec.dtype == "uint8" else 1.0
+        self.policy_rng = np.random.Generator(
             np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
         )
         n_streams = len(spec.streams)
-        first = int(self._policy_rng.random() * n_streams)
-        self._rules = rules(config, n_streams)
-        self._agent = new_agent(config, n_streams, first)
-        self._out = np.zeros(1, OUTCOME)
+        first = int(self.policy_rng.random() * n_streams)
+        self.rules = rules(config, n_streams)
+        self.agent = new_agent(config, n_streams, first)
+        self.out = np.zeros(1, OUTCOME)
         self._freeze()
-        self._sfa = self._new_abstraction()
+        self.abstraction = self._new_abstraction()
 
     @property
     def tau(self) -> int:
@@ -64,32 +94,57 @@ class CuriousLearner:
     @property
     def stream(self) -> int:
         """Stream the learner wants to watch next."""
-        return int(self._agent.memory["stream"][0])
+        return int(self.agent.memory["stream"][0])
 
     @property
     def iteration(self) -> int:
         """Iterations so far."""
-        return int(self._agent.memory["iteration"][0])
+        return int(self.agent.memory["iteration"][0])
 
     @property
     def epsilon(self) -> float:
         """Probability of a random action in the last iteration."""
-        return float(self._agent.memory["epsilon"][0])
+        return float(self.agent.memory["epsilon"][0])
 
     @property
     def policy(self) -> NDArray[np.int64]:
         """The policy being learned, (S,): 0 stay, 1 switch."""
-        return self._agent.policy.copy()
+        return self.agent.policy.copy()
 
     @property
     def phi(self) -> Float:
         """Weights of the adaptive abstraction, (J, I)."""
-        return self._sfa.phi
+        return self.abstraction.phi
 
     @property
     def exhausted(self) -> bool:
         """Whether exploration has ended long ago and still nothing converged."""
-        return bool(self._agent.memory["idle"][0] > self.config.patience)
+        return bool(self.agent.memory["idle"][0] > self.config.patience)
+
+    @property
+    def state(self) -> LearnerState:
+        """The learner's state, a copy."""
+        return LearnerState(
+            arrays={name: array.copy() for name, array in self._arrays().items()},
+            modules=tuple(self.modules),
+            policy_rng=self.policy_rng.bit_generator.state,
+        )
+
+    def restore(self, state: LearnerState) -> None:
+        """Go on from a state of a learner with the same configuration, spec and seed.
+
+        Raises:
+            ValueError: an array is missing or of another shape or type.
+        """
+        self.modules = list(state.modules)
+        self._freeze()
+        self.abstraction = self._new_abstraction()
+        for name, own in self._arrays().items():
+            array = state.arrays.get(name)
+            if array is None or array.shape != own.shape or array.dtype != own.dtype:
+                raise ValueError(f"{name} is missing or of another shape or type")
+            own[...] = array
+        self.policy_rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:
         """One iteration: look at tau frames, learn, and decide what to watch next.
@@ -105,47 +160,59 @@ class CuriousLearner:
                 f"the learner asked for {self.tau} frames of stream {self.stream}, "
                 f"not {len(block)} of stream {block.stream}"
             )
-        agent = self._agent
+        agent = self.agent
         frames = block.frames.reshape(len(block), -1)
         x = quadratic(frames) if self.config.expansion == "quadratic" else frames
         outputs, count = self.config.outputs, len(self.modules)
-        y_frozen = project(self._frozen_phi, self._frozen_offset, x)
-        y_frozen = np.ascontiguousarray(
-            y_frozen.reshape(len(block), count, outputs).transpose(1, 0, 2)
-        )
+        y_frozen = np.empty((count, len(block), outputs))
         eta_frozen = np.empty((count, outputs))
-        known_by = verdict(y_frozen, self._band_mean, self._band_sd, eta_frozen)
-        if is_constant(frames, self._scale):
-            known_by = CONSTANT
+        known_by = recognise(
+            self.frozen,
+            self.rules.roc_error,
+            block.stream,
+            frames,
+            x,
+            self.scale,
+            y_frozen,
+            eta_frozen,
+        )
         y = np.full((len(block), outputs), np.nan)
         xi = np.nan
         if known_by == 0:
             gap = has_gap(agent, block.stream, block.t)
-            xi = mean_change(self._sfa.update(x, gap))
-            phi = self._sfa.phi
-            y = project(phi, phi @ self._sfa.mean, x)
+            xi = mean_change(self.abstraction.update(x, gap))
+            phi = self.abstraction.phi
+            y = project(phi, mean_output(phi, self.abstraction.mean), x)
         think(
             agent,
-            self._rules,
-            self._out,
+            self.rules,
+            self.out,
             known_by,
             xi,
             y,
             block.t + len(block),
-            self._policy_rng.random(3),
+            self.policy_rng.random(3),
         )
         signals = self._signals(block, y, y_frozen, eta_frozen, known_by)
-        if self._out["saved"][0]:
-            self._save(signals)
+        if self.out["saved"][0]:
+            self.save_abstraction()
         return signals
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Every array that changes in place, by name."""
+        parts = {"agent": self.agent, "abstraction": self.abstraction.state}
+        return {
+            f"{part}.{name}": array
+            for part, arrays in parts.items()
+            for name, array in zip(arrays._fields, arrays, strict=True)
+        }
 
     def _signals(
         self, block: Block, y: Float, y_frozen: Float, eta_frozen: Float, known_by: int
     ) -> BlockSignals:
-        agent = self._agent
+        agent = self.agent
         novel = known_by == 0
-        out: dict[str, Any] = dict(zip(OUTCOME.names or (), self._out[0].item(), strict=True))
-        n_rewards = max(int(agent.memory["rewards"][0]), 1)
+        out: dict[str, Any] = dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))
         return BlockSignals(
             iteration=self.iteration - 1,
             t=block.t,
@@ -159,39 +226,47 @@ class CuriousLearner:
             gate_mean=agent.gate_mean.copy(),
             gate_sd=np.sqrt(agent.gate_variance),
             eta_inst_frozen=eta_frozen,
-            band_mean=self._band_mean,
-            band_sd=self._band_sd,
-            R=agent.dense / n_rewards,
+            band_mean=self.frozen.band_mean,
+            band_sd=self.frozen.band_sd,
+            R=agent.dense / (agent.memory["scale"][0] or 1.0),
             Q=agent.Q.copy(),
             policy=agent.policy.copy(),
             **out,
         )
 
-    def _save(self, signals: BlockSignals) -> None:
+    def save_abstraction(self) -> None:
+        """Freeze the abstraction that the last iteration found ready, and begin a new one."""
+        agent, memory = self.agent, self.agent.memory[0]
         module = Module(
             index=len(self.modules) + 1,
-            stream=signals.stream,
-            iteration=signals.iteration,
-            phi=self._sfa.phi.copy(),
-            mean=self._sfa.mean.copy(),
-            band_mean=signals.gate_mean,
-            band_sd=signals.gate_sd,
-            eta=signals.eta,
-            policy=signals.policy,
+            stream=int(memory["last_stream"]),
+            iteration=int(memory["iteration"]) - 1,
+            phi=self.abstraction.phi.copy(),
+            mean=self.abstraction.mean.copy(),
+            band_mean=agent.gate_mean.copy(),
+            band_sd=np.sqrt(agent.gate_variance),
+            eta=agent.eta.copy(),
+            policy=agent.policy.copy(),
+            centres=agent.centres.copy(),
+            counts=agent.counts.copy(),
         )
         self.modules.append(module)
         self._freeze()
-        begin_abstraction(self._agent, self._rules.epsilon_start)
-        self._sfa = self._new_abstraction()
+        begin_abstraction(agent, self.rules.epsilon_start)
+        self.abstraction = self._new_abstraction()
 
     def _freeze(self) -> None:
-        """Stack the frozen modules' rows, so that one matrix product serves all of them."""
-        outputs = self.config.outputs
-        shape = (len(self.modules), outputs)
-        self._frozen_phi = np.array([m.phi for m in self.modules]).reshape(-1, self._n_inputs)
-        self._frozen_offset = np.array([m.phi @ m.mean for m in self.modules]).reshape(-1)
-        self._band_mean = np.array([m.band_mean for m in self.modules]).reshape(shape)
-        self._band_sd = np.array([m.band_sd for m in self.modules]).reshape(shape)
+        """Stack the frozen modules' rows, so that one pass over a block serves all of them."""
+        count, outputs, modules = len(self.modules), self.config.outputs, self.modules
+        agent = self.agent
+        self.frozen = Frozen(
+            phi=np.array([m.phi for m in modules]).reshape(-1, self._n_inputs),
+            offset=np.array([mean_output(m.phi, m.mean) for m in modules]).reshape(-1),
+            band_mean=np.array([m.band_mean for m in modules]).reshape(count, outputs),
+            band_sd=np.array([m.band_sd for m in modules]).reshape(count, outputs),
+            centres=np.array([m.centres for m in modules]).reshape(count, *agent.centres.shape),
+            counts=np.array([m.counts for m in modules]).reshape(count, *agent.counts.shape),
+        )
 
     def _new_abstraction(self) -> IncSFA:
         key = (WEIGHTS_KEY, len(self.modules))

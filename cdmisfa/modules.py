@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ class Module:
         band_sd: (J,) running standard deviation of eta_inst.
         eta: (J,) slowness of each output when saved, cycles per frame.
         policy: (S,) 0 stay, 1 switch, for each stream.
+        centres: (S, C, tau, J) centres of the clusters; empty but for CD-MISFA 1.0.
+        counts: (S, C) what each centre has seen; empty but for CD-MISFA 1.0.
     """
 
     index: int
@@ -33,3 +35,5 @@ class Module:
     band_sd: NDArray[np.float64]
     eta: NDArray[np.float64]
     policy: NDArray[np.int64]
+    centres: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+    counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))

@@ -59,3 +59,37 @@ def add_reward(
         switch[s] += r
     if dense.shape[0] > 0:
         dense[s, a, s_next] += r
+
+
+@compiled
+def add_reward_locally(
+    stay: Float, switch: Float, dense: Float, s: int, a: int, s_next: int, r: float, alpha: float
+) -> float:
+    """CD-MISFA 1.0: move the entry (s, a, s') towards the reward; return the tensor's norm.
+
+    R~(s,a,s') <- alpha r + (1 - alpha) R~(s,a,s'), R = R~ / |R~|. No other entry changes, which
+    is what makes 1.0 unstable.
+
+    Source: paper, CD-MISFA 1.0 vs CD-MISFA 2.0 (b).
+
+    Args:
+        stay: (S,) written: R~(s, stay, s).
+        switch: (S,) written: sum of R~(s, switch, s') over s'.
+        dense: (S, 2, S) R~, in place.
+        s: stream before the action.
+        a: 0 stay, 1 switch.
+        s_next: stream after the action.
+        r: reward.
+        alpha: learning rate.
+    """
+    dense[s, a, s_next] += alpha * (r - dense[s, a, s_next])
+    stay[s] = dense[s, 0, s]
+    switch[s] = 0.0
+    for following in range(len(switch)):
+        switch[s] += dense[s, 1, following]
+    square = 0.0
+    for before in range(len(stay)):
+        for action in range(2):
+            for following in range(len(stay)):
+                square += dense[before, action, following] ** 2
+    return math.sqrt(square)
