@@ -63,8 +63,10 @@ def learn_command(
     frames, configuration = open_source(
         source, preset=preset, settings=settings, seed=seed, loop=loop, salvage=salvage
     )
+    for warning in getattr(frames, "warnings", ()):
+        click.echo(f"warning: {warning}", err=True)
     try:
-        with bar("learning", max_iterations, "iterations") as shown, stoppable() as stop:
+        with bar("learning", "iterations") as shown, stoppable() as stop:
             result = learn(
                 frames,
                 configuration.learner,
@@ -107,7 +109,7 @@ class Reporter:
         if now >= self._next:
             self._next = now + TICK
             note = f"{progress.modules} modules, epsilon {progress.epsilon:.3f}"
-            self._shown.update(progress.iteration, note)
+            self._shown.update(progress.iteration, progress.max_iterations, note)
 
 
 def summary(result: RunResult) -> str:

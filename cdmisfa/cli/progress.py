@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import click
-
-Advance = Callable[[int], None]
 
 
 class Bar:
     """What a command reports to: how far it is, and lines worth reading."""
 
-    def update(self, done: float, note: str = "") -> None:
-        """So much is done in all; `note` stands behind the bar."""
+    def update(self, done: float, total: float | None = None, note: str = "") -> None:
+        """So much is done, of so much where that is known; `note` stands behind the bar."""
 
     def say(self, line: str) -> None:
         """A line that stays, above the bar."""
@@ -23,12 +21,11 @@ class Bar:
 
 
 @contextmanager
-def bar(title: str, total: float | None, unit: str) -> Iterator[Bar]:
+def bar(title: str, unit: str) -> Iterator[Bar]:
     """Show progress while the body runs, if anyone is looking.
 
     Args:
         title: what is being done.
-        total: how much there is to do, or None where nobody knows.
         unit: of what `Bar.update` counts.
     """
     if not sys.stderr.isatty():
@@ -65,12 +62,12 @@ def bar(title: str, total: float | None, unit: str) -> Iterator[Bar]:
     )
 
     class TerminalBar(Bar):
-        def update(self, done: float, note: str = "") -> None:
-            progress.update(task, completed=done, note=note)
+        def update(self, done: float, total: float | None = None, note: str = "") -> None:
+            progress.update(task, completed=done, total=total, note=note)
 
         def say(self, line: str) -> None:
             progress.console.print(line, markup=False, highlight=False)
 
     with progress:
-        task = progress.add_task(title, total=total, note="")
+        task = progress.add_task(title, total=None, note="")
         yield TerminalBar()

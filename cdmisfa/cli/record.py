@@ -31,6 +31,7 @@ from cdmisfa.cli.progress import bar
     metavar="F.png",
     help="Draw the scene from outside instead of recording it.",
 )
+@click.option("--resume", is_flag=True, help="Go on where an interrupted recording ended.")
 @options.force
 @options.as_json
 def record_command(
@@ -44,6 +45,7 @@ def record_command(
     settings: tuple[str, ...],
     scene_picture: Path | None,
     force: bool,
+    resume: bool,
     as_json: bool,
 ) -> None:
     """Record what a scene shows, one MCAP file per view.
@@ -64,7 +66,7 @@ def record_command(
         raise click.UsageError("say -o FOLDER, where the recording goes")
     from recorder.recording import record
 
-    with bar("recording", frames, "frames") as shown:
+    with bar("recording", "frames") as shown:
         files = record(
             scene,
             out,
@@ -74,15 +76,16 @@ def record_command(
             views=views or None,
             jobs=jobs,
             force=force,
-            progress=shown.update,
+            resume=resume,
+            progress=lambda done: shown.update(done, frames),
         )
-    rows = [file.as_json() for file in files]
     if as_json:
+        rows = [file.as_json() for file in files]
         options.print_json(
             {"schema": options.SCHEMA, "recording": str(out), "frames": frames, "views": rows}
         )
         return
     options.print_table(
         ("view", "file", "frames", "bytes", "sha256"),
-        [(r["name"], r["file"], r["frames"], r["bytes"], r["sha256"]) for r in rows],
+        [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files],
     )
