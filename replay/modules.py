@@ -23,6 +23,9 @@ MAX_BYTES = 4 * 1024**3
 """Largest array that is read; asked for before anything is decompressed."""
 
 _NUMBERS = ("index", "stream", "iteration")
+_OPTIONAL = tuple(
+    f.name for f in dataclasses.fields(Module) if f.default_factory is not dataclasses.MISSING
+)
 _ARRAYS = tuple(f.name for f in dataclasses.fields(Module) if f.name not in _NUMBERS)
 
 
@@ -70,15 +73,24 @@ def load_modules(path: Path) -> tuple[Module, ...]:
 
 
 def _module(stored: Any, index: int) -> Module:
-    numbers: dict[str, Any] = {name: int(stored[_key(index, name)]) for name in _NUMBERS}
-    arrays = {name: stored[_key(index, name)] for name in _ARRAYS}
-    outputs, size = arrays["phi"].shape
-    expected = {"mean": (size,), "policy": arrays["policy"].shape}
-    for name, array in arrays.items():
-        shape = (outputs, size) if name == "phi" else expected.get(name, (outputs,))
-        if array.shape != shape or array.dtype.kind not in "fi":
-            raise ValueError(f"{name} has shape {array.shape}")
-    return Module(**numbers, **arrays)
+    values: dict[str, Any] = {name: int(stored[_key(index, name)]) for name in _NUMBERS}
+    for name in _ARRAYS:
+        if name in _OPTIONAL and _key(index, name) not in stored.files:
+            continue
+        array = stored[_key(index, name)]
+        if array.dtype.kind not in "fi":
+            raise ValueError(f"{name} is no array of numbers")
+        values[name] = array
+    outputs, size = values["phi"].shape
+    for name, shape in {
+        "mean": (size,),
+        "band_mean": (outputs,),
+        "band_sd": (outputs,),
+        "eta": (outputs,),
+    }.items():
+        if values[name].shape != shape:
+            raise ValueError(f"{name} has shape {values[name].shape}")
+    return Module(**values)
 
 
 def _refuse_large(archive: zipfile.ZipFile) -> None:

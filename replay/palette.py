@@ -1,0 +1,51 @@
+"""Colours that people with any colour vision can tell apart, the same in viewer and figures.
+
+Source: Okabe and Ito, Color Universal Design (2008).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Rgb = tuple[int, int, int]
+
+ORANGE: Rgb = (230, 159, 0)
+SKY: Rgb = (86, 180, 233)
+GREEN: Rgb = (0, 158, 115)
+YELLOW: Rgb = (240, 228, 66)
+BLUE: Rgb = (0, 114, 178)
+VERMILLION: Rgb = (213, 94, 0)
+PURPLE: Rgb = (204, 121, 167)
+GREY: Rgb = (136, 136, 136)
+
+CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
+"""Colours of things that are counted: streams, modules."""
+
+
+def colour(index: int) -> Rgb:
+    """The colour of stream or module number `index`, from 0."""
+    return CYCLE[index % len(CYCLE)]
+
+
+def packed(rgb: Rgb) -> int:
+    """A colour as 0xRRGGBBAA, opaque."""
+    red, green, blue = rgb
+    return red << 24 | green << 16 | blue << 8 | 0xFF
+
+
+def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Weights as an image: blue below zero, white at zero, vermillion above.
+
+    Args:
+        weights: (height, width); the largest magnitude gets the full colour.
+
+    Returns:
+        (height, width, 3) uint8.
+    """
+    largest = float(np.max(np.abs(weights), initial=0.0))
+    part = np.nan_to_num(weights / largest if largest > 0 else weights * 0.0)[..., None]
+    white = np.array([255.0, 255.0, 255.0])
+    low, high = np.array(BLUE, dtype=float), np.array(VERMILLION, dtype=float)
+    image = np.where(part < 0, white + (low - white) * -part, white + (high - white) * part)
+    return np.asarray(np.round(image), dtype=np.uint8)

@@ -1,0 +1,50 @@
+"""A run in words, for the first page of its view."""
+
+from __future__ import annotations
+
+from replay.outline import Outline
+
+ACTIONS = ("stay", "switch")
+
+
+def summary_text(outline: Outline, name: str) -> str:
+    """What was learned, when, and where the robot stayed for it, as Markdown."""
+    spec = outline.header.spec
+    lines = [f"## {name}", _opening(outline), ""]
+    if outline.saved:
+        lines += [
+            "| module | stream | iteration | η [1/frame] | policy |",
+            "|---|---|---|---|---|",
+        ]
+        for save in outline.saved:
+            eta = ", ".join(f"{value:.4f}" for value in save.eta)
+            lines.append(
+                f"| {save.module} | {spec.streams[save.stream]} | {save.iteration} | {eta} "
+                f"| {policy_text(save.policy, spec.streams)} |"
+            )
+        lines.append("")
+    lines += ["| stream | watched |", "|---|---|"]
+    for s in outline.streams(16):
+        share = outline.visits[s] / max(outline.frames, 1)
+        lines.append(f"| {spec.streams[s]} | {outline.visits[s]} frames, {share:.0%} |")
+    settings = [("seed", outline.header.manifest.get("seed"))]
+    settings += [(key, outline.header.setting("learner", key)) for key in ("nu", "tau", "sigma")]
+    settings += [("delta", outline.delta)]
+    said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
+    return "\n".join([*lines, "", said, ""])
+
+
+def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
+    """Where a policy stays, as "stay on left"; the rest switches."""
+    stays = [streams[s] for s, action in enumerate(policy) if action == 0]
+    if len(stays) == len(streams):
+        return "stay everywhere"
+    return f"stay on {', '.join(stays)}" if stays else "switch everywhere"
+
+
+def _opening(outline: Outline) -> str:
+    learned = f"{len(outline.saved)} module{'' if len(outline.saved) == 1 else 's'} learned"
+    return (
+        f"**{learned}** in {outline.iterations:,} iterations "
+        f"({outline.frames:,} frames of {len(outline.names())} streams)."
+    )

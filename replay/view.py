@@ -1,0 +1,141 @@
+"""Building the Rerun view of a run or a recording from its logs.
+
+The view can always be built again: the logs are the archive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from cdmisfa.errors import CdmisfaError, UsageError
+from recorder.logfile import partial_path
+from replay.config import ViewConfig
+from replay.layout import run_layout
+from replay.modules import MODULES_FILE, load_modules
+from replay.outline import Outline, read_outline
+from replay.run_view import RunView
+from replay.runlog import run_log
+from replay.summary import summary_text
+
+APPLICATION = "cdmisfa"
+"""Rerun's application id: one layout is remembered for it."""
+
+FLUSH_SECONDS = 60.0
+
+
+def build_view(
+    path: Path,
+    out: Path,
+    *,
+    every: int = 10,
+    force: bool = True,
+    config: ViewConfig | None = None,
+) -> None:
+    """Write the view of a run as an .rrd file, whole or not at all.
+
+    Args:
+        path: a run's folder or its run.mcap.
+        out: the file.
+        every: show every so many watched frames, of those that were kept.
+        force: replace an existing file.
+        config: everything else; `every` is then taken from it.
+
+    Raises:
+        UsageError: there is no such run, or `out` exists and `force` is not set.
+        LogDamagedError: the run cannot be read.
+        CdmisfaError: the view cannot be written.
+    """
+    config = config or ViewConfig(every=every)
+    out = Path(out)
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    partial = partial_path(out)
+    log = run_log(path)
+    outline = read_outline(log)
+    folder = log.parent
+    modules = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
+    recording = rr.RecordingStream(APPLICATION, recording_id=_identity(log))
+    recording.set_log_time_enabled(False)
+    try:
+        recording.save(partial)
+        if not partial.exists():
+            raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
+        recording.send_recording_name(_name(log))
+        _properties(recording, outline, folder)
+        text = summary_text(outline, _name(log))
+        document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+        recording.log("summary", document, static=True)
+        RunView(recording, log, outline, config).write(modules)
+        _finish(recording, run_layout(outline, config))
+        os.replace(partial, out)
+    except (RuntimeError, OSError) as error:
+        raise CdmisfaError(f"{out} cannot be written: {error}") from error
+    finally:
+        recording.disconnect()
+        partial.unlink(missing_ok=True)
+
+
+def _finish(recording: rr.RecordingStream, layout: rrb.Blueprint) -> None:
+    recording.send_blueprint(layout)
+    recording.flush(timeout_sec=FLUSH_SECONDS)
+    recording.disconnect()
+
+
+def _name(log: Path) -> str:
+    return log.resolve().parent.name
+
+
+def _identity(log: Path) -> str:
+    """A name no other run has: Rerun merges recordings of the same name."""
+    place = hashlib.sha256(str(log.resolve()).encode()).hexdigest()[:12]
+    return f"{_name(log)}-{place}"
+
+
+def _properties(recording: rr.RecordingStream, outline: Outline, folder: Path) -> None:
+    """Configuration and result, which the viewer's tables of runs show as columns."""
+    config = outline.header.manifest.get("config")
+    if isinstance(config, Mapping):
+        for section, table in config.items():
+            values = dict(_flat(table)) if isinstance(table, Mapping) else {}
+            if values:
+                recording.send_property(str(section), rr.AnyValues(**values))
+    result: dict[str, Any] = {
+        "seed": outline.header.manifest.get("seed", 0),
+        "iterations": outline.iterations,
+        "frames": outline.frames,
+        "modules": len(outline.saved),
+        "learned": ", ".join(outline.names()[s.stream] for s in outline.saved),
+        **_ending(folder),
+    }
+    recording.send_property("result", rr.AnyValues(**result))
+
+
+def _ending(folder: Path) -> dict[str, str]:
+    """Why the run ended, where its manifest is there to say it."""
+    try:
+        document = json.loads((folder / "run.json").read_text("utf-8"))
+        result = document["result"]
+        return {name: str(result[name]) for name in ("ended", "signals_sha256")}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    values: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        name = f"{prefix}{key}".replace(".", "_")
+        if isinstance(value, Mapping):
+            values += _flat(value, f"{name}_")
+        elif isinstance(value, bool | int | float | str):
+            values.append((name, value))
+        else:
+            values.append((name, json.dumps(value)))
+    return values
