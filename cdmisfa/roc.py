@@ -88,7 +88,7 @@ def cluster(
 
 @compiled
 def known_to(centres: Float, counts: Float, label: int, y_frozen: Float, threshold: float) -> int:
-    """Index of the first frozen module (from 1) whose error on a block is below the threshold; or 0.
+    """First frozen module (from 1) whose error on a block is below the threshold, or 0.
 
     Args:
         centres: (M, S, C, n, J) of the frozen modules.
