@@ -200,7 +200,7 @@ class CuriousLearner:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Every array that changes in place, by name."""
-        parts = {"agent": self.agent, "abstraction": self.abstraction.state}
+        parts: dict[str, Any] = {"agent": self.agent, "abstraction": self.abstraction.state}
         return {
             f"{part}.{name}": array
             for part, arrays in parts.items()

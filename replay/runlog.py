@@ -189,6 +189,36 @@ class RunWriter:
         entry.timestamp.FromNanoseconds(time)
         self._log.write(self._event, time, entry.SerializeToString(), iteration & 0xFFFFFFFF)
 
+    def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
+        """Copy what another log of the same run holds of its first iterations.
+
+        Messages are copied as they are, so a run that goes on keeps its past bit for bit.
+
+        Args:
+            log: the log to copy from.
+            iterations: how many.
+
+        Yields:
+            The signals that were copied, in order.
+        """
+        channels = {
+            SIGNALS_TOPIC: self._signals,
+            WATCHED_TOPIC: self._watched,
+            PHI_TOPIC: self._phi,
+            TRUTH_TOPIC: self._truth,
+            EVENT_TOPIC: self._event,
+        }
+        with LogReader(log) as reader:
+            for entry in reader.messages(channels, ordered=False):
+                topic, signals = entry.channel.topic, None
+                if topic == SIGNALS_TOPIC:
+                    signals = signals_message.decode(entry.data, f"{log} {topic}")
+                    if signals.iteration >= iterations:
+                        return
+                self._log.write(channels[topic], entry.log_time, entry.data, entry.sequence)
+                if signals is not None:
+                    yield signals
+
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
         self._log.flush()
@@ -271,6 +301,11 @@ def read_signals(path: Path) -> Iterator[BlockSignals]:
     log = run_log(path)
     for _, data in _messages(log, SIGNALS_TOPIC):
         yield signals_message.decode(data, f"{log} {SIGNALS_TOPIC}")
+
+
+def count_iterations(path: Path) -> int:
+    """How many iterations' records a run's log holds, without decoding them."""
+    return sum(1 for _ in _messages(run_log(path), SIGNALS_TOPIC))
 
 
 def read_watched(path: Path) -> Iterator[tuple[int, NDArray[Any]]]:

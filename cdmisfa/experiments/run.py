@@ -10,15 +10,28 @@ import contextlib
 import json
 import os
 import platform
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cdmisfa.agent import think
 from cdmisfa.blocks import FrameSource
+from cdmisfa.compiled import needs_compiling
 from cdmisfa.config import LearnerConfig, as_table
 from cdmisfa.errors import LogExhaustedError, UsageError
+from cdmisfa.experiments.checkpoint import (
+    SET_ASIDE,
+    Checkpoint,
+    checkpoints,
+    newest_covered,
+    restore,
+    save_checkpoint,
+    set_aside,
+)
+from cdmisfa.incsfa import strict
 from cdmisfa.learner import CuriousLearner
 from cdmisfa.modules import Module
 from cdmisfa.signals import SCHEMA_VERSION, SignalsHash
@@ -103,6 +116,8 @@ def learn(
     rerun: bool = True,
     progress: Callable[[Progress], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
+    resume: bool = False,
+    checkpoint_every: int = 200,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
 
@@ -118,9 +133,13 @@ def learn(
         rerun: also build the Rerun view.
         progress: called after every iteration.
         stop: asked after every iteration; true ends the run cleanly.
+        resume: go on with the run in `out` where it was stopped, in whatever way; its
+            signals become those of a run that was never stopped.
+        checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
 
     Raises:
-        UsageError: `out` exists and `force` is not set.
+        UsageError: `out` exists and `force` is not set; or `resume` is, and `out` holds no
+            run or one with another configuration or source.
         LogExhaustedError: a recording ended first; what was learned is saved.
     """
     learner = CuriousLearner(config, source.spec, seed)
@@ -128,7 +147,10 @@ def learn(
     digest = SignalsHash()
     tables = {**(sections or {}), "learner": as_table(config)}
     exhausted: LogExhaustedError | None = None
-    with _run_log(out, source, tables, seed, force) as log:
+    with _run_log(out, source, tables, seed, force, resume) as log:
+        if log is not None and resume:
+            _go_on(log, learner, source, digest)
+        _say_if_compiling()
         while True:
             ended = _ending(learner, limit, max_iterations, stop)
             if ended:
@@ -145,6 +167,8 @@ def learn(
                 log.block(signals, block, learner.modules[-1].phi if signals.saved else learner.phi)
                 if len(learner.modules) > learned:
                     log.event(block.t, signals.iteration, _saved_text(learner, source))
+                if checkpoint_every and learner.iteration % checkpoint_every == 0:
+                    _save_checkpoint(log, learner, source)
             if progress is not None:
                 progress(
                     Progress(
@@ -157,6 +181,7 @@ def learn(
                 )
         if log is not None:
             log.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
+            _save_checkpoint(log, learner, source)
     result = RunResult(
         run=str(out) if out is not None else None,
         source=source.describe(),
@@ -201,21 +226,33 @@ def _saved_text(learner: CuriousLearner, source: FrameSource) -> str:
 
 @contextlib.contextmanager
 def _run_log(
-    out: Path | None, source: FrameSource, tables: Mapping[str, Any], seed: int, force: bool
+    out: Path | None,
+    source: FrameSource,
+    tables: Mapping[str, Any],
+    seed: int,
+    force: bool,
+    resume: bool,
 ) -> Iterator[Any]:
     """The run's log, finished on success, a readable prefix on failure; None for no folder."""
     if out is None:
+        if resume:
+            raise UsageError("which run to go on with? name its folder")
         yield None
         return
     from replay.runlog import RunWriter
 
-    if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
+    manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
+    if resume:
+        set_aside(out, source.spec, manifest)
+    elif out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
     out.mkdir(parents=True, exist_ok=True)
-    for name in ("run.json", "modules.npz", "run.rrd"):
-        (out / name).unlink(missing_ok=True)
-    manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
-    log = RunWriter(out / "run.mcap", source.spec, manifest, force=force)
+    stale = [out / name for name in ("run.json", "modules.npz", "run.rrd")]
+    if not resume:
+        stale += [out / "run.mcap", out / SET_ASIDE, *checkpoints(out)]
+    for path in stale:
+        path.unlink(missing_ok=True)
+    log = RunWriter(out / "run.mcap", source.spec, manifest, force=force or resume)
     try:
         yield log
     except BaseException:
@@ -224,9 +261,49 @@ def _run_log(
     log.finish()
 
 
-def _write_run(
-    out: Path, result: RunResult, tables: Mapping[str, Any], rerun: bool
-) -> None:
+def _go_on(log: Any, learner: CuriousLearner, source: FrameSource, digest: SignalsHash) -> None:
+    """Bring log, learner, source and digest to where the run's newest checkpoint stands."""
+    from replay.runlog import count_iterations
+
+    run = log.path.parent
+    before = run / SET_ASIDE
+    if not before.exists():
+        return
+    checkpoint = newest_covered(run, count_iterations(before))
+    if checkpoint is not None:
+        restore(learner, checkpoint)
+        for signals in log.take_over(before, checkpoint.iteration):
+            digest.add(signals)
+        source.seek(checkpoint.t)
+        last = max(checkpoint.iteration - 1, 0)
+        log.event(source.t, last, f"resumed at iteration {checkpoint.iteration}")
+        changed = [
+            f"{name} is {now}, was {checkpoint.versions.get(name)}"
+            for name, now in versions().items()
+            if checkpoint.versions.get(name) != now
+        ]
+        if changed:
+            log.event(source.t, last, "; ".join(changed), "WARNING")
+        log.flush()
+    before.unlink()
+
+
+def _save_checkpoint(log: Any, learner: CuriousLearner, source: FrameSource) -> None:
+    log.flush()
+    save_checkpoint(
+        log.path.parent, Checkpoint(learner.iteration, source.t, learner.state, versions())
+    )
+
+
+def _say_if_compiling() -> None:
+    """Explain the wait to whoever is looking, when numba has nothing on disk yet."""
+    if not sys.stderr.isatty():
+        return
+    if needs_compiling(think) or needs_compiling(strict.update):
+        print("compiling the learner, this first time only (some 10 to 30 s)", file=sys.stderr)
+
+
+def _write_run(out: Path, result: RunResult, tables: Mapping[str, Any], rerun: bool) -> None:
     from replay.modules import save_modules
 
     save_modules(out / "modules.npz", result.modules)

@@ -1,0 +1,229 @@
+"""Checkpoints of a run: a learner's state on disk, and going on from it.
+
+A checkpoint is one file of plain arrays and a JSON text, written whole or not at all.
+It holds no signals: those are in the run's log, which is always flushed first. So a
+run that was stopped anywhere goes on from the newest checkpoint that its log covers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.blocks import SourceSpec
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.learner import CuriousLearner, LearnerState
+from cdmisfa.modules import Module
+from cdmisfa.signals import SCHEMA_VERSION
+
+SCHEMA = 1
+"""Version of the file; rises when the state of a learner changes its meaning."""
+
+KEPT = 2
+"""Checkpoints that a run's folder keeps: the newest, and one in case its log was lost."""
+
+SET_ASIDE = "run.before.mcap.partial"
+"""The log of a run that goes on, until the new one has taken over what counts."""
+
+_HEAD = "checkpoint"
+_MODULES = "modules."
+_INTEGERS = ("index", "stream", "iteration")
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """Where a run stood after some iteration.
+
+    Attributes:
+        iteration: iterations done.
+        t: frame at which the source goes on.
+        state: of the learner.
+        versions: of the packages that computed it.
+    """
+
+    iteration: int
+    t: int
+    state: LearnerState
+    versions: Mapping[str, str]
+
+
+def save_checkpoint(run: Path, checkpoint: Checkpoint) -> Path:
+    """Write a checkpoint into a run's folder and drop all but the newest ones.
+
+    The run's log must already hold every iteration before it.
+    """
+    path = run / f"checkpoint-{checkpoint.iteration:012d}.npz"
+    partial = path.with_name(path.name + ".partial")
+    head = {
+        "schema": SCHEMA,
+        "iteration": checkpoint.iteration,
+        "t": checkpoint.t,
+        "policy_rng": checkpoint.state.policy_rng,
+        "versions": checkpoint.versions,
+    }
+    arrays: dict[str, NDArray[Any]] = {_HEAD: np.frombuffer(json.dumps(head).encode(), np.uint8)}
+    for field in dataclasses.fields(Module):
+        values = [getattr(module, field.name) for module in checkpoint.state.modules]
+        arrays[_MODULES + field.name] = np.array(values)
+    arrays.update(checkpoint.state.arrays)
+    with open(partial, "wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+    for old in checkpoints(run)[KEPT:]:
+        old.unlink()
+    return path
+
+
+def checkpoints(run: Path) -> list[Path]:
+    """The checkpoints in a run's folder, newest first."""
+    return sorted(run.glob("checkpoint-*.npz"), reverse=True)
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        LogDamagedError: the file is damaged, or not a checkpoint of this version.
+    """
+    try:
+        arrays = _plain_arrays(path)
+        head = json.loads(arrays.pop(_HEAD).tobytes())
+        if head["schema"] != SCHEMA:
+            raise LogDamagedError(f"{path}: a checkpoint of version {head['schema']}, not {SCHEMA}")
+        columns = {
+            name.removeprefix(_MODULES): arrays.pop(name)
+            for name in list(arrays)
+            if name.startswith(_MODULES)
+        }
+        state = LearnerState(arrays, _modules(columns), head["policy_rng"])
+        return Checkpoint(int(head["iteration"]), int(head["t"]), state, head["versions"])
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise LogDamagedError(f"{path}: not a whole checkpoint ({error}); remove it") from error
+
+
+def _plain_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    with zipfile.ZipFile(path) as archive:
+        # Stored as they are, members cannot unpack to more than the file's size.
+        if any(m.compress_type != zipfile.ZIP_STORED for m in archive.infolist()):
+            raise ValueError("it is compressed")
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
+    values: Any = {
+        name: column.tolist() if name in _INTEGERS else list(column)
+        for name, column in columns.items()
+    }
+    rows = zip(*values.values(), strict=True)
+    return tuple(Module(**dict(zip(values, row, strict=True))) for row in rows)
+
+
+def newest_covered(run: Path, iterations: int) -> Checkpoint | None:
+    """The newest readable checkpoint whose past the log holds; None starts from the beginning.
+
+    Args:
+        run: the run's folder.
+        iterations: how many iterations its log holds.
+    """
+    for path in checkpoints(run):
+        with contextlib.suppress(LogDamagedError):
+            checkpoint = load_checkpoint(path)
+            if checkpoint.iteration <= iterations:
+                return checkpoint
+    return None
+
+
+def restore(learner: CuriousLearner, checkpoint: Checkpoint) -> None:
+    """Put a learner where the checkpoint stands.
+
+    Raises:
+        LogDamagedError: the checkpoint is not one of this configuration.
+    """
+    try:
+        learner.restore(checkpoint.state)
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogDamagedError(
+            f"checkpoint at iteration {checkpoint.iteration}: {error}; remove it"
+        ) from error
+
+
+def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path | None:
+    """Move the log of a run that shall go on out of the way, after checking that it may.
+
+    Returns:
+        Where it is now; None where the run was stopped before its log said anything.
+
+    Raises:
+        UsageError: there is no run, or it was made with another configuration or source.
+    """
+    from recorder.logfile import partial_path
+    from replay.runlog import RUN_FILE
+
+    whole, aside = run / RUN_FILE, run / SET_ASIDE
+    found = next((p for p in (aside, partial_path(whole), whole) if p.is_file()), None)
+    if found is None:
+        raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to go on with")
+    if found == partial_path(whole) and not checkpoints(run) and not _has_header(found):
+        return None
+    refuse_difference(run, found, spec, manifest)
+    os.replace(found, aside)
+    return aside
+
+
+def _has_header(log: Path) -> bool:
+    from replay.runlog import read_header
+
+    try:
+        read_header(log)
+    except (LogDamagedError, UsageError):
+        return False
+    return True
+
+
+def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
+    """Refuse to go on with another configuration, seed or source, naming the first difference.
+
+    Raises:
+        UsageError: something differs.
+    """
+    from replay.runlog import read_header
+
+    header = read_header(log)
+    before = {
+        "signals": header.schema,
+        **header.manifest,
+        "spec": dataclasses.asdict(header.spec),
+    }
+    now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec)}
+    for key, old, new in differences(_json(before), _json(now)):
+        raise UsageError(
+            f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: go on with "
+            "what it was made with, or choose another folder"
+        )
+
+
+def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two JSON values differ: dotted key, the value before, the value now."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in sorted({*before, *now}):
+            where = f"{key}.{name}" if key else name
+            yield from differences(before.get(name), now.get(name), where)
+    elif before != now:
+        yield key, before, now
+
+
+def _json(value: Any) -> Any:
+    return json.loads(json.dumps(value))
