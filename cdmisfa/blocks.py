@@ -91,7 +91,11 @@ class FrameSource(Protocol):
         """
 
     def seek(self, t: int) -> None:
-        """Move the clock to frame t, so that the next block starts there."""
+        """Move the clock to frame t, so that the next block starts there.
+
+        Raises:
+            ValueError: there is no frame before 0.
+        """
 
     def describe(self) -> Mapping[str, Any]:
         """What identifies the source, as JSON values: its kind, seed or file hashes."""
@@ -112,8 +116,17 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
         raise ValueError(f"a block has at least one frame, not {n}")
 
 
+def check_frame(t: int) -> None:
+    """Refuse a place on the clock that no source has.
+
+    Raises:
+        ValueError: before frame 0.
+    """
+    if t < 0:
+        raise ValueError(f"there is no frame {t}: the first is 0")
+
+
 def freeze(array: NDArray[Any]) -> NDArray[Any]:
     """Mark an array as never to be written again, and return it."""
     array.flags.writeable = False
     return array
-

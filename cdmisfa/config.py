@@ -22,6 +22,9 @@ from cdmisfa.errors import UsageError
 
 Section = TypeVar("Section")
 
+LARGEST = 2**63 - 1
+"""Largest whole number a key takes."""
+
 
 @dataclass(frozen=True, slots=True)
 class LearnerConfig:
@@ -68,6 +71,8 @@ class LearnerConfig:
         within(self, "learner", 1e-6, 1.0, "alpha")
         within(self, "learner", 0.0, math.inf, "epsilon_knee")
         within(self, "learner", 0.0, 0.999999, "gamma")
+        if self.beta is not None:
+            within(self, "learner", 0.0, math.inf, "beta")
         if self.tau < 3:
             raise UsageError(f"learner.tau is {self.tau}: a block needs at least 3 frames")
         if self.outputs > self.components:
@@ -150,7 +155,7 @@ def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
     for word in words:
         key, equals, value = word.partition("=")
         section, dot, name = key.strip().partition(".")
-        if not (equals and dot and name):
+        if not (equals and section and dot and name):
             raise UsageError(f"--set {word}: write it as section.key=value, as learner.nu=0.02")
         sections.setdefault(section, {})[name] = value.strip()
     return sections
@@ -212,7 +217,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
         return convert(value, next(a for a in arguments if a is not types.NoneType), key)
     if origin is tuple:
         parts = (
-            [p for p in value.strip("()[] ").split(",") if p.strip()]
+            [p.strip() for p in value.strip("()[] ").split(",") if p.strip()]
             if isinstance(value, str)
             else value
         )
@@ -221,10 +226,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
         inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
         if len(inner) != len(parts):
             raise UsageError(f"{key} is {value}: it must have {len(inner)} values")
-        return tuple(
-            convert(p.strip() if isinstance(p, str) else p, h, key)
-            for p, h in zip(parts, inner, strict=True)
-        )
+        return tuple(convert(p, h, key) for p, h in zip(parts, inner, strict=True))
     try:
         if hint is bool:
             if isinstance(value, str):
@@ -235,7 +237,10 @@ def convert(value: Any, hint: Any, key: str) -> Any:
         if hint is int:
             if isinstance(value, bool | float):
                 raise ValueError
-            return int(value)
+            whole = int(value)
+            if abs(whole) > LARGEST:
+                raise ValueError
+            return whole
         if hint is float:
             if isinstance(value, bool):
                 raise ValueError
@@ -247,7 +252,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
             if not isinstance(value, str):
                 raise ValueError
             return value
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError):
         raise UsageError(f"{key} is {value!r}: it must be {_WORDS[hint]}") from None
     raise TypeError(f"{key}: fields of type {hint} cannot be configured")
 

@@ -197,7 +197,8 @@ class SignalsHash:
     """SHA-256 over the canonical bytes of all records in order.
 
     Canonical: for each field, its shape as little-endian int64, then its elements in C
-    order as little-endian float64, int64 or one byte of a bool.
+    order as little-endian float64, int64 or one byte of a bool. Every NaN is the one that
+    numpy calls `nan`: which of them an operation gives depends on the processor.
     """
 
     def __init__(self) -> None:
@@ -219,5 +220,7 @@ def canonical_bytes(signals: BlockSignals) -> bytes:
     parts: list[bytes] = []
     for _, value in values(signals):
         parts.append(np.array(value.shape, dtype="<i8").tobytes())
+        if value.dtype.kind == "f":
+            value = np.where(np.isnan(value), np.nan, value)
         parts.append(np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<")).tobytes())
     return b"".join(parts)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
-from cdmisfa.errors import UsageError
+from cdmisfa.blocks import Block, SourceSpec, check_frame, check_request, freeze
+from cdmisfa.errors import LogExhaustedError, UsageError
 
 PERIOD = 500
 """Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500."""
@@ -72,6 +72,15 @@ def one_period(name: str) -> Float:
 class OscillatorySource:
     """Deterministic two-dimensional streams on the common clock.
 
+    Args:
+        streams: names from `STREAMS`.
+        fps: frames per second.
+        start_ns: log time of frame 0 in nanoseconds.
+        length: frames after which the streams end; by default they do not.
+
+    Raises:
+        UsageError: no streams, or one that does not exist.
+
     Example:
         >>> source = OscillatorySource()
         >>> source.take(0, 100).frames.shape
@@ -86,6 +95,8 @@ class OscillatorySource:
         start_ns: int = START_NS,
         length: int | None = None,
     ) -> None:
+        if not streams:
+            raise UsageError("a source has at least one stream: name some of " + ", ".join(STREAMS))
         self._shown = list(streams)
         self._tables = [one_period(name) for name in streams]
         self._t = 0
@@ -114,6 +125,11 @@ class OscillatorySource:
     def take(self, stream: int, n: int) -> Block:
         """The next n frames of a stream; see `FrameSource.take`."""
         check_request(self._spec, stream, n)
+        length = self._spec.length
+        if length is not None and self._t + n > length:
+            raise LogExhaustedError(
+                f"the streams end after {length} frames: {n} more at frame {self._t} do not exist"
+            )
         index = (self._t + np.arange(n)) % PERIOD
         frames = self._tables[stream][index]
         block = Block(stream, self._t, freeze(frames), freeze(2 * np.pi * index[:, None] / PERIOD))
@@ -121,7 +137,8 @@ class OscillatorySource:
         return block
 
     def seek(self, t: int) -> None:
-        """Move the clock to frame t."""
+        """Move the clock to frame t; see `FrameSource.seek`."""
+        check_frame(t)
         self._t = t
 
     def describe(self) -> Mapping[str, Any]:

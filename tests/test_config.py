@@ -1,0 +1,275 @@
+"""Configuration: strict keys and types, presets with sources, round trips."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdmisfa.config import (
+    LearnerConfig,
+    as_table,
+    build,
+    convert,
+    load_preset,
+    parse_settings,
+    presets,
+)
+from cdmisfa.errors import UsageError
+
+KEYS = [f.name for f in dataclasses.fields(LearnerConfig)]
+
+
+@dataclass(frozen=True)
+class Inner:
+    size: tuple[int, int] = (4, 8)
+    names: tuple[str, ...] = ("left",)
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = field(default_factory=Inner)
+    on: bool = False
+    seed: int | None = None
+    kind: Literal["a", "b"] = "a"
+
+
+def learner(**values: Any) -> LearnerConfig:
+    return build(LearnerConfig, "learner", values)
+
+
+def test_defaults_are_the_oscillatory_experiments() -> None:
+    assert learner() == LearnerConfig()
+    assert build(LearnerConfig, "learner", load_preset("oscillatory")["learner"]) == learner()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"),
+    [("sigm", "sigma"), ("epsilon_dekay", "epsilon_decay"), ("gate_windw", "gate_window")],
+)
+def test_an_unknown_key_names_the_nearest(wrong: str, right: str) -> None:
+    with pytest.raises(UsageError, match=rf"learner\.{wrong}: did you mean learner\.{right}\?"):
+        learner(**{wrong: 1})
+
+
+def test_a_key_like_no_other_lists_them_all() -> None:
+    with pytest.raises(UsageError, match="there are algorithm, nu, tau"):
+        learner(zzzzzzzz=1)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("nu", "fast", "a number"),
+        ("nu", True, "a number"),
+        ("nu", "nan", "a number"),
+        ("nu", [1.0], "a number"),
+        pytest.param("nu", 10**400, "a number", id="nu-huge"),
+        ("tau", 40.0, "a whole number"),
+        ("tau", "40.5", "a whole number"),
+        ("tau", True, "a whole number"),
+        pytest.param("tau", 10**30, "a whole number", id="tau-huge"),
+        ("tau", None, "a whole number"),
+        ("algorithm", "3.0", "choose one of 2.0, 1.0"),
+        ("expansion", "cubic", "choose one of none, quadratic"),
+        ("beta", "much", "a number"),
+    ],
+)
+def test_values_of_the_wrong_type(key: str, value: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=rf"learner\.{key} is .*{words}"):
+        learner(**{key: value})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("nu", 0.0),
+        ("nu", -1.0),
+        ("nu", math.inf),
+        ("delta", 0.0),
+        ("sigma", -1e-9),
+        ("beta", math.inf),
+        ("beta", -0.1),
+        ("tau", 2),
+        ("components", 0),
+        ("outputs", 6),
+        ("gamma", 1.0),
+        ("gamma", -0.1),
+        ("epsilon_decay", 1.01),
+        ("epsilon_knee", math.inf),
+        ("novel_share", 1.5),
+        ("gate_window", 0),
+        ("warm_up", -1),
+        ("patience", 0),
+    ],
+)
+def test_values_out_of_range_name_the_key(key: str, value: float) -> None:
+    with pytest.raises(UsageError, match=rf"learner\.{key} is"):
+        learner(**{key: value})
+
+
+def test_texts_become_the_fields_type() -> None:
+    config = learner(nu="0.02", tau="40", beta="0.5", algorithm="2.0")
+    assert (config.nu, config.tau, config.beta) == (0.02, 40, 0.5)
+    assert type(config.tau) is int
+    assert type(learner(nu=1).nu) is float
+
+
+@pytest.mark.parametrize("word", ["auto", "none", None])
+def test_auto_is_the_papers_beta(word: Any) -> None:
+    assert learner(beta=word).beta is None
+
+
+def test_the_last_layer_wins() -> None:
+    layers = ({"nu": 0.1, "tau": 10}, {"nu": "0.2"}, {})
+    config = build(LearnerConfig, "learner", *layers)
+    assert (config.nu, config.tau) == (0.2, 10)
+
+
+def test_nested_tables_and_dotted_names() -> None:
+    layers = ({"inner": {"size": [1, 2]}}, {"inner.names": "left, right", "on": "true"})
+    outer = build(Outer, "scene", *layers)
+    assert outer == Outer(Inner((1, 2), ("left", "right")), on=True)
+    assert build(Outer, "scene", {"inner.size": "(3,4)"}, base=outer).inner.names == (
+        "left",
+        "right",
+    )
+
+
+@pytest.mark.parametrize(
+    ("layer", "message"),
+    [
+        ({"inner": 3}, r"scene\.inner is a table"),
+        ({"inner.siz": 3}, r"scene\.inner\.siz: did you mean scene\.inner\.size\?"),
+        ({"on.x": 1}, r"scene\.on has no keys of its own"),
+        ({"inner.size": "1,2,3"}, r"scene\.inner\.size is 1,2,3: it must have 2 values"),
+        ({"inner.size": 7}, r"scene\.inner\.size is 7: it must be a list"),
+        ({"inner.size": "1,x"}, r"scene\.inner\.size is 'x': it must be a whole number"),
+        ({"on": "maybe"}, r"scene\.on is 'maybe': it must be true or false"),
+        ({"on": 1}, r"scene\.on is 1: it must be true or false"),
+        ({"inner.names": [1]}, r"scene\.inner\.names is 1: it must be a text"),
+    ],
+)
+def test_nested_mistakes_name_the_whole_key(layer: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        build(Outer, "scene", layer)
+
+
+@given(
+    st.builds(
+        Outer,
+        st.builds(
+            Inner,
+            st.tuples(st.integers(0, 99), st.integers(0, 99)),
+            st.lists(st.text(), max_size=3).map(tuple),
+        ),
+        st.booleans(),
+        st.none() | st.integers(0, 2**63 - 1),
+        st.sampled_from(["a", "b"]),
+    )
+)
+def test_as_table_and_build_are_inverse(outer: Outer) -> None:
+    assert build(Outer, "scene", as_table(outer)) == outer
+
+
+@given(
+    st.builds(
+        LearnerConfig,
+        nu=st.floats(1e-6, 1),
+        tau=st.integers(3, 1000),
+        beta=st.none() | st.floats(0, 10),
+        sigma=st.floats(0, 1),
+    )
+)
+def test_a_learners_table_survives_json_and_texts(config: LearnerConfig) -> None:
+    table = as_table(config)
+    assert list(table) == KEYS
+    assert build(LearnerConfig, "learner", table) == config
+    assert build(LearnerConfig, "learner", {k: str(v) for k, v in table.items()}) == config
+
+
+@pytest.mark.parametrize("name", ["icub", "oscillatory"])
+def test_presets_hold_every_key_with_its_source(name: str) -> None:
+    text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
+    assert name in presets()
+    section, seen = "", []
+    for line in text.splitlines():
+        if match := re.fullmatch(r"\[(\w+)\]", line):
+            section = match[1]
+        elif match := re.match(r"(\w+) = ", line):
+            assert re.search(r" # \w", line), f"{name}: no comment: {line}"
+            if section == "learner":
+                assert re.search(r"# (paper, \S|reading\b)", line), f"{name}: no source: {line}"
+                seen.append(match[1])
+    assert seen == KEYS
+    assert set(load_preset(name)["learner"]) == set(KEYS)
+    build(LearnerConfig, "learner", load_preset(name)["learner"])
+
+
+@pytest.mark.parametrize("name", ["icub", "oscillatory"])
+def test_decisions_that_presets_name_exist(name: str) -> None:
+    decisions = Path(__file__).parents[1] / "docs" / "decisions"
+    text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
+    named = set(re.findall(r"reading (\d{4})", text))
+    assert named
+    assert named <= {path.name[:4] for path in decisions.glob("*.md")}
+
+
+def test_the_papers_constants() -> None:
+    oscillatory = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
+    icub = build(LearnerConfig, "learner", load_preset("icub")["learner"])
+    told = [(c.nu, c.tau, c.sigma, c.delta, c.epsilon_start) for c in (oscillatory, icub)]
+    assert told == [(0.05, 100, 0.0009, 0.0006, 1.2), (0.01, 40, 0.01, 0.0008, 1.2)]
+    assert (oscillatory.expansion, icub.expansion) == ("quadratic", "none")
+
+
+def test_an_unknown_preset_names_the_nearest() -> None:
+    with pytest.raises(UsageError, match="no preset 'icob': did you mean icub"):
+        load_preset("icob")
+
+
+def test_presets_from_files(tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text("[learner]\nnu = 0.5\n")
+    assert load_preset(str(file)) == {"learner": {"nu": 0.5}}
+    for text, words in (("nu = 1\n", "outside a .section"), ("[learner\n", "not TOML")):
+        file.write_text(text)
+        with pytest.raises(UsageError, match=words):
+            load_preset(str(file))
+    file.write_bytes(b"\xff\xfe")
+    with pytest.raises(UsageError, match="not TOML"):
+        load_preset(str(file))
+    with pytest.raises(UsageError, match="No such file"):
+        load_preset(str(tmp_path / "none.toml"))
+
+
+def test_settings_are_section_key_value() -> None:
+    words = ["learner.nu=0.02", "scene.inner.size = 1,2", "learner.nu=0.03"]
+    assert parse_settings(words) == {"learner": {"nu": "0.03"}, "scene": {"inner.size": "1,2"}}
+
+
+@pytest.mark.parametrize("word", ["nu=1", "learner.nu", "learner.=1", ".nu=1", "", "="])
+def test_settings_of_another_form_are_refused(word: str) -> None:
+    with pytest.raises(UsageError, match="section.key=value"):
+        parse_settings([word])
+
+
+@given(st.text(max_size=20), st.sampled_from(KEYS))
+def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
+    try:
+        learner(**{key: text})
+    except UsageError as error:
+        assert f"learner.{key} is" in str(error)
+
+
+def test_fields_that_cannot_be_configured_are_a_programmers_error() -> None:
+    with pytest.raises(TypeError, match="cannot be configured"):
+        convert(1, dict, "scene.x")
