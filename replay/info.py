@@ -8,8 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.errors import LogDamagedError
 from recorder.viewlog import METADATA
+from replay.files import log_files
 from replay.reader import Crc, LogReader
 from replay.records import MalformedRecord
 from replay.runlog import METADATA as RUN_METADATA
@@ -66,24 +67,6 @@ def describe(path: str | Path) -> dict[str, Any]:
         "problems": [p for d in documents for p in d["problems"]],
         "metadata": {d["file"]: d["metadata"] for d in documents},
     }
-
-
-def log_files(path: str | Path) -> list[Path]:
-    """The MCAP files of a folder, or the file itself; a `.partial` where nothing else is there.
-
-    Raises:
-        UsageError: there is none.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise UsageError(f"{path}: no such file or folder")
-    if not path.is_dir():
-        return [path]
-    whole = sorted(path.glob("*.mcap"))
-    cut = [p for p in sorted(path.glob("*.mcap.partial")) if p.with_suffix("") not in whole]
-    if not whole and not cut:
-        raise UsageError(f"{path}: no .mcap file in this folder")
-    return whole + cut
 
 
 def kind_of(reader: LogReader) -> str:

@@ -23,6 +23,7 @@ from replay.records import (
     Channel,
     MalformedRecord,
     Schema,
+    Statistics,
     decompress,
     decompress_prefix,
 )
@@ -123,6 +124,16 @@ class LogReader:
         if structure.tail is not None and not self.salvage and structure.tail.crc:
             return f"{structure.missing}; recover can save part of the last chunk, unverified"
         return structure.missing
+
+    @property
+    def data_complete(self) -> bool:
+        """Whether every message is there, if not the summary behind them."""
+        return self._structure.data_crc is not None
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """What the summary says the file holds."""
+        return self._structure.statistics
 
     @property
     def segments(self) -> list[Segment]:

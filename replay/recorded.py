@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import hashlib
 import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
-from cdmisfa.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.errors import LogDamagedError, LogExhaustedError
+from replay.files import log_files, sha256
 from replay.viewfile import ViewFacts, ViewFile, intersection
 
 CACHE_BYTES: Final = 128 * 1024 * 1024
@@ -44,7 +44,7 @@ class RecordedSource:
         """
         self.warnings: tuple[str, ...] = ()
         self._loop = loop
-        self._files = view_files(paths)
+        self._files = log_files(paths)
         self._hashes: list[dict[str, Any]] | None = None
         self._views: list[list[ViewFile]] = []
         opened: list[ViewFile] = []
@@ -73,6 +73,17 @@ class RecordedSource:
     def frames(self) -> int:
         """Frames that every view has."""
         return self._count
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the first frame that every view has."""
+        return self._first
+
+    def coverage(self) -> dict[str, list[tuple[int, int]]]:
+        """Give for each view the frames that are there, from and up to before."""
+        return {
+            parts[0].facts.view: [r for view in parts for r in view.ranges] for parts in self._views
+        }
 
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a view shows at t .. t+n-1; moves t by n.
@@ -153,7 +164,7 @@ class RecordedSource:
     def _set_clock(self) -> None:
         """Find the frames that every view has, whole."""
         facts = [parts[0].facts for parts in self._views]
-        covered = [[r for view in parts for r in view.ranges] for parts in self._views]
+        covered = list(self.coverage().values())
         common = covered[0]
         for ranges in covered[1:]:
             common = intersection(common, ranges)
@@ -202,46 +213,6 @@ class RecordedSource:
                 if start <= frame < stop:
                     return view, frame, min(wanted, min(high, stop) - frame)
         raise AssertionError(f"frame {frame} is in no file")
-
-
-def view_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """The files of a recording: those in a folder, or those named.
-
-    A `.partial` counts where the finished file is not there.
-
-    Raises:
-        UsageError: there is none.
-    """
-    if isinstance(paths, str | Path):
-        paths = [paths]
-    files: list[Path] = []
-    for path in map(Path, paths):
-        if path.is_dir():
-            found = sorted(path.glob("*.mcap"))
-            cut = [p for p in sorted(path.glob("*.mcap.partial")) if p.with_suffix("") not in found]
-            if not found and not cut:
-                raise UsageError(f"{path}: no .mcap file in this folder; record one first")
-            files += found + cut
-        elif path.exists():
-            files.append(path)
-        else:
-            raise UsageError(f"{path}: no such file or folder")
-    if not files:
-        raise UsageError("no recording was named")
-    return files
-
-
-def sha256(path: Path) -> str:
-    """SHA-256 of a file, read piece by piece.
-
-    Raises:
-        CdmisfaError: it cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise CdmisfaError(f"{path}: {error.strerror}") from None
 
 
 def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
