@@ -7,7 +7,7 @@ compiled whole-trial loop run the very same code. An iteration costs O(streams).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,10 +134,9 @@ class Rules(NamedTuple):
 
 def rules(config: LearnerConfig, n_streams: int) -> Rules:
     """The rules of a configuration for n streams."""
-    special = {"beta": config.reward_beta(n_streams), "tabular": config.algorithm == "1.0"}
-    return Rules(
-        **{n: special[n] if n in special else float(getattr(config, n)) for n in Rules._fields}
-    )
+    special: Any = {"beta": config.reward_beta(n_streams), "tabular": config.algorithm == "1.0"}
+    values: Any = {n: float(getattr(config, n)) for n in Rules._fields if n not in special}
+    return Rules(**special, **values)
 
 
 def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent:
