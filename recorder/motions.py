@@ -122,7 +122,13 @@ class Motions:
         return self._t
 
     def seek(self, t: int) -> None:
-        """Go to frame t: drawing on when it lies ahead, from the start when behind."""
+        """Go to frame t: drawing on when it lies ahead, from the start when behind.
+
+        Raises:
+            ValueError: t is negative.
+        """
+        if t < 0:
+            raise ValueError(f"frame {t} does not exist: the first is 0")
         chunk = t // CHUNK
         if chunk < self._chunk:
             self._restart()
