@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.progress import Bar, bar
 
 
 @click.command("demo")
@@ -25,8 +29,28 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
     """
     from cdmisfa.experiments.demo import demo
 
-    report = demo(out or Path(), seed=seed, frames=frames, jobs=jobs, stage=bar)
+    report = demo(out or Path(), seed=seed, frames=frames, jobs=jobs, stage=_stage)
     if as_json:
         options.print_json(report.as_json())
-    else:
-        click.echo(report.text())
+        return
+    options.print_table(
+        ("module", "view", "policy", "iteration", "follows", "correlation"),
+        [
+            (m.module, m.view, " ".join(m.policy), m.iteration, m.follows, f"{m.correlation:.3f}")
+            for m in report.modules
+        ],
+    )
+    click.echo()
+    for figure in report.figures:
+        click.echo(f"figure     {figure}")
+    click.echo(f"look at it {sys.argv[0]} view {report.run}")
+
+
+@contextmanager
+def _stage(title: str, unit: str) -> Iterator[Bar]:
+    """Announce a stage and say how long it took, also where nobody sees a bar."""
+    start = time.monotonic()
+    click.echo(title, err=True)
+    with bar("", unit) as shown:
+        yield shown
+    click.echo(f"    {time.monotonic() - start:.0f} s", err=True)

@@ -1,0 +1,65 @@
+"""Fixtures that several areas share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left: its exit code and what it wrote."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """The one document on stdout; anything else there fails."""
+        return json.loads(self.out)
+
+
+Cdmisfa = Callable[..., Outcome]
+
+
+@pytest.fixture
+def cdmisfa(capfd: pytest.CaptureFixture[str]) -> Cdmisfa:
+    """Run the command line in this process and take what it wrote."""
+    from cdmisfa.cli import run
+
+    def call(*args: object) -> Outcome:
+        capfd.readouterr()
+        code = run([str(arg) for arg in args])
+        written = capfd.readouterr()
+        return Outcome(code, written.out, written.err)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def oscillatory_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of the oscillatory streams, 2000 frames; not to be changed."""
+    from cdmisfa.cli import run
+
+    folder = tmp_path_factory.mktemp("recordings") / "oscillatory"
+    assert run(["record", "oscillatory", "-o", str(folder), "--frames", "2000"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="session")
+def oscillatory_run(
+    tmp_path_factory: pytest.TempPathFactory, oscillatory_recording: Path
+) -> Path:
+    """A run of 15 iterations on that recording, without a Rerun view; not to be changed."""
+    from cdmisfa.cli import run
+
+    folder = tmp_path_factory.mktemp("runs") / "oscillatory"
+    words = ["learn", str(oscillatory_recording), "-o", str(folder)]
+    assert run([*words, "--max-iterations", "15", "--no-rerun"]) == 0
+    return folder
