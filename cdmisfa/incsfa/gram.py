@@ -1,0 +1,208 @@
+"""IncSFA on the Gram matrix of the CCIPCA vectors: the fast path for images.
+
+The trajectory is the strict kernel's up to rounding. All scalars of a frame come from
+inner products (`coefficients`), and the vectors themselves are read and written once
+for every four frames (`passes`). xi has no cancellation.
+
+Sums are reassociated, so the last digits may differ across CPUs, and between cuts of
+the same frames into calls (the learner always cuts by tau); on one machine, with the
+same cuts, the bits are the same on every run. No BLAS, one thread.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.compiled import compiled
+from cdmisfa.incsfa.coefficients import (
+    ccipca_coefficients,
+    change_of_features,
+    features_in_vectors,
+    follow,
+)
+from cdmisfa.incsfa.passes import GROUP, TILE, apply_group, gram_tile
+from cdmisfa.incsfa.state import Float, Params, State, amnesic_weight, mca_step
+from cdmisfa.incsfa.strict import slow_features
+
+REFRESH = 1000
+"""Frames after which the Gram matrix is computed from the vectors again."""
+
+
+class Group(NamedTuple):
+    """What is known of up to GROUP consecutive frames before they are applied.
+
+    Attributes:
+        u: (GROUP, I) centred frames; rows of missing frames are 0.
+        g: (GROUP, GROUP) their inner products.
+        e: (K, GROUP) their inner products with the vectors.
+    """
+
+    u: Float
+    g: Float
+    e: Float
+
+
+class Steps(NamedTuple):
+    """A group's CCIPCA steps, in the form `passes.apply_tile` wants them.
+
+    Attributes:
+        shrink: (K,) product of what the steps keep of each vector.
+        gain: (K, GROUP) share of the residual each vector takes, over the product so far.
+        take: (K, GROUP) share of each vector the residual loses, times the product so far.
+    """
+
+    shrink: Float
+    gain: Float
+    take: Float
+
+
+class Features(NamedTuple):
+    """The slow features after the last frame, on the CCIPCA vectors.
+
+    Attributes:
+        scale: (K,) whitening scales.
+        m: (J, K) phi = m v.
+    """
+
+    scale: Float
+    m: Float
+
+
+@compiled
+def group_length(left: int, pending: bool, gap: bool) -> int:
+    """Frames of the next group: up to GROUP, but one after a gap ends with its second frame.
+
+    That frame's change spans two steps and is taken from phi itself.
+
+    Args:
+        left: frames left.
+        pending: the frame before followed a gap.
+        gap: the first of these frames follows a gap.
+    """
+    return min(left, 1 if pending else 2 if gap else GROUP)
+
+
+@compiled
+def refresh_gram(v: Float, gram: Float) -> None:
+    """Compute the inner products of the vectors anew.
+
+    Args:
+        v: (K, I) CCIPCA vectors.
+        gram: (K, K) receives v v^T.
+    """
+    gram[:] = 0.0
+    for start in range(0, v.shape[1], TILE):
+        gram_tile(v, start, gram)
+
+
+@compiled
+def learn_group(
+    state: State,
+    nu: float,
+    group: Group,
+    count: int,
+    gap: bool,
+    steps: Steps,
+    now: Features,
+    xi: Float,
+) -> None:
+    """Learn from a group's inner products: everything but `state.v` and `state.phi`.
+
+    Args:
+        state: gram, d, w, z_prev and counts are brought up to date.
+        nu: learning rate of MCA.
+        group: e is overwritten.
+        count: frames in the group.
+        gap: its first frame follows a gap.
+        steps: receives the CCIPCA steps.
+        now: brought up to date.
+        xi: (count,) changes of phi; NaN where the frame follows a gap, and left alone
+            where the frame before does.
+    """
+    J, K = state.w.shape
+    keep, gain, take = np.empty(K), np.empty(K), np.empty(K)
+    e, work, z_dot = np.empty(K), np.empty(K), np.empty(K)
+    rho, m_before, gram_before = np.empty(GROUP), np.empty((J, K)), np.empty((K, K))
+    steps.shrink[:] = 1.0
+    steps.gain[:] = 0.0
+    steps.take[:] = 0.0
+    for t in range(count):
+        energy = group.g[t, t]
+        gram_before[:] = state.gram
+        m_before[:] = now.m
+        for k in range(K):
+            e[k] = work[k] = group.e[k, t]
+        for s in range(GROUP):
+            rho[s] = group.g[s, t]
+        weight = amnesic_weight(state.counts[0] + 1)
+        ccipca_coefficients(state.gram, state.d, weight, energy, work, keep, gain, take)
+        follow(group.e, rho, t, keep, gain, take)
+        features_in_vectors(state.w, state.d, now.scale, now.m)
+        for k in range(K):
+            steps.shrink[k] *= keep[k]
+            steps.gain[k, t] = gain[k] / steps.shrink[k]
+            steps.take[k, t] = take[k] * steps.shrink[k]
+            z = group.e[k, t] * now.scale[k]
+            z_dot[k] = z - state.z_prev[k]
+            state.z_prev[k] = z
+        state.counts[0] += 1
+        if gap and t == 0:
+            xi[t] = np.nan
+            state.counts[1] = 1
+            continue
+        mca_step(state.w, z_dot, nu, work)
+        features_in_vectors(state.w, state.d, now.scale, now.m)
+        if state.counts[1] == 0:
+            xi[t] = change_of_features(
+                now.m, m_before, gram_before, e, energy, keep, gain, take, work
+            )
+        state.counts[1] = 0
+
+
+@compiled
+def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Float) -> None:
+    """Learn from consecutive frames; the trajectory is that of `strict.update`.
+
+    Args:
+        state: changed in place.
+        params: constants of the rule.
+        frames: (n, I) float64 values or uint8 pixels; not changed.
+        gap: the first frame does not follow the last one of the call before.
+        xi: (n,) receives the change of phi at each frame, NaN after a gap.
+    """
+    n_frames, size = frames.shape
+    J, K = state.w.shape
+    group = Group(np.zeros((GROUP, size)), np.zeros((GROUP, GROUP)), np.zeros((K, GROUP)))
+    coming = Group(np.zeros((GROUP, size)), np.zeros((GROUP, GROUP)), np.zeros((K, GROUP)))
+    steps = Steps(np.ones(K), np.zeros((K, GROUP)), np.zeros((K, GROUP)))
+    now = Features(np.empty(K), np.empty((J, K)))
+    tile, row = np.zeros(2 * GROUP * TILE), np.empty(size)
+    if state.counts[2] == 0 or state.counts[2] >= REFRESH:
+        refresh_gram(state.v, state.gram)
+        state.counts[2] = 0
+    state.counts[2] += n_frames
+    features_in_vectors(state.w, state.d, now.scale, now.m)
+    gap = gap or state.counts[0] == 0
+    start = count = 0
+    while True:
+        new_episode = gap and start == 0
+        pending = count > 0 and (state.counts[1] == 1 or (new_episode and count > 1))
+        learn_group(state, params.nu, group, count, new_episode, steps, now, xi[start:])
+        start += count
+        following = group_length(n_frames - start, state.counts[1] == 1, gap and start == 0)
+        apply_group(
+            state.v, state.mean, group.u, steps.shrink, steps.gain, steps.take, tile,
+            frames, start, following, state.counts[0], params.mean_window,
+            coming.u, coming.g, coming.e,
+        )  # fmt: skip
+        if pending:
+            xi[start - 1] = slow_features(state.w, now.scale, state.v, state.phi, row)
+        if following == 0:
+            break
+        count = following
+        group, coming = coming, group
+    if state.counts[1] == 0 and not pending:
+        slow_features(state.w, now.scale, state.v, state.phi, row)
