@@ -253,7 +253,7 @@ def track_output(agent: Agent, rules: Rules, j: int, y: Float) -> None:
     n = len(y)
     blocks = agent.memory[0]["novel_blocks"]
     mean, square, derivative = block_moments(y)
-    rate = max(2.0 * n / (rules.slowness_window + n), 1.0 / blocks)
+    rate = min(1.0, max(2.0 * n / (rules.slowness_window + n), 1.0 / blocks))
     agent.derivative[j] += rate * (derivative - agent.derivative[j])
     agent.recent_mean[j] += rate * (mean - agent.recent_mean[j])
     agent.recent_square[j] += rate * (square - agent.recent_square[j])
@@ -269,6 +269,8 @@ def track_output(agent: Agent, rules: Rules, j: int, y: Float) -> None:
         agent.eta_dot[j] += 2.0 / (rules.eta_dot_window + 1.0) * (change - agent.eta_dot[j])
     agent.eta[j] = eta
     agent.eta_inst[j] = instantaneous_slowness(y)
+    if math.isinf(agent.eta_inst[j]):
+        return  # an output that stands still has no slowness to average
     a = window_rate(rules.gate_window, blocks)
     step = agent.eta_inst[j] - agent.gate_mean[j]
     agent.gate_mean[j] += a * step

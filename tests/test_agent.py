@@ -1,0 +1,307 @@
+"""The agent's iteration: what is rewarded, what is saved, what is forgotten."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdmisfa.agent import (
+    IDLE_EPSILON,
+    OUTCOME,
+    Agent,
+    begin_abstraction,
+    has_gap,
+    mean_change,
+    new_agent,
+    ready_to_save,
+    recent_variance,
+    rules,
+    think,
+    track_output,
+)
+from cdmisfa.config import LearnerConfig
+from cdmisfa.gate import CONSTANT, NOVEL
+from cdmisfa.signals import DENSE_STREAMS
+from cdmisfa.slowness import instantaneous_slowness
+
+TAU = 50
+SLOW = np.sin(2 * np.pi * np.arange(5000) / 250)
+STAY = (0.999999, 0.0, 0.0)
+"""Draws that explore only while epsilon is 1 or more, and then stay."""
+
+
+def config(**values: Any) -> LearnerConfig:
+    return LearnerConfig(**{"warm_up": 2, **values})
+
+
+class Bench:
+    """An agent that is told what its gate and its abstraction say."""
+
+    def __init__(self, n: int = 3, first: int = 0, **values: Any) -> None:
+        self.config = config(**values)
+        self.agent = new_agent(self.config, n, first)
+        self.rules = rules(self.config, n)
+        self.t = 0
+
+    def step(
+        self,
+        xi: float = 0.01,
+        known_by: int = NOVEL,
+        draws: tuple[float, float, float] = STAY,
+        y: np.ndarray | None = None,
+    ) -> dict[str, Any]:
+        start = self.t % 4000
+        y = SLOW[start : start + TAU, None] if y is None else y
+        self.t += len(y)
+        out = np.zeros(1, OUTCOME)
+        think(self.agent, self.rules, out, known_by, xi, y, self.t, np.array(draws))
+        return dict(zip(OUTCOME.names or (), out[0].item(), strict=True))
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        memory = self.agent.memory
+        return dict(zip(memory.dtype.names, memory[0].item(), strict=True))
+
+
+def test_it_begins_with_nothing_known_and_the_stream_it_is_told() -> None:
+    bench = Bench(first=2)
+    told = bench.memory
+    assert (told["stream"], told["module"], told["iteration"]) == (2, 1, 0)
+    assert (told["epsilon"], told["share"]) == (1.2, 1.0)
+    assert not bench.agent.policy.any()
+    assert np.isnan(bench.agent.eta).all()
+
+
+def test_rewards_begin_after_the_warm_up() -> None:
+    bench = Bench(warm_up=2)
+    outs = [bench.step(xi) for xi in (0.5, 0.3, 0.2, 0.1)]
+    assert math.isnan(outs[0]["xi_dot"])
+    assert outs[1]["xi_dot"] == pytest.approx(-0.2)
+    assert [math.isnan(o["reward"]) for o in outs] == [True, True, False, False]
+    assert bench.memory["rewards"] == 2
+
+
+def test_the_reward_goes_to_the_transition_that_led_to_the_block() -> None:
+    bench = Bench(warm_up=1, sigma=0.01, beta=0.5)
+    bench.step(0.5, draws=(0.0, 0.9, 0.0))  # switch from 0 to 1
+    out = bench.step(0.02, draws=(0.0, 0.0, 0.0))
+    expected = 0.48 + 0.5 * math.exp(-2.0)
+    assert out["curiosity"] == pytest.approx(0.48)
+    assert out["expert"] == pytest.approx(0.5 * math.exp(-2.0))
+    assert out["reward"] == pytest.approx(expected)
+    assert bench.agent.dense[0, 1, 1] == pytest.approx(expected)
+    assert np.count_nonzero(bench.agent.dense) == 1
+    assert bench.agent.switch_sum.tolist() == pytest.approx([expected, 0, 0])
+    assert (out["stream"], out["next_stream"]) == (1, 1)
+
+
+@pytest.mark.parametrize("verdict", [1, 2, CONSTANT])
+def test_a_known_block_teaches_nothing_but_time_goes_on(verdict: int) -> None:
+    bench = Bench(warm_up=0)
+    for xi in (0.5, 0.4, 0.3):
+        bench.step(xi)
+    before = {name: a.copy() for name, a in bench.agent._asdict().items() if name != "memory"}
+    memory = bench.memory
+    out = bench.step(0.1, known_by=verdict, y=np.full((TAU, 1), np.nan))
+    for name, array in before.items():
+        np.testing.assert_array_equal(getattr(bench.agent, name), array, err_msg=name)
+    assert out["known_by"] == verdict
+    assert not out["novel"]
+    assert all(math.isnan(out[k]) for k in ("xi", "xi_dot", "curiosity", "expert", "reward"))
+    for name in ("rewards", "novel_blocks", "xi", "fed_stream", "fed_until"):
+        assert bench.memory[name] == memory[name], name
+    assert out["epsilon"] == memory["epsilon"] * 0.999
+    assert out["share"] == pytest.approx(memory["share"] * (1 - 2 / 41))
+    assert bench.memory["iteration"] == memory["iteration"] + 1
+
+
+def test_the_weight_change_is_compared_with_the_last_novel_block() -> None:
+    bench = Bench(warm_up=0)
+    bench.step(0.5)
+    bench.step(known_by=1)
+    bench.step(known_by=CONSTANT)
+    assert bench.step(0.2)["curiosity"] == pytest.approx(0.3)
+
+
+def test_gaps() -> None:
+    bench = Bench()
+    assert has_gap(bench.agent, 0, 0)
+    bench.step()
+    assert not has_gap(bench.agent, 0, TAU)
+    assert has_gap(bench.agent, 1, TAU)
+    assert has_gap(bench.agent, 0, TAU + 1)
+    bench.step(known_by=1)
+    assert has_gap(bench.agent, 0, 2 * TAU)
+    bench.step()
+    assert not has_gap(bench.agent, 0, 3 * TAU)
+    begin_abstraction(bench.agent, 1.2)
+    assert has_gap(bench.agent, 0, 3 * TAU)
+
+
+def test_the_mean_change_leaves_out_what_has_none() -> None:
+    assert mean_change(np.array([np.nan, 1.0, 2.0])) == 1.5
+    assert mean_change(np.array([0.5, 1.5])) == 1.0
+    assert math.isnan(mean_change(np.array([np.nan])))
+
+
+def test_eta_is_over_all_novel_blocks_and_eta_inst_over_the_last() -> None:
+    bench = Bench()
+    y = np.random.default_rng(0).standard_normal((40, TAU, 1))
+    for block in y:
+        bench.step(y=block)
+    assert bench.agent.eta_inst[0] == instantaneous_slowness(y[-1, :, 0].copy())
+    assert bench.agent.eta[0] == pytest.approx(0.2251, rel=0.1)
+    assert recent_variance(bench.agent, 0) == pytest.approx(1.0, rel=0.2)
+
+
+def test_eta_dot_is_the_running_mean_change_of_eta() -> None:
+    bench, seen, expected = Bench(), [], math.nan
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        bench.step(y=rng.standard_normal((TAU, 1)))
+        seen.append(bench.agent.eta[0])
+        if len(seen) > 1:
+            change = abs(seen[-1] - seen[-2])
+            known = len(seen) > 2
+            expected = expected + 2 / 41 * (change - expected) if known else change
+        np.testing.assert_allclose(bench.agent.eta_dot[0], expected, rtol=1e-12)
+
+
+def test_the_gates_band_is_the_mean_and_sd_of_eta_inst() -> None:
+    bench, seen = Bench(gate_window=20), []
+    rng = np.random.default_rng(2)
+    for _ in range(10):  # up to half the window the rate is 1/n: the plain mean and SD
+        bench.step(y=rng.standard_normal((TAU, 1)))
+        seen.append(bench.agent.eta_inst[0])
+        assert bench.agent.gate_mean[0] == pytest.approx(np.mean(seen))
+        assert math.sqrt(bench.agent.gate_variance[0]) == pytest.approx(np.std(seen), abs=1e-12)
+
+
+def test_a_block_longer_than_the_window_counts_fully_and_not_more() -> None:
+    bench = Bench(slowness_window=10)
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        y = rng.standard_normal((TAU, 1)) * rng.choice([0.1, 10.0])
+        bench.step(y=y)
+        assert bench.agent.derivative[0] == pytest.approx(np.mean(np.diff(y[:, 0]) ** 2))
+        assert recent_variance(bench.agent, 0) == pytest.approx(np.var(y))
+
+
+def test_one_output_that_stood_still_does_not_ruin_the_gate() -> None:
+    bench = Bench(eta_dot_window=4)
+    bench.step()
+    bench.step(y=np.full((TAU, 1), 0.25))
+    assert bench.agent.eta_inst[0] == math.inf
+    for _ in range(60):
+        bench.step()
+    assert np.isfinite(bench.agent.gate_mean).all()
+    assert np.isfinite(bench.agent.gate_variance).all()
+    assert np.isfinite(bench.agent.eta_dot).all()
+
+
+def saving(bench: Bench, limit: int = 2000, **step: Any) -> int:
+    """Steps until the abstraction is saved, or 0."""
+    for k in range(1, limit):
+        if bench.step(**step)["saved"]:
+            return k
+    return 0
+
+
+def test_a_settled_output_is_saved_after_more_blocks_than_the_window() -> None:
+    assert saving(Bench(delta=1.0, eta_dot_window=40)) == 41
+    assert saving(Bench(delta=1.0, eta_dot_window=7)) == 8
+    assert saving(Bench(delta=1e-30), limit=200) == 0
+
+
+def test_a_dead_output_is_not_saved() -> None:
+    bench = Bench(delta=1.0)
+    tiny = 0.3 * SLOW[:250, None]  # variance .045, below .1
+    assert saving(bench, limit=100, y=tiny) == 0
+    assert not ready_to_save(bench.agent, bench.rules)
+
+
+def test_a_hardly_fed_abstraction_is_not_saved() -> None:
+    bench = Bench(delta=1.0)
+    for k in range(600):
+        assert not bench.step(known_by=NOVEL if k % 4 else 1)["saved"]
+    assert bench.memory["novel_blocks"] == 450
+    assert 0 < saving(bench) < 60
+
+
+def test_after_a_save_everything_starts_anew() -> None:
+    bench = Bench(delta=1.0, warm_up=0)
+    steps = saving(bench)
+    saved = bench.memory
+    assert saved["epsilon"] == 1.2
+    assert bench.agent.Q.any()
+    begin_abstraction(bench.agent, bench.config.epsilon_start)
+    fresh = new_agent(bench.config, 3, 0)
+    for name in Agent._fields[1:]:
+        np.testing.assert_array_equal(getattr(bench.agent, name), getattr(fresh, name), name)
+    memory, first = bench.memory, fresh.memory[0]
+    kept = {"iteration": steps, "module": 2, "last_action": 0, "last_stream": 0}
+    for name in fresh.memory.dtype.names:
+        np.testing.assert_array_equal(memory[name], kept.get(name, first[name]), name)
+
+
+def test_the_iteration_that_saves_changes_neither_reward_nor_policy() -> None:
+    bench = Bench(delta=1.0, warm_up=0)
+    for _ in range(40):
+        bench.step()
+    before, count = bench.agent.Q.copy(), bench.memory["rewards"]
+    assert bench.step()["saved"]
+    np.testing.assert_array_equal(bench.agent.Q, before)
+    assert bench.memory["rewards"] == count
+
+
+def test_idle_counts_iterations_without_exploration() -> None:
+    bench = Bench(epsilon_start=2 * IDLE_EPSILON, epsilon_tail_decay=0.4)
+    assert bench.step()["epsilon"] < IDLE_EPSILON
+    for k in range(2, 6):
+        bench.step()
+        assert bench.memory["idle"] == k
+
+
+@given(st.integers(1, 8), st.lists(st.tuples(st.floats(0, 1), *[st.floats(0, 0.99)] * 3)))
+def test_the_next_stream_follows_from_the_action(
+    n: int, history: list[tuple[float, float, float, float]]
+) -> None:
+    bench = Bench(n, warm_up=0)
+    stream = 0
+    for xi, *draws in history:
+        out = bench.step(xi, draws=(draws[0], draws[1], draws[2]))
+        assert out["stream"] == stream
+        stream = out["next_stream"]
+        assert bench.memory["stream"] == stream
+        assert (stream == out["stream"]) == (out["action"] == 0 or n == 1)
+        assert np.isfinite(bench.agent.Q).all()
+
+
+def test_without_exploration_the_policy_decides() -> None:
+    bench = Bench(epsilon_start=1e-6, warm_up=0)
+    bench.agent.policy[:] = [1, 1, 1]
+    out = bench.step(draws=(0.5, 0.0, 0.6))
+    assert (out["action"], out["explored"], out["next_stream"]) == (1, False, 2)
+
+
+def test_ten_thousand_streams_need_memory_in_proportion() -> None:
+    def size(n: int) -> int:
+        return sum(array.nbytes for array in new_agent(config(), n, 0))
+
+    assert new_agent(config(), DENSE_STREAMS, 0).dense.shape == (64, 2, 64)
+    assert new_agent(config(), DENSE_STREAMS + 1, 0).dense.shape == (0, 2, 0)
+    assert size(10_000) - size(5_000) <= 5_000 * 64
+    rng = np.random.default_rng(4)
+    bench = Bench(10_000, warm_up=0)
+    visited = set()
+    for xi in rng.random(300):
+        out = bench.step(xi, draws=tuple(rng.random(3)))
+        visited.add(out["next_stream"])
+    assert len(visited) > 100
+    assert np.isfinite(bench.agent.Q).all()
+    assert bench.agent.Q.any()
