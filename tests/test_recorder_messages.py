@@ -1,0 +1,95 @@
+"""Messages of a recording: what goes in comes out, at the bytes a fast reader looks at."""
+
+import math
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf import PoseInFrame_pb2, RawImage_pb2
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdmisfa.errors import UsageError
+from recorder.messages import (
+    ImageEncoder,
+    Payload,
+    PoseEncoder,
+    TruthEncoder,
+    VectorEncoder,
+    image_payload,
+    truth_layout,
+    truth_tags,
+    vector_payload,
+)
+
+TIMES = st.integers(0, 2**62)
+DOUBLES = st.lists(st.floats(), min_size=1, max_size=20)
+
+
+def values(message: bytes, payload: Payload) -> bytes:
+    end = len(message) - payload.tail
+    start = end - payload.size
+    assert message[start - len(payload.before) : start] == payload.before
+    return message[start:end]
+
+
+def decode(encoder, message: bytes):
+    """Decode with nothing but the schema a log holds."""
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(encoder.schema_data()).file:
+        pool.Add(file)
+    described = pool.FindMessageTypeByName(encoder.schema)
+    return message_factory.GetMessageClass(described).FromString(message)
+
+
+@given(TIMES, st.integers(1, 40), st.integers(1, 200), st.sampled_from(["", "left", "é" * 90]))
+def test_images(time, height, width, frame_id):
+    frame = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
+    encoder = ImageEncoder(height, width, frame_id)
+    message = encoder(time, frame)
+    assert values(message, image_payload(height, width, frame_id)) == frame.tobytes()
+    image = RawImage_pb2.RawImage.FromString(message)
+    assert (image.height, image.width, image.step) == (height, width, width)
+    assert (image.encoding, image.frame_id) == ("mono8", frame_id)
+    assert image.timestamp.ToNanoseconds() == time
+    assert decode(encoder, message).data == frame.tobytes()
+
+
+@given(TIMES, DOUBLES)
+def test_vectors_are_exact_to_the_bit(time, numbers):
+    frame = np.array(numbers)
+    encoder = VectorEncoder()
+    message = encoder(time, frame)
+    assert values(message, vector_payload(len(frame))) == frame.astype("<f8").tobytes()
+    decoded = decode(encoder, message)
+    assert np.array(decoded.values).tobytes() == frame.tobytes()
+    assert decoded.timestamp.ToNanoseconds() == time
+
+
+@given(TIMES, DOUBLES)
+def test_truth_has_one_layout_whatever_its_values(time, numbers):
+    names = [f"object{i}_x" for i in range(len(numbers))]
+    row = np.array(numbers)
+    encoder = TruthEncoder(names)
+    message = encoder(time, row)
+    layout = truth_layout(names)
+    tail = np.frombuffer(message[-layout.itemsize :], layout)[0]
+    assert [tail[f"tag_{i}"].tobytes() for i in range(len(names))] == truth_tags(names)
+    assert np.array([tail[name] for name in names]).tobytes() == row.tobytes()
+    decoded = decode(encoder, message)
+    assert np.array([getattr(decoded, name) for name in names]).tobytes() == row.tobytes()
+
+
+def test_poses():
+    half = math.sqrt(0.5)
+    message = PoseEncoder("root")(5, (1.0, 2.0, 3.0), (0.0, 0.0, half, half))
+    pose = PoseInFrame_pb2.PoseInFrame.FromString(message)
+    assert pose.frame_id == "root"
+    assert (pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) == (1.0, 2.0, 3.0)
+    assert (pose.pose.orientation.z, pose.pose.orientation.w) == (half, half)
+
+
+@pytest.mark.parametrize("names", [["a b"], ["timestamp"], ["a", "a"], ["1x"], [""]])
+def test_names_that_protobuf_does_not_have_are_refused(names):
+    with pytest.raises(UsageError, match="ground truth"):
+        TruthEncoder(names)

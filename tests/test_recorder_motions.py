@@ -1,0 +1,91 @@
+"""The objects' motions: the paper's statistics, and frame t whatever came before."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdmisfa.errors import UsageError
+from recorder.config import BoxConfig, SceneConfig, SphereConfig
+from recorder.motions import CHUNK, Motions, reflect
+
+SCENE = SceneConfig()
+WHOLE = Motions(SCENE, 3).take(2 * CHUNK + 100)
+
+
+@given(st.lists(st.integers(1, 3000), min_size=1, max_size=8))
+@settings(max_examples=25, deadline=None)
+def test_positions_do_not_depend_on_how_blocks_are_cut(sizes):
+    motions, start = Motions(SCENE, 3), 0
+    for n in sizes:
+        got = motions.take(n)
+        expected = WHOLE[start : start + n]
+        np.testing.assert_array_equal(got[: len(expected)], expected)
+        start += n
+        assert motions.t == start
+
+
+@given(st.lists(st.integers(0, 2 * CHUNK), min_size=1, max_size=6))
+@settings(max_examples=25, deadline=None)
+def test_any_frame_can_be_sought(frames):
+    motions = Motions(SCENE, 3)
+    for t in frames:
+        motions.seek(t)
+        np.testing.assert_array_equal(motions.take(5), WHOLE[t : t + 5])
+
+
+def test_object_1_toggles_y_and_is_uniform_in_x():
+    x, y = WHOLE[:, 0].T
+    np.testing.assert_array_equal(y[:30], [0.4] * 10 + [0.6] * 10 + [0.4] * 10)
+    assert set(np.unique(y)) == {0.4, 0.6}
+    assert -0.6 <= x.min() < -0.59
+    assert -0.41 < x.max() <= -0.4
+    assert abs(np.corrcoef(x[1:], x[:-1])[0, 1]) < 0.05
+
+
+def test_object_2_is_uniform_and_forgets():
+    low, high = WHOLE[:, 1].min(axis=0), WHOLE[:, 1].max(axis=0)
+    np.testing.assert_allclose([low, high], [[-0.8, -0.1], [-0.6, 0.1]], atol=0.002)
+    for values in WHOLE[:, 1].T:
+        assert abs(np.corrcoef(values[1:], values[:-1])[0, 1]) < 0.05
+
+
+def test_object_3_walks_within_its_limits_y_slower_than_x():
+    path = WHOLE[:, 2]
+    assert path.min() >= -0.58
+    assert path.max() <= -0.42
+    assert path[:, 1].max() - path[:, 1].min() > 0.1
+    steps = np.diff(path, axis=0)
+    assert 0.0035 < steps[:, 1].std() < 0.0041
+    assert steps[:, 0].std() > 10 * steps[:, 1].std()
+    assert np.corrcoef(path[1:, 1], path[:-1, 1])[0, 1] > 0.99
+
+
+def test_one_object_never_changes_another():
+    other = SceneConfig(object1=BoxConfig(toggle_every=7), object3=SphereConfig(step_x=0.01))
+    np.testing.assert_array_equal(Motions(other, 3).take(200)[:, 1], WHOLE[:200, 1])
+
+
+def test_another_seed_is_another_world():
+    assert not np.array_equal(Motions(SCENE, 4).take(50)[:, 1], WHOLE[:50, 1])
+
+
+def test_the_motions_share_no_random_numbers_with_who_spawns_from_the_same_seed():
+    drawn = (WHOLE[:20, 1, 0] + 0.8) / 0.2
+    for child in np.random.SeedSequence(3).spawn(8):
+        numbers = np.random.default_rng(child).random(100)
+        assert np.abs(drawn[:, None] - numbers).min() > 1e-9
+
+
+def test_a_walk_turns_round_at_its_limits():
+    np.testing.assert_allclose(
+        reflect(np.array([0.0, 0.9, 1.1, 2.0, 2.1, -0.1, 3.2]), (0.0, 1.0)),
+        [0.0, 0.9, 0.9, 0.0, 0.1, 0.1, 0.8],
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(reflect(np.array([5.0, -5.0]), (0.3, 0.3)), [0.3, 0.3])
+
+
+def test_limits_the_wrong_way_round_are_named():
+    with pytest.raises(UsageError, match=r"scene\.object3\.y.*lower limit first"):
+        SphereConfig(y=(0.2, 0.1))
