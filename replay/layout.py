@@ -5,191 +5,226 @@ from __future__ import annotations
 import rerun as rr
 import rerun.blueprint as rrb
 
-from replay.config import ViewConfig
+from replay.columns import FRAME
 from replay.outline import Outline
 
+MOST_MODULES = 6
+"""Modules that get rows of their own."""
+
 LEGEND = rrb.PlotLegend(visible=True, corner=rrb.Corner2D.RightTop)
+HEAT = rrb.TensorScalarMapping(colormap="viridis")
+
+Span = tuple[float, float]
 
 
-def run_layout(outline: Outline, config: ViewConfig) -> rrb.Blueprint:
-    """The layout of a run; it adapts to its streams and modules."""
+def blueprint(*tabs: rrb.Container | rrb.View, name: str, timeline: str = FRAME) -> rrb.Blueprint:
+    """Tabs with one plain time bar below and no panels around.
+
+    The cursor starts at the end, where what was learned is on show.
+    """
     return rrb.Blueprint(
-        rrb.Tabs(
-            _overview(outline),
-            _abstraction(outline),
-            _gate(outline),
-            _decision(outline),
-            _modules(outline),
-            rrb.DataframeView(
-                origin="/",
-                contents=["/signals/**"],
-                name="Table",
-                query=rrb.archetypes.DataframeQuery(timeline="iteration", apply_latest_at=True),
-            ),
-            active_tab=0,
-            name="Run",
-        ),
-        rrb.TimePanel(timeline="frame", state="collapsed", play_state="paused"),
+        rrb.Tabs(*tabs, active_tab=0, name=name),
+        rrb.TimePanel(timeline=timeline, state="collapsed", play_state="following"),
         rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
         auto_layout=False,
     )
 
 
-def _overview(outline: Outline) -> rrb.Container:
-    sees = rrb.Vertical(
-        _watched(outline),
-        rrb.TextDocumentView(origin="/summary", name="What happened"),
-        row_shares=[2, 3],
-    )
-    story = rrb.Vertical(
-        rrb.StateTimelineView(origin="/lanes", name="What it does"),
-        _line(
-            "What it feels: change of slowness η̇ - a module is saved below δ",
-            ["/signals/eta_dot", "/abstraction/delta", "/abstraction/saved"],
-            _above_zero(outline),
-        ),
-        _line("What it expects: reward R for staying, by stream", ["/decision/R_stay/**"]),
-        rrb.StateTimelineView(origin="/policy", name="What it decides: policy by stream"),
-        row_shares=[5, 4, 4, 3],
-    )
-    return rrb.Horizontal(sees, story, column_shares=[2, 5], name="Overview")
-
-
-def _abstraction(outline: Outline) -> rrb.Container:
-    weights = "/abstraction/phi"
-    return rrb.Horizontal(
-        rrb.Vertical(_watched(outline), _weights(outline, weights, "Weights φ")),
-        rrb.Vertical(
-            _line("Output y", ["/signals/y"]),
-            _line("Slowness η [1/frame]", ["/signals/eta"], outline.span("eta", low=0.0)),
-            _line(
-                "Change of slowness η̇, and δ",
-                ["/signals/eta_dot", "/abstraction/delta", "/abstraction/saved"],
-                _above_zero(outline),
-            ),
-            _line("Change of weights ξ", ["/signals/xi"], outline.span("xi", low=0.0)),
-            _line("Recent variance of the output", ["/signals/variance"]),
-        ),
-        column_shares=[2, 5],
-        name="Abstraction",
-    )
-
-
-def _gate(outline: Outline) -> rrb.Container:
-    bands = [
-        _line(
-            f"Slowness in the block by module {i}, and its band of 2 SD",
-            [f"/signals/eta_inst_frozen/{i}", f"/gate/band/{i}"],
+def whole(frames: int) -> rrb.archetypes.TimeAxis:
+    """A time axis that shows frames 0 to `frames`."""
+    return rrb.archetypes.TimeAxis(
+        view_range=rr.TimeRange(
+            start=rr.TimeRangeBoundary.absolute(seq=0),
+            end=rr.TimeRangeBoundary.absolute(seq=max(frames, 1)),
         )
-        for i in range(1, min(outline.modules, 6) + 1)
-    ]
-    own = [
-        _line(
-            "Slowness in the block by the abstraction",
-            ["/signals/eta_inst", "/signals/gate_mean", "/signals/gate_sd"],
-        ),
-        _line("Share of novel blocks", ["/signals/share"], (0.0, 1.05)),
-    ]
-    lanes = rrb.StateTimelineView(
-        origin="/lanes",
-        contents=["$origin/1_stream", "$origin/2_learning", "$origin/3_gate"],
-        name="Verdict",
     )
-    return rrb.Vertical(lanes, *bands, *own, name="Gate")
 
 
-def _decision(outline: Outline) -> rrb.Container:
-    return rrb.Horizontal(
-        rrb.Vertical(
-            rrb.StateTimelineView(origin="/policy", name="Policy by stream"),
-            _line("Reward R for staying", ["/decision/R_stay/**"]),
-            _line("Value of staying minus switching", ["/decision/advantage/**"]),
-            _line(
-                "Rewards",
-                ["/signals/curiosity", "/signals/expert", "/signals/reward"],
-                outline.span("reward", "curiosity", "expert"),
+def lines(
+    name: str, contents: list[str], axis: rrb.archetypes.TimeAxis, span: Span | None = None
+) -> rrb.TimeSeriesView:
+    """Curves over time, all in view from the start."""
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=contents,
+        name=name,
+        axis_x=axis,
+        axis_y=rrb.ScalarAxis(range=span) if span is not None else None,
+        plot_legend=LEGEND,
+    )
+
+
+class RunLayout:
+    """The layout of a run; it adapts to its streams and modules.
+
+    Args:
+        outline: the run in short.
+    """
+
+    def __init__(self, outline: Outline) -> None:
+        self._outline = outline
+        self._spec = outline.header.spec
+        self._axis = whole(outline.frames)
+        self._images = len(self._spec.frame_shape) == 2
+
+    def blueprint(self) -> rrb.Blueprint:
+        """The layout, ready to be sent."""
+        table = rrb.DataframeView(
+            origin="/",
+            contents=["/signals/**"],
+            name="Table",
+            query=rrb.archetypes.DataframeQuery(timeline="iteration", apply_latest_at=True),
+        )
+        return blueprint(
+            self._overview(),
+            self._abstraction(),
+            self._gate(),
+            self._decision(),
+            self._modules(),
+            table,
+            name="Run",
+        )
+
+    def _overview(self) -> rrb.Container:
+        sees = rrb.Vertical(
+            self._watched(),
+            rrb.TextDocumentView(origin="/summary", name="What happened"),
+            self._weights("/abstraction/phi", "What it looks for: weights φ"),
+            row_shares=[3, 6, 3],
+        )
+        story = rrb.Vertical(
+            self._lanes(
+                "What it does, and decides: the policy in each stream", "/lanes/**", "/policy/**"
             ),
-            _line("Exploration ε", ["/signals/epsilon"], (0.0, 1.25)),
-        ),
-        rrb.Vertical(
-            _heat("/signals/R", "R for staying: stream to next stream", stay=True),
-            _heat("/signals/R", "R for switching: stream to next stream", stay=False),
+            self._convergence("What it feels: a module is saved when η̇ falls below δ"),
+            self._lines("What it expects: reward R for staying", ["/decision/R_stay/**"]),
+            row_shares=[5 + min(len(self._spec.streams), 6), 5, 4],
+        )
+        return rrb.Horizontal(sees, story, column_shares=[2, 5], name="Overview")
+
+    def _abstraction(self) -> rrb.Container:
+        span = self._outline.span
+        curves = rrb.Vertical(
+            self._lines("Output y", ["/signals/y"]),
+            self._lines("Slowness η [1/frame]", ["/signals/eta"], span("eta", low=0.0)),
+            self._convergence("Change of slowness η̇, and δ"),
+            self._lines("Change of weights ⟨ξ⟩", ["/signals/xi"], span("xi", low=0.0)),
+            self._lines("Recent variance of the output", ["/signals/variance"]),
+        )
+        now = rrb.Vertical(
+            self._watched(), self._weights("/abstraction/phi", "Weights φ"), row_shares=[2, 3]
+        )
+        return rrb.Horizontal(now, curves, column_shares=[2, 5], name="Abstraction")
+
+    def _gate(self) -> rrb.Container:
+        verdict = self._lanes("Verdict", "/lanes/1_stream", "/lanes/2_learning", "/lanes/3_gate")
+        bands = [
+            self._lines(
+                f"Slowness in the block by module {i}: known within the band of 2 SD",
+                [f"/signals/eta_inst_frozen/{i}", f"/gate/band/{i}"],
+            )
+            for i in range(1, min(self._outline.modules, MOST_MODULES) + 1)
+        ]
+        own = self._lines(
+            "Slowness in the block by the abstraction, its mean and SD",
+            ["/signals/eta_inst", "/signals/gate_mean", "/signals/gate_sd"],
+        )
+        share = self._lines("Share of novel blocks", ["/signals/share"], (0.0, 1.05))
+        return rrb.Vertical(verdict, *bands, own, share, name="Gate")
+
+    def _decision(self) -> rrb.Container:
+        rewards = ["curiosity", "expert", "reward"]
+        curves = rrb.Vertical(
+            self._lanes("Policy in each stream, and what was done", "/policy/**", "/lanes/**"),
+            self._lines("Reward R for staying", ["/decision/R_stay/**"]),
+            self._lines("Value Q of staying minus switching", ["/decision/advantage/**"]),
+            self._lines(
+                "Rewards",
+                [f"/signals/{name}" for name in rewards],
+                self._outline.span(*rewards),
+            ),
+            self._lines("Exploration ε", ["/signals/epsilon"], (0.0, 1.25)),
+            row_shares=[5 + min(len(self._spec.streams), 6), 4, 4, 4, 3],
+        )
+        heat = rrb.Vertical(
+            _reward(0, "R for staying: from stream (down) to stream (across)"),
+            _reward(1, "R for switching: from stream (down) to stream (across)"),
             rrb.TensorView(
                 origin="/signals/Q",
-                name="Q: stream by action (stay, switch)",
-                scalar_mapping=rrb.TensorScalarMapping(colormap="viridis"),
+                name="Q: stream (down), stay and switch (across)",
+                scalar_mapping=HEAT,
             ),
-        ),
-        column_shares=[3, 2],
-        name="Decision",
-    )
-
-
-def _modules(outline: Outline) -> rrb.Container:
-    rows = [
-        rrb.Horizontal(
-            _weights(
-                outline, f"/modules/{save.module}/weights", f"Weights of module {save.module}"
-            ),
-            _line(f"Output of module {save.module}", [f"/signals/y_frozen/{save.module}"]),
-            column_shares=[2, 5],
         )
-        for save in outline.saved[:6]
-    ]
-    truth = [_line("Truth", ["/world/truth"])] if outline.header.spec.truth else []
-    return rrb.Vertical(*rows, *truth, name="Modules")
+        return rrb.Horizontal(curves, heat, column_shares=[5, 2], name="Decision")
 
+    def _modules(self) -> rrb.Container:
+        rows = [
+            rrb.Horizontal(
+                self._weights(f"/modules/{i}/weights", f"Weights of module {i}"),
+                self._lines(
+                    f"Output of module {i} on what was watched", [f"/signals/y_frozen/{i}"]
+                ),
+                column_shares=[2, 5],
+            )
+            for i in range(1, min(self._outline.modules, MOST_MODULES) + 1)
+        ]
+        truth = [self._lines("What the world knows", ["/world/truth"])] if self._spec.truth else []
+        learned = rrb.TextLogView(origin="/events", name="Events")
+        return rrb.Vertical(*rows, *truth, learned, name="Modules")
 
-def _watched(outline: Outline) -> rrb.View:
-    if len(outline.header.spec.frame_shape) == 2:
-        return rrb.Spatial2DView(origin="/world/watched", name="What it sees")
-    return rrb.TimeSeriesView(
-        origin="/world/watched",
-        name="What it sees: the last 500 frames",
-        plot_legend=LEGEND,
-        time_ranges=[
-            rr.VisibleTimeRange(
-                "frame",
+    def _watched(self) -> rrb.View:
+        if self._images:
+            return rrb.Spatial2DView(origin="/world/watched", name="What it sees")
+        near = rr.VisibleTimeRange(
+            FRAME,
+            start=rr.TimeRangeBoundary.cursor_relative(seq=-500),
+            end=rr.TimeRangeBoundary.cursor_relative(),
+        )
+        axis = rrb.archetypes.TimeAxis(
+            view_range=rr.TimeRange(
                 start=rr.TimeRangeBoundary.cursor_relative(seq=-500),
                 end=rr.TimeRangeBoundary.cursor_relative(),
             )
-        ],
+        )
+        return rrb.TimeSeriesView(
+            origin="/world/watched",
+            name="What it sees: the last 500 frames",
+            plot_legend=LEGEND,
+            time_ranges=[near],
+            axis_x=axis,
+        )
+
+    def _weights(self, path: str, name: str) -> rrb.View:
+        if self._images:
+            return rrb.Spatial2DView(origin=path, name=name)
+        return rrb.BarChartView(origin=path, name=name)
+
+    def _convergence(self, name: str) -> rrb.View:
+        """Eta-dot with delta well above the floor, and the saves."""
+        span, delta = self._outline.span("eta_dot", low=0.0), self._outline.delta
+        if span is not None and delta is not None:
+            span = 0.0, min(max(span[1], 2.5 * delta), 8 * delta)
+        return self._lines(
+            name, ["/signals/eta_dot", "/abstraction/delta", "/abstraction/saved"], span
+        )
+
+    def _lanes(self, name: str, *contents: str) -> rrb.View:
+        return rrb.StateTimelineView(
+            origin="/", contents=list(contents), name=name, time_view=self._axis
+        )
+
+    def _lines(self, name: str, contents: list[str], span: Span | None = None) -> rrb.View:
+        return lines(name, contents, self._axis, span)
+
+
+def _reward(action: int, name: str) -> rrb.View:
+    selection = rrb.TensorSliceSelection(
+        width=2,
+        height=0,
+        indices=[rr.TensorDimensionIndexSelection(dimension=1, index=action)],
     )
-
-
-def _weights(outline: Outline, path: str, name: str) -> rrb.View:
-    if len(outline.header.spec.frame_shape) == 2:
-        return rrb.Spatial2DView(origin=path, name=name)
-    return rrb.BarChartView(origin=path, name=name)
-
-
-def _heat(path: str, name: str, *, stay: bool) -> rrb.View:
     return rrb.TensorView(
-        origin=path,
-        name=name,
-        scalar_mapping=rrb.TensorScalarMapping(colormap="viridis"),
-        slice_selection=rrb.TensorSliceSelection(
-            width=2,
-            height=0,
-            indices=[rr.TensorDimensionIndexSelection(dimension=1, index=0 if stay else 1)],
-        ),
+        origin="/signals/R", name=name, scalar_mapping=HEAT, slice_selection=selection
     )
-
-
-def _line(
-    name: str, contents: list[str], span: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    axis = rrb.ScalarAxis(range=span) if span is not None else None
-    return rrb.TimeSeriesView(
-        origin="/", contents=contents, name=name, axis_y=axis, plot_legend=LEGEND
-    )
-
-
-def _above_zero(outline: Outline) -> tuple[float, float] | None:
-    """A range for eta-dot in which delta is well above the floor."""
-    span = outline.span("eta_dot", low=0.0)
-    if span is None or outline.delta is None:
-        return span
-    return 0.0, min(max(span[1], 2.5 * outline.delta), 12 * outline.delta)

@@ -18,7 +18,7 @@ import rerun.blueprint as rrb
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import partial_path
 from replay.config import ViewConfig
-from replay.layout import run_layout
+from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
 from replay.outline import Outline, read_outline
 from replay.run_view import RunView
@@ -74,7 +74,7 @@ def build_view(
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         recording.log("summary", document, static=True)
         RunView(recording, log, outline, config).write(modules)
-        _finish(recording, run_layout(outline, config))
+        _finish(recording, RunLayout(outline).blueprint())
         os.replace(partial, out)
     except (RuntimeError, OSError) as error:
         raise CdmisfaError(f"{out} cannot be written: {error}") from error

@@ -1,0 +1,241 @@
+"""Opening a view: in a window, in a browser on this machine, or as a picture without a screen.
+
+The viewer is a program of its own. It is started with its telemetry switched off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import rerun_cli
+
+from cdmisfa.errors import CdmisfaError, UsageError
+from recorder.logfile import partial_path
+from replay.columns import FRAME
+from replay.view import build_view
+
+DRIVERS = "/usr/share/vulkan/icd.d/*.json"
+"""Where Linux keeps the descriptions of Vulkan drivers."""
+
+INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
+"""What gives a machine without a graphics card a driver."""
+
+WINDOW = "1600x1000"
+SETTLE = 6.0
+"""Seconds after which the viewer has painted everything and taken its notices away."""
+
+SECONDS = 120.0
+"""Longest time for a picture."""
+
+
+def program() -> Path:
+    """The viewer itself; the `rerun` on the path is a wrapper that leaves it behind when ended."""
+    return Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
+
+
+def environment() -> dict[str, str]:
+    """Environment for the viewer: CI=1 switches its telemetry off."""
+    return {**os.environ, "CI": "1"}
+
+
+def missing_driver() -> str:
+    """Why no picture can be drawn without a screen here, or "" where it can."""
+    if sys.platform.startswith("linux") and not glob.glob(DRIVERS):
+        return f"no Vulkan driver is installed: {INSTALL}"
+    return ""
+
+
+def save(path: Path, out: Path, *, every: int = 10, force: bool = False) -> None:
+    """Write the view of a run or recording to an .rrd file; see `build_view`."""
+    build_view(path, out, every=every, force=force)
+
+
+def open_window(path: Path, *, every: int = 10, memory_limit: str = "2GB") -> None:
+    """Show a run or recording in the viewer, until its window is closed.
+
+    Raises:
+        CdmisfaError: the viewer ended with an error.
+    """
+    with _view_of(path, every) as view:
+        _run([str(view), "--memory-limit", memory_limit])
+
+
+def serve(
+    path: Path, *, every: int = 10, memory_limit: str = "2GB", port: int | None = None
+) -> None:
+    """Serve the viewer and a run to browsers on this machine, until interrupted.
+
+    Prints the address on stderr.
+
+    Raises:
+        CdmisfaError: the server ended with an error.
+    """
+    data_port, page_port = _free_port(), port or _free_port()
+    with _view_of(path, every) as view:
+        proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
+        print(f"http://127.0.0.1:{page_port}/?url={proxy}", file=sys.stderr, flush=True)
+        _run(
+            [
+                "--serve-web",
+                *("--bind", "127.0.0.1"),
+                *("--port", str(data_port)),
+                *("--web-viewer-port", str(page_port)),
+                *("--server-memory-limit", memory_limit),
+                str(view),
+            ]
+        )
+
+
+def screenshot(
+    path: Path,
+    out: Path,
+    *,
+    at: int | None = None,
+    every: int = 10,
+    force: bool = False,
+    window: str = WINDOW,
+) -> None:
+    """Draw the view of a run or recording without a screen.
+
+    Args:
+        path: a run or recording, or an .rrd file.
+        out: the PNG file.
+        at: frame at which the time cursor stands; by default the last.
+        every: show every so many watched frames.
+        force: replace an existing file.
+        window: size, as "1600x1000".
+
+    Raises:
+        UsageError: `out` exists and `force` is not set.
+        CdmisfaError: no driver, or the viewer failed.
+    """
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    if missing_driver():
+        raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
+    with _view_of(path, every) as view:
+        png = _draw(view, at, window)
+    partial = partial_path(out)
+    try:
+        partial.write_bytes(png)
+        os.replace(partial, out)
+    except OSError as error:
+        raise CdmisfaError(f"{out} cannot be written: {error.strerror or error}") from error
+
+
+def _draw(view: Path, at: int | None, window: str) -> bytes:
+    """A PNG of the whole window, once everything in it is loaded."""
+    with headless_viewer(window) as viewer:
+        viewer.open(str(view))
+        end = time.monotonic() + SECONDS
+        while not _painted(viewer):
+            if time.monotonic() > end:
+                raise CdmisfaError(f"{view} was not drawn within {SECONDS:.0f} s")
+            time.sleep(0.2)
+        if at is not None:
+            viewer.set_time(FRAME, sequence=at, play_state="paused")
+        time.sleep(SETTLE)
+        while viewer.get_state().loading and time.monotonic() < end:
+            time.sleep(0.2)
+        return bytes(viewer.take_screenshot())
+
+
+def _painted(viewer: Any) -> bool:
+    try:
+        state = viewer.get_state()
+    except (ConnectionError, RuntimeError):
+        return False
+    return bool(state.recordings) and bool(state.views) and not state.loading
+
+
+@contextlib.contextmanager
+def headless_viewer(window: str = WINDOW) -> Iterator[Any]:
+    """A viewer without a window, as Rerun's `ViewerClient`; ended on the way out.
+
+    Raises:
+        CdmisfaError: it does not start.
+    """
+    from rerun.experimental import ViewerClient
+
+    port = _free_port()
+    command = [str(program()), "--headless", "--hide-welcome-screen"]
+    command += ["--port", str(port), "--bind", "127.0.0.1", "--window-size", window]
+    with tempfile.TemporaryFile() as words:
+        # Output goes to a file: the viewer hangs when nobody empties a pipe.
+        process = subprocess.Popen(command, env=environment(), stdout=words, stderr=words)
+        try:
+            yield _connected(ViewerClient, port, process, words)
+        finally:
+            _end(process)
+
+
+def _connected(client: Any, port: int, process: subprocess.Popen[bytes], words: Any) -> Any:
+    end = time.monotonic() + SECONDS
+    while time.monotonic() < end:
+        if process.poll() is not None:
+            words.seek(0)
+            lines = words.read().decode("utf-8", "replace").strip().splitlines()
+            said = next((line for line in lines if "panicked" in line or "rror" in line), "")
+            raise CdmisfaError(f"the viewer did not start: {said or process.returncode}")
+        try:
+            viewer = client.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            viewer.get_state()
+            return viewer
+        except (ConnectionError, RuntimeError, OSError, ValueError):
+            time.sleep(0.1)
+    raise CdmisfaError(f"the viewer did not start within {SECONDS:.0f} s")
+
+
+@contextlib.contextmanager
+def _view_of(path: Path, every: int) -> Iterator[Path]:
+    """The view of a run, built for as long as it is looked at."""
+    if path.suffix == ".rrd":
+        if not path.is_file():
+            raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="cdmisfa-view-") as folder:
+        view = Path(folder) / f"{path.resolve().stem}.rrd"
+        build_view(path, view, every=every)
+        yield view
+
+
+def _run(arguments: Sequence[str]) -> None:
+    """Run the viewer until it ends; an interrupt ends it and is passed on."""
+    process = subprocess.Popen([str(program()), *arguments], env=environment())
+    try:
+        code = process.wait()
+    except BaseException:
+        _end(process)
+        raise
+    if code:
+        raise CdmisfaError(
+            f"the viewer ended with code {code}: without a display use --web or --screenshot"
+        )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        process.send_signal(signal.SIGTERM)
+    try:
+        process.wait(timeout=5)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
