@@ -216,9 +216,9 @@ class LogReader:
             data = memoryview(table.data.data)
             for number, sequence, log_time, publish_time, at, size in zip(
                 table.channel.tolist(),
-                table.sequence.tolist(),
+                table.headers["sequence"].tolist(),
                 table.log_time.tolist(),
-                table.publish_time.tolist(),
+                table.headers["publish_time"].tolist(),
                 table.at.tolist(),
                 table.size.tolist(),
                 strict=True,
@@ -285,20 +285,22 @@ class LogReader:
         return table
 
     def index(self, segment: Segment) -> list[tuple[int, NDArray[np.uint64]]]:
-        """Read a chunk's message indexes: channel, and (n, 2) of log time and offset."""
+        """Read a chunk's message indexes: channel, and (n, 2) of log time and offset.
+
+        Raises:
+            MalformedRecord: they are larger than any chunk.
+        """
         if not segment.indexes:
             return []
-        first, last = segment.indexes[0], segment.indexes[-1]
-        stop = last.offset + 16 * last.count
-        if stop - first.offset > MAX_CHUNK:
+        first, last = segment.indexes[0].offset, segment.indexes[-1]
+        size = last.offset + 16 * last.count - first
+        if size > MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
-        raw = self._file.read(first.offset, stop - first.offset)
+        raw = self._file.read(first, size)
         return [
             (
                 part.channel,
-                np.frombuffer(raw, "<u8", 2 * part.count, part.offset - first.offset).reshape(
-                    -1, 2
-                ),
+                np.frombuffer(raw, "<u8", 2 * part.count, part.offset - first).reshape(-1, 2),
             )
             for part in segment.indexes
         ]

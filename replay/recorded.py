@@ -15,8 +15,11 @@ from cdmisfa.errors import LogDamagedError, LogExhaustedError
 from replay.files import log_files, sha256
 from replay.viewfile import ViewFacts, ViewFile, intersection
 
-CACHE_BYTES: Final = 128 * 1024 * 1024
-"""Decoded chunks that a source keeps, over all its views."""
+CACHE_BYTES: Final = 1024 * 1024
+"""Decoded chunks that are kept of each view; one always is.
+
+Few, because playing moves forward, and memory that is used again is still in the CPU's cache.
+"""
 _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns")
 _SAME_VALUES: Final = ("scene", "seed", "config_sha256")
 
@@ -50,8 +53,7 @@ class RecordedSource:
         opened: list[ViewFile] = []
         try:
             for path in self._files:
-                share = CACHE_BYTES // len(self._files)
-                opened.append(ViewFile(path, salvage=salvage, cache_bytes=share))
+                opened.append(ViewFile(path, salvage=salvage, cache_bytes=CACHE_BYTES))
             self._views = _arrange(opened, salvage=salvage)
             self._set_clock()
         except BaseException:

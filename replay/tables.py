@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from mcap.opcode import Opcode
-from numpy.lib.stride_tricks import as_strided, sliding_window_view
 from numpy.typing import NDArray
 
 from replay.records import (
@@ -25,59 +24,54 @@ class MessageTable:
 
     Attributes:
         data: (B,) uint8, the chunk's decompressed records.
-        channel: (n,) uint16.
-        sequence: (n,) uint32.
-        log_time: (n,) uint64, nanoseconds.
-        publish_time: (n,) uint64, nanoseconds.
+        headers: (n,) of `MESSAGE_HEADER`: channel, sequence and times in nanoseconds.
         at: (n,) int64, place of the payload in `data`.
         size: (n,) int64, bytes of the payload.
     """
 
     data: Bytes
-    channel: NDArray[np.uint16]
-    sequence: NDArray[np.uint32]
-    log_time: NDArray[np.uint64]
-    publish_time: NDArray[np.uint64]
+    headers: NDArray[np.void]
     at: NDArray[np.int64]
     size: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.at)
 
+    @property
+    def channel(self) -> NDArray[np.uint16]:
+        """Channel of each message, (n,)."""
+        return self.headers["channel"]
+
+    @property
+    def log_time(self) -> NDArray[np.uint64]:
+        """Log time of each message in nanoseconds, (n,)."""
+        return self.headers["log_time"]
+
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
         """Give the table of some rows."""
-        return MessageTable(
-            self.data,
-            self.channel[rows],
-            self.sequence[rows],
-            self.log_time[rows],
-            self.publish_time[rows],
-            self.at[rows],
-            self.size[rows],
-        )
+        return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
 
     def payload(self, row: int) -> bytes:
         """Copy the payload of one message."""
         at = int(self.at[row])
         return self.data[at : at + int(self.size[row])].tobytes()
 
-    def windows(self, at: NDArray[np.int64], size: int) -> Bytes:
-        """Give `size` bytes from each of n places in `data` as an (n, size) array.
-
-        Where the places are evenly spaced this is a view, otherwise a copy.
+    def gather(self, at: NDArray[np.int64], size: int) -> Bytes:
+        """Copy `size` bytes from each of n places in `data`, (n, size).
 
         Raises:
-            MalformedRecord: a window lies outside the data.
+            MalformedRecord: one lies outside the data.
         """
         if len(at) == 0 or size == 0:
             return np.empty((len(at), size), np.uint8)
         if at.min() < 0 or at.max() + size > len(self.data):
             raise MalformedRecord("a message is shorter than its fields")
-        steps = np.diff(at)
-        step = int(steps[0]) if len(steps) else size
-        if step > 0 and (steps == step).all():
-            return as_strided(self.data[int(at[0]) :], (len(at), size), (step, 1), writeable=False)
-        return sliding_window_view(self.data, size)[at]
+        return windows(self.data, size)[at]
+
+
+def windows(data: Bytes, size: int) -> Bytes:
+    """View every `size` consecutive bytes of B bytes, (B - size + 1, size)."""
+    return np.ndarray((max(len(data) - size + 1, 0), size), np.uint8, data, 0, (1, 1))
 
 
 def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
@@ -87,30 +81,21 @@ def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
         MalformedRecord: what stands there is no message, or runs over the chunk's end.
     """
     if len(offsets) == 0:
-        headers = np.empty(0, MESSAGE_HEADER)
-    else:
-        width = MESSAGE_HEADER.itemsize
-        if offsets.min() < 0 or offsets.max() + width > len(data):
-            raise MalformedRecord("a message lies outside its chunk")
-        headers = np.ascontiguousarray(sliding_window_view(data, width)[offsets])
-        headers = headers.view(MESSAGE_HEADER)[:, 0]
+        return MessageTable(data, np.empty(0, MESSAGE_HEADER), offsets, offsets)
+    width = MESSAGE_HEADER.itemsize
+    if offsets.min() < 0 or offsets.max() + width > len(data):
+        raise MalformedRecord("a message lies outside its chunk")
+    headers = windows(data, width)[offsets].view(MESSAGE_HEADER)[:, 0]
     if (headers["opcode"] != Opcode.MESSAGE).any():
         raise MalformedRecord("a message index points to something else than a message")
     length = headers["length"]
-    if (length < MESSAGE_FIELDS).any():
+    if length.min() < MESSAGE_FIELDS:
         raise MalformedRecord("a message is shorter than its own header")
-    room = (len(data) - RECORD_HEADER.size - offsets).astype(np.uint64)
-    if (length > room).any():
+    size = length.astype(np.int64) - MESSAGE_FIELDS
+    at = offsets + width
+    if length.max() > len(data) or (at + size).max() > len(data):
         raise MalformedRecord("a message runs over the end of its chunk")
-    return MessageTable(
-        data,
-        headers["channel"].copy(),
-        headers["sequence"].copy(),
-        headers["log_time"].copy(),
-        headers["publish_time"].copy(),
-        offsets + MESSAGE_HEADER.itemsize,
-        length.astype(np.int64) - MESSAGE_FIELDS,
-    )
+    return MessageTable(data, headers, at, size)
 
 
 def walked_table(
@@ -159,23 +144,26 @@ def indexed_table(
     """
     data = np.frombuffer(raw, np.uint8)
     pairs = np.concatenate([pairs for _, pairs in indexes])
-    channels = np.concatenate([np.full(len(p), c, np.uint16) for c, p in indexes])
+    channels = np.repeat(
+        np.array([c for c, _ in indexes], np.uint16), [len(pairs) for _, pairs in indexes]
+    )
     if len(pairs) and pairs[:, 1].max() >= len(data):
         raise MalformedRecord("a message index points outside its chunk")
     offsets = pairs[:, 1].astype(np.int64)
-    if (np.diff(offsets) <= 0).any():
+    if (offsets[1:] <= offsets[:-1]).any():
         order = np.argsort(offsets, kind="stable")
         offsets, pairs, channels = offsets[order], pairs[order], channels[order]
     table = table_at(data, offsets)
     if (table.channel != channels).any() or (table.log_time != pairs[:, 0]).any():
         raise MalformedRecord("its message index names other messages than it holds")
-    starts = np.append(offsets, len(data))
-    ends = np.concatenate([[0], table.at + table.size])
+    edges = np.empty((len(offsets) + 1, 2), np.int64)
+    edges[1:, 0], edges[0, 0] = table.at + table.size, 0
+    edges[:-1, 1], edges[-1, 1] = offsets, len(data)
     definitions: list[tuple[int, int, int]] = []
-    for gap in np.flatnonzero(starts != ends):
-        if starts[gap] < ends[gap]:
+    for low, high in edges[edges[:, 0] != edges[:, 1]].tolist():
+        if low > high:
             raise MalformedRecord("its message index names overlapping messages")
-        for opcode, at, end in walk(raw, int(ends[gap]), int(starts[gap])):
+        for opcode, at, end in walk(raw, low, high):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.append((opcode, at + RECORD_HEADER.size, end))
             elif opcode <= max(Opcode):

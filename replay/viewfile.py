@@ -5,10 +5,11 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -32,11 +33,13 @@ from recorder.viewlog import METADATA, SCHEMA_VERSION, TRUTH_TOPIC, view_topic
 from replay.reader import LogReader
 from replay.records import Bytes, Channel, MalformedRecord
 from replay.structure import Segment
-from replay.tables import MessageTable
+from replay.tables import MessageTable, windows
 
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
+_DECODED: Final = 4
+_BATCH: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +152,52 @@ class Run:
         return self.row + frame - self.start
 
 
-class ChannelRows:
-    """The messages of one channel, numbered through all chunks of a file."""
+class Rows(Protocol):
+    """Decoded messages of one chunk."""
 
-    def __init__(self, reader: LogReader, channel: Channel) -> None:
+    def rows(self, low: int, high: int) -> NDArray[Any]:
+        """Give rows `low` to before `high`, or to the last one."""
+
+
+@dataclass(frozen=True, slots=True)
+class PixelRows:
+    """Values that stand as bytes in a chunk: (B - size + 1, size) windows, (n,) places."""
+
+    windows: Bytes
+    at: NDArray[np.int64]
+
+    def rows(self, low: int, high: int) -> Bytes:
+        """Copy the values of some messages, (high - low, size)."""
+        return self.windows[self.at[low:high]]
+
+
+@dataclass(frozen=True, slots=True)
+class TruthRows:
+    """Ground truth of a chunk, (n, D)."""
+
+    values: NDArray[np.float64]
+
+    def rows(self, low: int, high: int) -> NDArray[np.float64]:
+        """Give the ground truth of some messages, (high - low, D)."""
+        return self.values[low:high]
+
+
+class ChannelRows:
+    """The messages of one channel, numbered through all chunks of a file.
+
+    Args:
+        reader: the file.
+        channel: the channel.
+        decode: gives for the channel's messages of one chunk an array with a row each.
+    """
+
+    def __init__(
+        self, reader: LogReader, channel: Channel, decode: Callable[[MessageTable], Rows]
+    ) -> None:
         self.channel = channel
         self._reader = reader
+        self._decode = decode
+        self._decoded: OrderedDict[int, Rows] = OrderedDict()
         self._segments: list[Segment] = []
         counts: list[int] = []
         for segment in reader.segments:
@@ -162,10 +205,7 @@ class ChannelRows:
             if count:
                 self._segments.append(segment)
                 counts.append(count)
-        self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-
-    def __len__(self) -> int:
-        return int(self._starts[-1])
+        self._starts = list(itertools.accumulate(counts, initial=0))
 
     def runs(self, facts: ViewFacts, *, salvage: bool) -> list[Run]:
         """Number the messages by their log time.
@@ -179,56 +219,80 @@ class ChannelRows:
                 and without `salvage` a frame that is missing.
         """
         found: list[Run] = []
+        row = 0
+        batch: list[NDArray[np.uint64]] = []
         for number in range(len(self._segments)):
-            try:
-                times = self._times(number)
-            except MalformedRecord as error:
-                raise LogDamagedError(f"{self._reader.path}: {error}") from None
-            if salvage and self._reader.table(self._segments[number]) is None:
-                continue
-            first = int(self._starts[number])
-            frames = facts.frames_at(times)
-            exact = facts.times(frames) == times
-            before = found[-1].stop if found else facts.first_frame
-            steps = np.diff(frames, prepend=before - 1)
-            wrong = np.flatnonzero(~exact | (steps < 1 if salvage else steps != 1))
-            if len(wrong):
-                at = int(wrong[0])
-                raise LogDamagedError(
-                    f"{self._reader.path}: {self.channel.topic}: after frame "
-                    f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
-                    f"{frames[at]}: frames are missing or doubled; run cdmisfa verify, or leave "
-                    "out what is missing with --salvage"
-                )
-            edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
-            for low, high in itertools.pairwise(edges):
-                start = int(frames[low])
-                row = first + low
-                if found and found[-1].stop == start and found[-1].row_of(start) == row:
-                    found[-1] = Run(found[-1].start, start + high - low, found[-1].row)
-                else:
-                    found.append(Run(start, start + high - low, row))
+            damaged = salvage and self._reader.table(self._segments[number]) is None
+            if damaged or len(batch) >= _BATCH:
+                self._number(batch, row, facts, found, salvage)
+                row, batch = self._starts[number + damaged], []
+            if not damaged:
+                try:
+                    batch.append(self._times(number))
+                except MalformedRecord as error:
+                    raise LogDamagedError(f"{self._reader.path}: {error}") from None
+        self._number(batch, row, facts, found, salvage)
         return found
+
+    def _number(
+        self,
+        batch: list[NDArray[np.uint64]],
+        row: int,
+        facts: ViewFacts,
+        found: list[Run],
+        salvage: bool,
+    ) -> None:
+        """Add the frames of messages from `row` on to the runs found."""
+        if not batch:
+            return
+        times = np.concatenate(batch)
+        frames = facts.frames_at(times)
+        exact = facts.times(frames) == times
+        before = found[-1].stop if found else facts.first_frame
+        steps = np.diff(frames, prepend=before - 1)
+        wrong = np.flatnonzero(~exact | (steps < 1 if salvage else steps != 1))
+        if len(wrong):
+            at = int(wrong[0])
+            raise LogDamagedError(
+                f"{self._reader.path}: {self.channel.topic}: after frame "
+                f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
+                f"{frames[at]}: frames are missing or doubled; run cdmisfa verify, or leave "
+                "out what is missing with --salvage"
+            )
+        edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
+        for low, high in itertools.pairwise(edges):
+            start = int(frames[low])
+            if found and found[-1].stop == start and found[-1].row_of(start) == row + low:
+                found[-1] = Run(found[-1].start, start + high - low, found[-1].row)
+            else:
+                found.append(Run(start, start + high - low, row + low))
 
     def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the messages in the `number`th chunk that holds any."""
         segment = self._segments[number]
         if segment.indexes:
-            pairs = [p for c, p in self._reader.index(segment) if c == self.channel.id]
-            return np.concatenate(pairs)[:, 0]
-        return self._rows(number)[0].log_time
+            own = [p[:, 0] for c, p in self._reader.index(segment) if c == self.channel.id]
+            return own[0] if len(own) == 1 else np.concatenate(own)
+        return self._table(number).log_time
 
-    def pieces(self, start: int, count: int) -> list[tuple[MessageTable, int]]:
-        """Give `count` messages from row `start` on, chunk by chunk, with where each goes."""
-        found: list[tuple[MessageTable, int]] = []
-        at, stop = start, start + count
-        number = int(np.searchsorted(self._starts, start, side="right")) - 1
-        while at < stop:
-            table, first = self._rows(number)
-            low, high = at - first, min(stop, first + len(table)) - first
-            found.append((table.select(np.arange(low, high)), at - start))
-            at, number = first + high, number + 1
-        return found
+    def first(self, row: int) -> bytes:
+        """Copy the payload of one message."""
+        number = bisect.bisect_right(self._starts, row) - 1
+        return self._table(number).payload(row - self._starts[number])
+
+    def fill(self, row: int, out: NDArray[Any]) -> None:
+        """Fill `out` with the decoded messages from `row` on.
+
+        Raises:
+            LogDamagedError: a chunk or a message in it is damaged.
+        """
+        at, count = 0, len(out)
+        number = bisect.bisect_right(self._starts, row) - 1
+        while at < count:
+            low = row + at - self._starts[number]
+            part = self._rows(number).rows(low, low + count - at)
+            out[at : at + len(part)] = part
+            at, number = at + len(part), number + 1
 
     def _count(self, segment: Segment) -> int:
         counts = segment.channel_counts()
@@ -237,19 +301,33 @@ class ChannelRows:
         table = self._reader.table(segment)
         return 0 if table is None else int((table.channel == self.channel.id).sum())
 
-    def _rows(self, number: int) -> tuple[MessageTable, int]:
+    def _rows(self, number: int) -> Rows:
+        if number in self._decoded:
+            return self._decoded[number]
+        try:
+            rows = self._decode(self._table(number))
+        except MalformedRecord as error:
+            raise LogDamagedError(
+                f"{self._reader.path}: {self._segments[number].name}: {error}"
+            ) from None
+        if len(self._decoded) >= _DECODED:
+            self._decoded.popitem(last=False)
+        self._decoded[number] = rows
+        return rows
+
+    def _table(self, number: int) -> MessageTable:
         segment = self._segments[number]
         table = self._reader.table(segment)
         if table is None:
             raise LogDamagedError(f"{self._reader.path}: {segment.name} is damaged")
         rows = table.select(np.flatnonzero(table.channel == self.channel.id))
-        first, stop = int(self._starts[number]), int(self._starts[number + 1])
-        if len(rows) != stop - first:
+        stated = self._starts[number + 1] - self._starts[number]
+        if len(rows) != stated:
             raise LogDamagedError(
                 f"{self._reader.path}: {segment.name} holds {len(rows)} messages of "
-                f"{self.channel.topic!r}, its index says {stop - first}; run cdmisfa recover"
+                f"{self.channel.topic!r}, its index says {stated}; run cdmisfa recover"
             )
-        return rows, first
+        return rows
 
 
 class ViewFile:
@@ -287,10 +365,19 @@ class ViewFile:
             )
         self.facts = view_facts(self.path, records[0].values)
         image = self.facts.dtype == "uint8"
+        self._truth_layout = layout = truth_layout(self.facts.truth)
+        tags = truth_tags(self.facts.truth)
+        offsets = [layout.fields[f"tag_{i}"][1] for i in range(len(tags))] if layout.fields else []
+        self._tag_places = [
+            place + k for place, tag in zip(offsets, tags, strict=True) for k in range(len(tag))
+        ]
+        self._tag_bytes = np.frombuffer(b"".join(tags), np.uint8)
         self._frames = self._channel(
-            view_topic(self.facts.view), IMAGE_SCHEMA if image else VECTOR_SCHEMA
+            view_topic(self.facts.view), IMAGE_SCHEMA if image else VECTOR_SCHEMA, self._pixels
         )
-        self._truth = self._channel(TRUTH_TOPIC, TRUTH_SCHEMA) if self.facts.truth else None
+        self._truth = (
+            self._channel(TRUTH_TOPIC, TRUTH_SCHEMA, self._truths) if self.facts.truth else None
+        )
         self._frame_runs = self._frames.runs(self.facts, salvage=salvage)
         self._truth_runs: list[Run] = []
         self.ranges = [(run.start, run.stop) for run in self._frame_runs]
@@ -313,8 +400,7 @@ class ViewFile:
             LogDamagedError: a chunk or a message in it is damaged.
         """
         flat = out.reshape(len(out), -1).view(np.uint8)
-        for table, at in self._frames.pieces(_row(self._frame_runs, start), len(out)):
-            flat[at : at + len(table)] = self._values(table)
+        self._frames.fill(_row(self._frame_runs, start), flat)
 
     def truth(self, start: int, out: NDArray[np.float64]) -> None:
         """Fill (n, D) with the ground truth of the frames from `start` on.
@@ -322,22 +408,16 @@ class ViewFile:
         Raises:
             LogDamagedError: a chunk or a message in it is damaged.
         """
-        if self._truth is None:
-            return
-        layout, tags = truth_layout(self.facts.truth), truth_tags(self.facts.truth)
-        for table, at in self._truth.pieces(_row(self._truth_runs, start), len(out)):
-            raw = self._windows(table, table.at + table.size - layout.itemsize, layout.itemsize)
-            rows = np.ascontiguousarray(raw).view(layout)[:, 0]
-            for i, (name, tag) in enumerate(zip(self.facts.truth, tags, strict=True)):
-                if (rows[f"tag_{i}"] != np.void(tag)).any():
-                    raise LogDamagedError(f"{self.path}: /truth is not laid out as cdmisfa does it")
-                out[at : at + len(table), i] = rows[name]
+        if self._truth is not None:
+            self._truth.fill(_row(self._truth_runs, start), out)
 
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
         self.reader.close()
 
-    def _channel(self, topic: str, schema: str) -> ChannelRows:
+    def _channel(
+        self, topic: str, schema: str, decode: Callable[[MessageTable], Rows]
+    ) -> ChannelRows:
         channels = [c for c in self.reader.channels.values() if c.topic == topic]
         if len(channels) != 1:
             raise LogDamagedError(
@@ -346,15 +426,15 @@ class ViewFile:
         known = self.reader.schemas.get(channels[0].schema_id)
         if known is None or known.name != schema or channels[0].encoding != "protobuf":
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
-        return ChannelRows(self.reader, channels[0])
+        return ChannelRows(self.reader, channels[0], decode)
 
     def _find_payload(self) -> Payload:
         shape = self.facts.frame_shape
         if self.facts.dtype == "float64":
             return vector_payload(shape[0])
-        (table, _), *_ = self._frames.pieces(_row(self._frame_runs, self.ranges[0][0]), 1)
+        first = self._frames.first(_row(self._frame_runs, self.ranges[0][0]))
         try:
-            image = RawImage.FromString(table.payload(0))
+            image = RawImage.FromString(first)
         except DecodeError:
             raise LogDamagedError(f"{self.path}: its frames are no foxglove.RawImage") from None
         if (image.height, image.width) != shape or image.step != shape[1]:
@@ -366,22 +446,30 @@ class ViewFile:
             raise LogDamagedError(f"{self.path}: its frames are {image.encoding!r}, not mono8")
         return image_payload(shape[0], shape[1], image.frame_id)
 
-    def _values(self, table: MessageTable) -> Bytes:
+    def _pixels(self, table: MessageTable) -> PixelRows:
         payload = self._payload
-        before = len(payload.before)
+        before = np.frombuffer(payload.before, np.uint8)
         at = table.at + table.size - payload.tail - payload.size
-        if (at - before < table.at).any():
-            raise LogDamagedError(f"{self.path}: a frame is shorter than the others")
-        tag = self._windows(table, at - before, before)
-        if (tag != np.frombuffer(payload.before, np.uint8)).any():
-            raise LogDamagedError(f"{self.path}: a frame is laid out unlike the others")
-        return self._windows(table, at, payload.size)
+        if (at - len(before) < table.at).any():
+            raise MalformedRecord("a frame is shorter than the others")
+        if (table.gather(at - len(before), len(before)) != before).any():
+            raise MalformedRecord("a frame is laid out unlike the others")
+        return PixelRows(windows(table.data, payload.size), at)
 
-    def _windows(self, table: MessageTable, at: NDArray[np.int64], size: int) -> Bytes:
-        try:
-            return table.windows(at, size)
-        except MalformedRecord as error:
-            raise LogDamagedError(f"{self.path}: {error}") from None
+    def _truths(self, table: MessageTable) -> TruthRows:
+        names = self.facts.truth
+        layout = self._truth_layout
+        at = table.at + table.size - layout.itemsize
+        if (at < table.at).any():
+            raise MalformedRecord("ground truth is shorter than its fields")
+        raw = table.gather(at, layout.itemsize)
+        if (raw[:, self._tag_places] != self._tag_bytes).any():
+            raise MalformedRecord("ground truth is not laid out as cdmisfa does it")
+        rows = raw.view(layout)[:, 0]
+        values = np.empty((len(rows), len(names)))
+        for i, name in enumerate(names):
+            values[:, i] = rows[name]
+        return TruthRows(values)
 
 
 def intersection(one: list[tuple[int, int]], two: list[tuple[int, int]]) -> list[tuple[int, int]]:
