@@ -1,0 +1,289 @@
+"""A run that was stopped, in whatever way, goes on as if it never had been."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.experiments.checkpoint import (
+    SET_ASIDE,
+    checkpoints,
+    differences,
+    load_checkpoint,
+    newest_covered,
+)
+from cdmisfa.experiments.run import RunResult, learn
+from cdmisfa.learner import CuriousLearner, LearnerState
+from cdmisfa.streams import OscillatorySource
+from recorder.config import RecordConfig, SceneConfig
+from recorder.recording import record
+from replay.compare import compare
+from replay.recorded import RecordedSource
+from replay.runlog import read_events
+
+CONFIG = LearnerConfig(
+    tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
+)
+"""Saves its first module at iteration 8 and its second at 42."""
+
+LENGTH = 90
+EVERY = 20
+
+
+def go(
+    source: FrameSource, out: Path | None, iterations: int, config: LearnerConfig = CONFIG, **more
+) -> RunResult:
+    more = {"max_modules": 99, "seed": 3, "rerun": False, "checkpoint_every": EVERY} | more
+    return learn(source, config, out, max_iterations=iterations, **more)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was never stopped."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    modules = go(OscillatorySource(), out, LENGTH).modules
+    assert [module.iteration for module in modules] == [8, 42]
+    return out
+
+
+@pytest.mark.parametrize("stopped", [1, EVERY - 1, EVERY, 43, 47, LENGTH])
+def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped: int) -> None:
+    out = tmp_path / "run"
+    go(OscillatorySource(), out, stopped)
+    result = go(OscillatorySource(), out, LENGTH, resume=True)
+    assert compare(whole, out) is None
+    assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
+    assert not list(out.glob("*.partial"))
+    assert len(checkpoints(out)) <= 2
+
+
+def test_a_run_says_that_it_was_resumed(tmp_path: Path) -> None:
+    go(OscillatorySource(), tmp_path / "run", 30)
+    go(OscillatorySource(), tmp_path / "run", 40, resume=True)
+    texts = [event.text for event in read_events(tmp_path / "run")]
+    assert "resumed at iteration 30" in texts
+
+
+def test_the_first_algorithm_goes_on_too(tmp_path: Path) -> None:
+    config = LearnerConfig(algorithm="1.0", tau=40, eta_dot_window=5, warm_up=3)
+    go(OscillatorySource(), tmp_path / "run", 47, config)
+    resumed = go(OscillatorySource(), tmp_path / "run", LENGTH, config, resume=True)
+    assert resumed.signals_sha256 == go(OscillatorySource(), None, LENGTH, config).signals_sha256
+
+
+def test_a_recording_goes_on(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "log", frames=LENGTH * CONFIG.tau)
+    with_stop = RecordedSource(tmp_path / "log")
+    go(with_stop, tmp_path / "run", 33)
+    resumed = go(RecordedSource(tmp_path / "log"), tmp_path / "run", LENGTH, resume=True)
+    assert resumed.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
+
+
+def test_a_simulator_goes_on(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet")
+    from recorder.scenes import open_scene
+
+    def live() -> FrameSource:
+        return open_scene("icub", SceneConfig(kind="icub", seed=1), RecordConfig())
+
+    config = LearnerConfig(tau=10, components=3, expansion="none")
+    source = live()
+    straight = go(source, None, 10, config)
+    source.close()
+    for iterations, resume in ((6, False), (10, True)):
+        source = live()
+        result = go(source, tmp_path / "run", iterations, config, checkpoint_every=4, resume=resume)
+        source.close()
+    assert result.signals_sha256 == straight.signals_sha256
+
+
+SLOW = """
+import sys, time
+from pathlib import Path
+import test_resume as case
+from cdmisfa.streams import OscillatorySource
+case.go(OscillatorySource(), Path(sys.argv[1]), case.LENGTH, resume=sys.argv[2] == "resume",
+        progress=lambda _: time.sleep(.02))
+"""
+
+
+def killed_when(out: Path, resume: bool, ready: Callable[[], bool]) -> None:
+    """Run `SLOW` and kill -9 it once something has happened."""
+    mode = "resume" if resume else "new"
+    here = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    process = subprocess.Popen([sys.executable, "-c", SLOW, str(out), mode], env=here)
+    deadline = time.monotonic() + 60
+    while not ready():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+def test_kill_9_anywhere_loses_nothing(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    partial = out / "run.mcap.partial"
+
+    def reached(iteration: int) -> Callable[[], bool]:
+        return lambda: any(load_checkpoint(p).iteration >= iteration for p in checkpoints(out)[:1])
+
+    killed_when(out, False, lambda: partial.exists() and partial.stat().st_size > 20_000)
+    killed_when(out, True, reached(2 * EVERY))
+    result = go(OscillatorySource(), out, LENGTH, resume=True)
+    assert compare(whole, out) is None
+    assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
+
+
+def test_a_kill_while_resuming_loses_nothing(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    go(OscillatorySource(), out, 50)
+    half = (out / "run.mcap").read_bytes()
+    (out / "run.mcap").rename(out / SET_ASIDE)
+    (out / "run.mcap.partial").write_bytes(half[: len(half) // 3])
+    go(OscillatorySource(), out, LENGTH, resume=True)
+    assert compare(whole, out) is None
+
+
+def test_a_log_that_lost_its_end_goes_on_from_the_older_checkpoint(
+    whole: Path, tmp_path: Path
+) -> None:
+    out, short = tmp_path / "run", tmp_path / "short"
+    go(OscillatorySource(), out, 57)
+    go(OscillatorySource(), short, 50)
+    shutil.copy(short / "run.mcap", out / "run.mcap")
+    go(OscillatorySource(), out, LENGTH, resume=True)
+    assert compare(whole, out) is None
+    assert "resumed at iteration 40" in [event.text for event in read_events(out)]
+
+
+@pytest.mark.parametrize("damaged", [1, 2])
+def test_damaged_checkpoints_are_passed_over(whole: Path, tmp_path: Path, damaged: int) -> None:
+    out = tmp_path / "run"
+    go(OscillatorySource(), out, 57)
+    for path in checkpoints(out)[:damaged]:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+        with pytest.raises(LogDamagedError, match=path.name):
+            load_checkpoint(path)
+    go(OscillatorySource(), out, LENGTH, resume=True)
+    assert compare(whole, out) is None
+
+
+def test_a_kill_before_the_log_says_anything_starts_anew(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "run.mcap.partial").write_bytes(b"")
+    go(OscillatorySource(), out, LENGTH, resume=True)
+    assert compare(whole, out) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"config": LearnerConfig(tau=40, nu=0.07)}, "learner.nu = 0.05, not 0.07"),
+        ({"seed": 4}, "seed = 3, not 4"),
+        ({"source": OscillatorySource(("x1", "x2"))}, "streams"),
+        ({"source": OscillatorySource(fps=25.0)}, "spec.fps = 50.0, not 25.0"),
+    ],
+)
+def test_a_changed_run_is_refused_and_left_alone(
+    tmp_path: Path, change: dict[str, object], named: str
+) -> None:
+    out = tmp_path / "run"
+    config = LearnerConfig(tau=40)
+    go(OscillatorySource(), out, 20, config)
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    changed = {"source": OscillatorySource(), "config": config} | change
+    with pytest.raises(UsageError, match=named):
+        go(out=out, iterations=30, resume=True, **changed)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no run to go on with"):
+        go(OscillatorySource(), tmp_path, 10, resume=True)
+    with pytest.raises(UsageError, match="name its folder"):
+        go(OscillatorySource(), None, 10, resume=True)
+
+
+def test_a_forced_run_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    go(OscillatorySource(), out, 60)
+    go(OscillatorySource(), out, 20, seed=4, force=True)
+    assert [load_checkpoint(path).iteration for path in checkpoints(out)] == [20]
+
+
+def test_checkpoints_hold_no_code(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint-000000000001.npz"
+    np.savez(path, checkpoint=np.array([object()], dtype=object))
+    with pytest.raises(LogDamagedError, match="not a whole checkpoint"):
+        load_checkpoint(path)
+    np.savez_compressed(path, checkpoint=np.zeros(10_000_000, np.uint8))
+    with pytest.raises(LogDamagedError, match="compressed"):
+        load_checkpoint(path)
+    path.write_bytes(b"")
+    with pytest.raises(LogDamagedError):
+        load_checkpoint(path)
+    assert newest_covered(tmp_path, 10) is None
+
+
+def test_a_checkpoint_gives_the_state_back(tmp_path: Path) -> None:
+    source = OscillatorySource()
+    out = tmp_path / "run"
+    go(source, out, 60)
+    state = load_checkpoint(checkpoints(out)[0]).state
+    learner = CuriousLearner(CONFIG, source.spec, 3)
+    learner.restore(state)
+    again = learner.state
+    assert again.policy_rng == state.policy_rng
+    assert len(again.modules) == len(state.modules) > 0
+    for name, array in state.arrays.items():
+        assert again.arrays[name].tobytes() == array.tobytes()
+    assert not zipfile.ZipFile(checkpoints(out)[0]).testzip()
+
+
+def test_a_state_of_another_shape_is_refused() -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    state = learner.state
+    arrays = {**state.arrays, "agent.eta": np.zeros(7)}
+    with pytest.raises(ValueError, match=r"agent\.eta"):
+        learner.restore(LearnerState(arrays, (), state.policy_rng))
+
+
+def test_differences_name_the_key() -> None:
+    assert list(differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}, "d": 4})) == [
+        ("a.c", 2, 3),
+        ("d", None, 4),
+    ]
+
+
+def test_compiling_is_announced_only_when_it_will_happen(tmp_path: Path) -> None:
+    script = (
+        "from cdmisfa.compiled import needs_compiling as n; from cdmisfa.exploration import decay;"
+        "print(n(decay)); decay(1.0, .9, .5, .5); print(n(decay))"
+    )
+
+    def ask() -> str:
+        here = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+        return subprocess.run(
+            [sys.executable, "-c", script], env=here, check=True, capture_output=True, text=True
+        ).stdout
+
+    assert ask().split() == ["True", "False"]
+    assert ask().split() == ["False", "False"]
