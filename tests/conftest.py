@@ -53,9 +53,7 @@ def oscillatory_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def oscillatory_run(
-    tmp_path_factory: pytest.TempPathFactory, oscillatory_recording: Path
-) -> Path:
+def oscillatory_run(tmp_path_factory: pytest.TempPathFactory, oscillatory_recording: Path) -> Path:
     """A run of 15 iterations on that recording, without a Rerun view; not to be changed."""
     from cdmisfa.cli import run
 

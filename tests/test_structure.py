@@ -26,7 +26,9 @@ def python(*args: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_imports_run_one_way() -> None:
-    code = "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
+    code = (
+        "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
+    )
     done = python("-c", code)
     assert done.returncode == 0, done.stdout
 

@@ -88,10 +88,9 @@ def run(args: Sequence[str]) -> int:
     """
     with interruptible() as stop:
         try:
-            cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
+            # without standalone mode, Context.exit(code) comes back as the value
+            code = cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
             sys.stdout.flush()
-        except click.exceptions.Exit as end:
-            return end.exit_code
         except (click.Abort, KeyboardInterrupt):
             return _fail("interrupted", stop.exit_code)
         except BrokenPipeError:
@@ -103,7 +102,7 @@ def run(args: Sequence[str]) -> int:
             if os.environ.get("CDMISFA_TRACEBACK") == "1":
                 raise
             return _explain(error)
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 def _explain(error: Exception) -> int:

@@ -1,0 +1,325 @@
+"""The command line's contract: JSON keys, exit codes, a clean stdout, errors of one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa, Outcome
+
+SHORT = ("--max-iterations", "5", "--json")
+
+
+def assert_one_line(outcome: Outcome, code: int, *words: str) -> None:
+    """A user error: the code, nothing on stdout, one line that names what is wrong."""
+    assert outcome.code == code, outcome.err
+    assert outcome.out == ""
+    assert outcome.err.startswith("cdmisfa: ")
+    assert outcome.err.count("\n") == 1
+    for word in words:
+        assert word in outcome.err
+
+
+def start(*args: str, **environment: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "cdmisfa", *args],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **environment},
+    )
+
+
+class TestJson:
+    def test_learn_without_a_folder_writes_nothing(
+        self, cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        document = cdmisfa("learn", "oscillatory", "--seed", 5, *SHORT).json
+        assert document["schema"] == 1
+        assert document["run"] is None
+        assert document["seed"] == 5
+        assert document["iterations"] == 5
+        assert document["frames"] == 500
+        assert len(document["signals_sha256"]) == 64
+        assert document["modules"] == []
+        assert len(document["final_policy"]) == 3
+        assert 0 < document["epsilon"] <= 1.2
+        assert document["source"]["kind"] == "oscillatory"
+        assert list(tmp_path.iterdir()) == []
+
+    def test_learn_names_each_module(self, cdmisfa: Cdmisfa) -> None:
+        done = cdmisfa("learn", "oscillatory", "--seed", 1, "--max-modules", 1, "--json")
+        (module,) = done.json["modules"]
+        assert module["index"] == 1
+        assert module["stream"] == "x1"
+        assert module["stream_index"] == 0
+        assert module["policy"] == [0, 1, 1]
+        assert module["iteration"] == done.json["iterations"] - 1
+        assert module["eta"] == [pytest.approx(0.008, abs=0.004)]
+        assert "module 1 saved" in done.err
+
+    def test_record(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        folder = tmp_path / "r"
+        document = cdmisfa("record", "oscillatory", "-o", folder, "--frames", 60, "--json").json
+        assert (document["schema"], document["recording"], document["frames"]) == (
+            1,
+            str(folder),
+            60,
+        )
+        assert [view["name"] for view in document["views"]] == ["x1", "x2", "x3"]
+        for view in document["views"]:
+            assert view["frames"] == 60
+            assert Path(view["file"]).stat().st_size == view["bytes"]
+            assert len(view["sha256"]) == 64
+
+    def test_record_only_one_view(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        folder = tmp_path / "r"
+        words = ("record", "oscillatory", "-o", folder, "--frames", 60, "--view", "x2")
+        assert [view["name"] for view in cdmisfa(*words, "--json").json["views"]] == ["x2"]
+        assert [file.name for file in folder.iterdir()] == ["x2.mcap"]
+
+    @pytest.mark.parametrize("which", ["oscillatory_recording", "oscillatory_run"])
+    def test_info(self, cdmisfa: Cdmisfa, which: str, request: pytest.FixtureRequest) -> None:
+        path = request.getfixturevalue(which)
+        document = cdmisfa("info", path, "--json").json
+        assert {"schema", "path", "kind", "channels", "chunks", "complete", "crc"} <= set(document)
+        assert document["kind"] == which.partition("_")[2]
+        assert document["complete"] is True
+        assert document["crc"] == "ok"
+        for channel in document["channels"]:
+            keys = {"topic", "encoding", "schema", "messages", "start_ns", "end_ns"}
+            assert keys <= set(channel)
+
+    def test_verify(self, cdmisfa: Cdmisfa, oscillatory_recording: Path) -> None:
+        done = cdmisfa("verify", oscillatory_recording, "--json")
+        assert done.code == 0
+        assert done.json["ok"] is True
+        assert done.json["problems"] == []
+
+    def test_signals(self, cdmisfa: Cdmisfa) -> None:
+        from cdmisfa.signals import SIGNALS
+
+        document = cdmisfa("signals", "--json").json
+        assert [signal["name"] for signal in document["signals"]] == list(SIGNALS)
+
+    def test_doctor(self, cdmisfa: Cdmisfa) -> None:
+        document = cdmisfa("doctor", "--json").json
+        assert document["ok"] is True
+        assert {"python", "numpy", "pybullet", "vulkan driver"} <= {
+            check["what"] for check in document["checks"]
+        }
+
+
+class TestRuns:
+    def test_live_and_recorded_are_the_same(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path
+    ) -> None:
+        live = cdmisfa("learn", "oscillatory", *SHORT).json
+        recorded = cdmisfa("learn", oscillatory_recording, *SHORT).json
+        files = sorted(oscillatory_recording.glob("*.mcap"))
+        from_files = cdmisfa("learn", *files, *SHORT).json
+        assert live["signals_sha256"] == recorded["signals_sha256"]
+        assert live["signals_sha256"] == from_files["signals_sha256"]
+
+    def test_seed_changes_the_run(self, cdmisfa: Cdmisfa) -> None:
+        hashes = {
+            cdmisfa("learn", "oscillatory", "--seed", seed, *SHORT).json["signals_sha256"]
+            for seed in (0, 0, 1)
+        }
+        assert len(hashes) == 2
+
+    def test_settings_win_over_the_preset_and_stand_in_the_run(
+        self, cdmisfa: Cdmisfa, tmp_path: Path
+    ) -> None:
+        import json
+
+        run = tmp_path / "run"
+        words = ("--set", "learner.tau=50", "--set", "learner.nu=0.02", "--no-rerun")
+        document = cdmisfa("learn", "oscillatory", "-o", run, *words, *SHORT).json
+        assert document["frames"] == 250
+        assert document["run"] == str(run)
+        config = json.loads((run / "run.json").read_text())["config"]
+        assert config["learner"]["nu"] == 0.02
+        assert config["learner"]["sigma"] == 0.0009
+        assert config["scene"]["kind"] == "oscillatory"
+
+    def test_own_preset(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        preset = tmp_path / "mine.toml"
+        preset.write_text("[learner]\ntau = 30\n")
+        document = cdmisfa("learn", "oscillatory", "--preset", preset, *SHORT).json
+        assert document["frames"] == 150
+
+    def test_compare(self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path) -> None:
+        same, other = tmp_path / "same", tmp_path / "other"
+        words = ("learn", "oscillatory", "--max-iterations", 15, "--no-rerun", "-o")
+        assert cdmisfa(*words, same).code == 0
+        assert cdmisfa(*words, other, "--seed", 9).code == 0
+        equal = cdmisfa("compare", oscillatory_run, same, "--json")
+        assert (equal.code, equal.json["identical"]) == (0, True)
+        differs = cdmisfa("compare", oscillatory_run, other, "--json")
+        assert (differs.code, differs.json["identical"]) == (4, False)
+        assert differs.json["first_difference"]["iteration"] == 0
+
+    def test_end_of_a_recording_is_an_error_that_keeps_the_run(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
+    ) -> None:
+        run = tmp_path / "run"
+        done = cdmisfa("learn", oscillatory_recording, "-o", run, "--no-rerun")
+        assert_one_line(done, 1, "--loop", str(run))
+        assert cdmisfa("info", run, "--json").json["complete"] is True
+        looped = cdmisfa("learn", oscillatory_recording, "--loop", "--max-iterations", 25, "--json")
+        assert looped.json["iterations"] == 25
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("words", "code", "names"),
+        [
+            (["learn", "no/such.mcap"], 2, ["no/such.mcap", "icub, oscillatory"]),
+            (["learn", "oscilatory"], 2, ["oscilatory", "icub, oscillatory"]),
+            (["record", "icubs", "-o", "x"], 2, ["icubs", "did you mean icub?"]),
+            (["record", "icub"], 2, ["-o"]),
+            (["record", "oscillatory", "-o", "x", "--view", "x9"], 2, ["x9", "x1, x2, x3"]),
+            (["info", "no/such.mcap"], 2, ["no/such.mcap"]),
+            (["verify", "no/such"], 2, ["no/such"]),
+            (["view", "no/such"], 2, ["no/such"]),
+            (["compare", "no/such", "neither"], 2, ["no/such"]),
+            (["recover", "no/such", "-o", "x"], 2, ["no/such"]),
+            (["export", "no/such", "-o", "x.csv"], 2, ["no/such"]),
+            (["plot", "no/such"], 2, ["no/such"]),
+            (["learn", "oscillatory", "--set", "learner.nuu=1"], 2, ["did you mean learner.nu?"]),
+            (["learn", "oscillatory", "--set", "lerner.nu=1"], 2, ["did you mean learner?"]),
+            (["learn", "oscillatory", "--set", "learner.nu=x"], 2, ["learner.nu", "number"]),
+            (["learn", "oscillatory", "--set", "nu"], 2, ["section.key=value"]),
+            (["learn", "oscillatory", "--set", "scene.kind=icub"], 2, ["scene.kind"]),
+            (["learn", "oscillatory", "--preset", "icubs"], 2, ["did you mean icub?"]),
+            (["learn", "oscillatory", "--preset", "no.toml"], 2, ["no.toml"]),
+            (["learn"], 2, ["SOURCE", "cdmisfa learn --help"]),
+            (["learn", "oscillatory", "--sead", "1"], 2, ["--seed"]),
+            (["learn", "oscillatory", "--seed", "x"], 2, ["--seed"]),
+            (["learnn"], 2, ["did you mean learn?"]),
+            (["view", "x", "--web", "--save", "y.rrd"], 2, ["--save"]),
+            (["view", "x", "--at", "3"], 2, ["--screenshot"]),
+        ],
+    )
+    def test_one_line_says_what_is_wrong(
+        self,
+        cdmisfa: Cdmisfa,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        words: list[str],
+        code: int,
+        names: list[str],
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        assert_one_line(cdmisfa(*words), code, *names)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize("command", ["learn", "info", "verify", "recover"])
+    @pytest.mark.parametrize("content", [b"", b"not an MCAP file at all" * 20])
+    def test_a_file_that_is_no_mcap(
+        self, cdmisfa: Cdmisfa, tmp_path: Path, command: str, content: bytes
+    ) -> None:
+        path = tmp_path / "left.mcap"
+        path.write_bytes(content)
+        options = ("-o", tmp_path / "out.mcap") if command == "recover" else ()
+        done = cdmisfa(command, path, *options)
+        assert done.code == 3, done.err
+        assert "left.mcap" in done.err + done.out
+        assert "Traceback" not in done.err
+        assert not (tmp_path / "out.mcap").exists()
+
+    def test_a_damaged_recording(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "x1.mcap"
+        data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        path.write_bytes(data)
+        done = cdmisfa("verify", path, "--json")
+        assert (done.code, done.json["ok"]) == (3, False)
+        assert all({"where", "what"} <= set(problem) for problem in done.json["problems"])
+        assert_one_line(cdmisfa("learn", path, "--max-iterations", 20), 3, str(path))
+
+    def test_nothing_is_overwritten(
+        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
+    ) -> None:
+        run, recording = tmp_path / "run", tmp_path / "recording"
+        record = ("record", "oscillatory", "--frames", 60, "-o", recording)
+        learn = ("learn", "oscillatory", "--no-rerun", "--max-iterations", 2, "-o", run)
+        for words, folder in ((record, recording), (learn, run)):
+            assert cdmisfa(*words).code == 0
+            before = {file: file.read_bytes() for file in folder.iterdir()}
+            assert_one_line(cdmisfa(*words, "--seed", 8), 2, str(folder), "--force")
+            assert {file: file.read_bytes() for file in folder.iterdir()} == before
+            assert cdmisfa(*words, "--seed", 8, "--force").code == 0
+
+    def test_a_folder_that_cannot_be_made(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        out = tmp_path / "file" / "run"
+        words = ("--max-iterations", 2, "--no-rerun")
+        for command in (("learn", "oscillatory", *words), ("record", "oscillatory")):
+            done = cdmisfa(*command, "-o", out)
+            assert_one_line(done, done.code, str(tmp_path / "file"))
+            assert done.code in (1, 2)
+
+    def test_without_the_simulator(self, tmp_path: Path) -> None:
+        stub = "raise ImportError('not installed')\n"
+        (tmp_path / "pybullet.py").write_text(stub)
+        (tmp_path / "icub_models.py").write_text(stub)
+        path = os.pathsep.join([str(tmp_path), *sys.path])
+        for words in (["learn", "icub"], ["record", "icub", "-o", str(tmp_path / "r")]):
+            with start(*words, PYTHONPATH=path) as process:
+                out, err = process.communicate(timeout=60)
+            assert_one_line(Outcome(process.returncode, out, err), 1, "pip install")
+        with start("learn", "oscillatory", *SHORT, PYTHONPATH=path) as process:
+            process.communicate(timeout=60)
+        assert process.returncode == 0
+
+
+class TestInterrupts:
+    @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+    def test_learn_stops_cleanly(self, tmp_path: Path, number: int, code: int) -> None:
+        run = tmp_path / "run"
+        words = ["learn", "oscillatory", "-o", str(run), "--no-rerun", "--json"]
+        with start(*words, "--set", "learner.delta=1e-12") as process:
+            wait_for(run / "run.mcap.partial", process)
+            process.send_signal(number)
+            out, err = process.communicate(timeout=60)
+        assert process.returncode == code, err
+        assert "Traceback" not in err
+        assert Outcome(code, out, err).json["ended"] == "interrupted"
+        assert sorted(f.name for f in run.iterdir() if "partial" in f.name) == []
+        assert (run / "run.json").exists()
+
+    def test_record_keeps_a_readable_part(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        recording = tmp_path / "recording"
+        words = ["record", "oscillatory", "-o", str(recording), "--frames", "100000000"]
+        with start(*words) as process:
+            wait_for(recording / "x3.mcap.partial", process)
+            time.sleep(0.3)
+            process.send_signal(signal.SIGTERM)
+            out, err = process.communicate(timeout=60)
+        assert_one_line(Outcome(process.returncode, out, err.lstrip()), 143, "interrupted")
+        assert cdmisfa("info", recording, "--json").json["complete"] is False
+
+    def test_closed_pipe_is_quiet(self) -> None:
+        with start("signals") as process:
+            assert process.stdout is not None
+            process.stdout.close()
+            assert process.stderr is not None
+            assert process.stderr.read() == ""
+
+
+def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 60
+    while not (path.exists() and path.stat().st_size > 0):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)

@@ -1,0 +1,67 @@
+"""Every command that the README shows does what it says, on a machine with nothing prepared."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+
+
+def commands() -> list[list[str]]:
+    lines = [line for block in blocks("sh") for line in block.splitlines() if line.strip()]
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_first_lines_are_targets_of_the_makefile() -> None:
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    targets = re.findall(r"^make (\w+)", blocks("")[0], re.MULTILINE)
+    assert targets == ["demo", "test"]
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
+
+
+@pytest.mark.skipif(not HAS_SIMULATOR, reason="PyBullet is missing: pip install pybullet")
+def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
+    for program, *args in commands():
+        assert program == "cdmisfa"
+        done = cdmisfa(*args)
+        assert done.code == 0, f"cdmisfa {shlex.join(args)}: {done.err}"
+    for made in ("live.rrd", "signals.parquet", "left-again.mcap", "runs/icub/run.rrd"):
+        assert (elsewhere / made).stat().st_size > 0
+    assert list((elsewhere / "figures").glob("*.png"))
+
+
+def test_python_example_works(elsewhere: Path) -> None:
+    (example,) = blocks("python")
+    done = subprocess.run(
+        [sys.executable, "-c", example + "\nprint(learner.modules[0].stream)"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, "0"), done.stderr
+
+
+def test_links_lead_somewhere() -> None:
+    links = re.findall(r"\]\((?!https?://)([^)#]+)\)", README)
+    assert [link for link in links if not (ROOT / link).exists()] == []
