@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from cdmisfa.agent import OUTCOME, begin_abstraction, has_gap, mean_change, new_agent, rules, think
 from cdmisfa.blocks import Block, SourceSpec
 from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import CdmisfaError
 from cdmisfa.expansion import expanded_size, quadratic
 from cdmisfa.gate import Frozen, mean_output, recognise
 from cdmisfa.incsfa import IncSFA, project
@@ -113,8 +114,8 @@ class CuriousLearner:
 
     @property
     def phi(self) -> Float:
-        """Weights of the adaptive abstraction, (J, I)."""
-        return self.abstraction.phi
+        """Weights of the adaptive abstraction, (J, I), a copy."""
+        return self.abstraction.phi.copy()
 
     @property
     def exhausted(self) -> bool:
@@ -153,13 +154,10 @@ class CuriousLearner:
             block: tau frames of the stream the learner asked for.
 
         Raises:
-            ValueError: the block is of another stream or length.
+            ValueError: the block is of another stream, length, frame shape or type.
+            CdmisfaError: it holds a value that is no finite number.
         """
-        if block.stream != self.stream or len(block) != self.tau:
-            raise ValueError(
-                f"the learner asked for {self.tau} frames of stream {self.stream}, "
-                f"not {len(block)} of stream {block.stream}"
-            )
+        self._check(block)
         agent = self.agent
         frames = block.frames.reshape(len(block), -1)
         x = quadratic(frames) if self.config.expansion == "quadratic" else frames
@@ -198,6 +196,25 @@ class CuriousLearner:
             self.save_abstraction()
         return signals
 
+    def _check(self, block: Block) -> None:
+        """Refuse a block that was not asked for, or that would spoil every estimate."""
+        if block.stream != self.stream or len(block) != self.tau:
+            raise ValueError(
+                f"the learner asked for {self.tau} frames of stream {self.stream}, "
+                f"not {len(block)} of stream {block.stream}"
+            )
+        shape, dtype = block.frames.shape[1:], block.frames.dtype
+        if shape != self.spec.frame_shape or dtype != self.spec.dtype:
+            raise ValueError(
+                f"the learner asked for frames of {self.spec.frame_shape} {self.spec.dtype}, "
+                f"not {shape} {dtype}"
+            )
+        if dtype.kind == "f" and not np.isfinite(block.frames).all():
+            raise CdmisfaError(
+                f"stream {self.spec.streams[block.stream]} holds a value that is no finite number "
+                f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
+            )
+
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Every array that changes in place, by name."""
         parts: dict[str, Any] = {"agent": self.agent, "abstraction": self.abstraction.state}
@@ -226,8 +243,8 @@ class CuriousLearner:
             gate_mean=agent.gate_mean.copy(),
             gate_sd=np.sqrt(agent.gate_variance),
             eta_inst_frozen=eta_frozen,
-            band_mean=self.frozen.band_mean,
-            band_sd=self.frozen.band_sd,
+            band_mean=self.frozen.band_mean.copy(),
+            band_sd=self.frozen.band_sd.copy(),
             R=agent.dense / (agent.memory["scale"][0] or 1.0),
             Q=agent.Q.copy(),
             policy=agent.policy.copy(),

@@ -1,0 +1,378 @@
+"""The learner: the oscillatory experiment, determinism, and what a block may do to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdmisfa.blocks import Block, SourceSpec, freeze
+from cdmisfa.config import LearnerConfig, build, load_preset
+from cdmisfa.errors import CdmisfaError
+from cdmisfa.gate import BAND, CONSTANT
+from cdmisfa.learner import CuriousLearner
+from cdmisfa.signals import BlockSignals, SignalsHash, values
+from cdmisfa.streams import OscillatorySource
+
+CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
+
+
+@dataclass
+class Trial:
+    learner: CuriousLearner
+    signals: list[BlockSignals]
+    sha256: str
+
+
+def trial(
+    seed: int,
+    iterations: int = 5000,
+    modules: int = 3,
+    config: LearnerConfig = CONFIG,
+    source: OscillatorySource | None = None,
+) -> Trial:
+    source = source or OscillatorySource()
+    learner = CuriousLearner(config, source.spec, seed)
+    digest, signals = SignalsHash(), []
+    while len(learner.modules) < modules and learner.iteration < iterations:
+        signals.append(learner.step(source.take(learner.stream, learner.tau)))
+        digest.add(signals[-1])
+    return Trial(learner, signals, digest.hexdigest())
+
+
+@pytest.fixture(scope="module")
+def whole() -> Trial:
+    return trial(0)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13, 14, 15])
+def test_the_oscillatory_experiment(seed: int) -> None:
+    learner = trial(seed).learner
+    assert [m.stream for m in learner.modules] == [0, 1, 2]
+    assert [m.policy.tolist() for m in learner.modules] == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
+    for module, eta in zip(learner.modules, (0.008, 0.006, 0.004), strict=True):
+        assert 0.6 * eta < module.eta[0] < 1.3 * eta  # Var(y) remembers the search
+    assert 1000 < learner.iteration < 2500
+
+
+def test_modules_encode_the_slow_features_of_their_streams(whole: Trial) -> None:
+    theta = 2 * np.pi * np.arange(500) / 500
+    slow = [np.sin(4 * theta - np.pi / 4), np.sin(3 * theta), np.cos(2 * theta)]
+    for module, expected in zip(whole.learner.modules, slow, strict=True):
+        source = OscillatorySource()
+        x = source.take(module.stream, 500).frames
+        i, j = np.triu_indices(2)
+        expanded = np.concatenate([x, x[:, i] * x[:, j]], axis=1)
+        y = (expanded - module.mean) @ module.phi[0]
+        assert abs(np.corrcoef(y, expected)[0, 1]) > 0.99
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    first, second = trial(3, iterations=300), trial(3, iterations=300)
+    assert first.sha256 == second.sha256
+    assert len(first.signals) == 300
+
+
+def test_another_seed_gives_another_run() -> None:
+    assert trial(3, iterations=20).sha256 != trial(4, iterations=20).sha256
+
+
+def test_signals_have_the_documented_shapes(whole: Trial) -> None:
+    config, n = whole.learner.config, 3
+    modules = 0
+    for k, record in enumerate(whole.signals):
+        sizes = {"T": config.tau, "J": config.outputs, "M": modules, "S": n, "A": 2}
+        for signal, value in values(record):
+            assert value.shape == tuple(sizes[d] for d in signal.dims), (k, signal.name)
+        assert (record.iteration, record.t) == (k, k * config.tau)
+        assert record.log_time == whole.learner.spec.time_ns(record.t)
+        assert record.module == modules + 1
+        modules += record.saved
+    assert modules == 3
+
+
+def test_each_iteration_watches_what_the_last_one_chose(whole: Trial) -> None:
+    for before, after in zip(whole.signals, whole.signals[1:], strict=False):
+        assert after.stream == before.next_stream
+        assert (before.next_stream == before.stream) == (before.action == 0)
+
+
+def test_what_a_block_does_not_have_is_nan(whole: Trial) -> None:
+    for record in whole.signals:
+        known = not record.novel
+        assert np.isnan(record.y).all() == known
+        assert np.isnan(record.eta_inst).all() == known
+        assert np.isnan(record.xi) == known
+        assert np.isnan(record.reward) == np.isnan(record.curiosity) == np.isnan(record.expert)
+        assert not (known and not np.isnan(record.reward))
+        if not np.isnan(record.reward):
+            assert record.reward == record.curiosity + record.expert
+            assert record.curiosity == -record.xi_dot
+
+
+def test_known_blocks_are_those_inside_a_band(whole: Trial) -> None:
+    for record in whole.signals:
+        distance = np.abs(record.eta_inst_frozen - record.band_mean)
+        inside = (distance <= BAND * record.band_sd).all(axis=1)
+        assert record.known_by == (np.argmax(inside) + 1 if inside.any() else 0)
+        assert record.novel == (record.known_by == 0)
+
+
+def test_r_is_the_mean_of_the_rewards_since_the_last_module(whole: Trial) -> None:
+    total, count, last = np.zeros((3, 2, 3)), 0, None
+    for record in whole.signals:
+        if not np.isnan(record.reward) and not record.saved:
+            total[last.stream, last.action, record.stream] += record.reward
+            count += 1
+        np.testing.assert_allclose(record.R, total / max(count, 1), rtol=1e-9, atol=1e-18)
+        if record.saved:
+            total, count = np.zeros((3, 2, 3)), 0
+        last = record
+
+
+def test_q_answers_to_r_and_the_policy_to_q(whole: Trial) -> None:
+    gamma = whole.learner.config.gamma
+    switch = (1 - np.eye(3)) / 2
+    for record in whole.signals[::20]:
+        V = record.Q[np.arange(3), record.policy]
+        expected = np.stack(
+            [
+                record.R[:, 0].sum(1) + gamma * V,
+                record.R[:, 1].sum(1) / 2 + gamma * switch @ V,
+            ],
+            axis=1,
+        )
+        np.testing.assert_allclose(record.Q, expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(record.policy, record.Q[:, 1] > record.Q[:, 0])
+
+
+def test_after_a_save_everything_begins_anew(whole: Trial) -> None:
+    saves = [k for k, record in enumerate(whole.signals) if record.saved]
+    for k in saves[:-1]:
+        saved, after = whole.signals[k], whole.signals[k + 1]
+        assert saved.novel
+        assert saved.epsilon == CONFIG.epsilon_start
+        assert after.epsilon == CONFIG.epsilon_start * CONFIG.epsilon_decay
+        assert not after.R.any()
+        assert not after.Q.any()
+        assert not after.policy.any()
+        assert after.novel_blocks == int(after.novel)
+        assert after.share == pytest.approx(1.0 if after.novel else 1 - 2 / 41)
+
+
+def test_a_saved_module_is_what_the_signals_said(whole: Trial) -> None:
+    saves = [record for record in whole.signals if record.saved]
+    for module, record in zip(whole.learner.modules, saves, strict=True):
+        assert (module.iteration, module.stream) == (record.iteration, record.stream)
+        assert (record.eta_dot < CONFIG.delta).all()
+        assert (record.variance >= CONFIG.min_variance).all()
+        assert record.share >= CONFIG.novel_share
+        for name in ("eta", "policy"):
+            np.testing.assert_array_equal(getattr(module, name), getattr(record, name))
+        np.testing.assert_array_equal(module.band_mean, record.gate_mean)
+        np.testing.assert_array_equal(module.band_sd, record.gate_sd)
+
+
+def test_a_frozen_modules_output_is_phi_times_the_centred_input(whole: Trial) -> None:
+    record = whole.signals[-2]
+    module = whole.learner.modules[0]
+    source = OscillatorySource()
+    source.seek(record.t)
+    x = source.take(record.stream, 100).frames
+    i, j = np.triu_indices(2)
+    expanded = np.concatenate([x, x[:, i] * x[:, j]], axis=1)
+    np.testing.assert_allclose(
+        record.y_frozen[0], (expanded - module.mean) @ module.phi.T, rtol=1e-9, atol=1e-9
+    )
+
+
+def snapshot(module: Any) -> dict[str, Any]:
+    return {f.name: np.array(getattr(module, f.name)) for f in dataclasses.fields(module)}
+
+
+def test_a_module_never_changes_once_frozen() -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    while not learner.modules:
+        learner.step(source.take(learner.stream, learner.tau))
+    frozen = snapshot(learner.modules[0])
+    for _ in range(60):
+        learner.step(source.take(learner.stream, learner.tau))
+    for name, value in snapshot(learner.modules[0]).items():
+        np.testing.assert_array_equal(value, frozen[name], err_msg=name)
+    state = [*learner.agent, *learner.abstraction.state]
+    for field in dataclasses.fields(learner.modules[0]):
+        value = getattr(learner.modules[0], field.name)
+        if isinstance(value, np.ndarray) and value.size:
+            assert not any(np.shares_memory(value, array) for array in state), field.name
+
+
+def test_nobody_can_reach_the_learner_through_what_it_gave_away() -> None:
+    def vandal(record: BlockSignals, learner: CuriousLearner) -> None:
+        for _, value in values(record):
+            if value.ndim and value.flags.writeable:
+                value[...] = 0
+        learner.phi[...] = 7
+        learner.policy[...] = 1
+
+    hashes = []
+    for touch in (lambda record, learner: None, vandal):
+        source, digest = OscillatorySource(), SignalsHash()
+        learner = CuriousLearner(CONFIG, source.spec, 0)
+        for _ in range(700):
+            record = learner.step(source.take(learner.stream, learner.tau))
+            digest.add(record)
+            touch(record, learner)
+        assert learner.modules
+        hashes.append(digest.hexdigest())
+    assert hashes[0] == hashes[1]
+
+
+def test_the_frames_are_not_changed() -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    frames = source.take(learner.stream, 100).frames.copy()
+    before = frames.copy()
+    learner.step(Block(learner.stream, 0, frames, np.empty((100, 0))))
+    np.testing.assert_array_equal(frames, before)
+
+
+SPEC = OscillatorySource().spec
+FRAMES = freeze(np.random.default_rng(0).standard_normal((100, 2)))
+
+
+def block(stream: int = 0, t: int = 0, frames: np.ndarray = FRAMES) -> Block:
+    return Block(stream, t, frames, np.empty((len(frames), 0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: block((s + 1) % 3), "not 100 of stream"),
+        (lambda s: block(s, frames=FRAMES[:99]), "not 99 of stream"),
+        (lambda s: block(s, frames=np.zeros((100, 3))), r"not \(3,\) float64"),
+        (lambda s: block(s, frames=np.zeros((100, 2), np.float32)), r"not \(2,\) float32"),
+    ],
+)
+def test_a_block_that_was_not_asked_for_is_refused(
+    change: Callable[[int], Block], words: str
+) -> None:
+    learner = CuriousLearner(CONFIG, SPEC, 0)
+    expected = trial(0, iterations=1).sha256
+    with pytest.raises(ValueError, match=words):
+        learner.step(change(learner.stream))
+    assert learner.iteration == 0
+    digest = SignalsHash()
+    digest.add(learner.step(OscillatorySource().take(learner.stream, 100)))
+    assert digest.hexdigest() == expected, "a refused block left a trace"
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_values_that_are_no_numbers_are_refused_with_the_place(bad: float) -> None:
+    learner = CuriousLearner(CONFIG, SPEC, 0)
+    frames = FRAMES.copy()
+    frames[40, 1] = bad
+    with pytest.raises(CdmisfaError, match=r"stream x\d .*no finite number in frames 300 to 399"):
+        learner.step(block(learner.stream, 300, frames))
+    assert learner.iteration == 0
+
+
+def test_a_constant_block_carries_nothing() -> None:
+    source = OscillatorySource(("zero", "zero"))
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    for _ in range(30):
+        record = learner.step(source.take(learner.stream, learner.tau))
+        assert (record.known_by, record.novel) == (CONSTANT, False)
+        assert np.isnan(record.reward)
+        assert not learner.phi.any()
+
+
+def gaps_seen(learner: CuriousLearner, blocks: list[Block]) -> list[bool | None]:
+    """For each block, whether the abstraction was told of a gap; None where it was not fed."""
+    told: list[bool | None] = []
+    update = learner.abstraction.update
+
+    def spy(frames: np.ndarray, gap: bool) -> np.ndarray:
+        told[-1] = bool(gap)
+        return update(frames, gap)
+
+    learner.abstraction.update = spy  # type: ignore[method-assign]
+    for one in blocks:
+        told.append(None)
+        learner.step(one)
+    return told
+
+
+def test_derivatives_never_reach_across_a_gap() -> None:
+    spec = SourceSpec(("only",), (2,), "float64")
+    rng = np.random.default_rng(1)
+    noise = [freeze(rng.standard_normal((100, 2))) for _ in range(6)]
+    still = freeze(np.ones((100, 2)))
+    blocks = [
+        block(0, 0, noise[0]),
+        block(0, 100, noise[1]),
+        block(0, 200, still),  # not learned from
+        block(0, 300, noise[2]),
+        block(0, 400, noise[3]),
+        block(0, 900, noise[4]),  # frames are missing before it
+    ]
+    told = gaps_seen(CuriousLearner(CONFIG, spec, 0), blocks)
+    assert told == [True, False, None, True, False, True]
+
+
+def test_a_switch_of_stream_is_a_gap() -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    told, streams = [], []
+    for _ in range(30):
+        streams.append(learner.stream)
+        told += gaps_seen(learner, [source.take(learner.stream, 100)])
+    assert told == [True] + [a != b for a, b in zip(streams, streams[1:], strict=False)]
+    assert set(told) == {True, False}
+
+
+def test_pixels_count_one_255th() -> None:
+    spec = SourceSpec(("a", "b"), (3, 4), "uint8")
+    config = LearnerConfig(expansion="none", components=3, tau=20)
+    pixels = np.random.default_rng(2).integers(0, 256, (40, 20, 3, 4), dtype=np.uint8)
+    image = CuriousLearner(config, spec, 1)
+    vector = CuriousLearner(config, SourceSpec(("a", "b"), (12,), "float64"), 1)
+    for k, frames in enumerate(pixels):
+        values_ = frames.reshape(20, 12) / 255.0
+        one = image.step(block(image.stream, 20 * k, frames))
+        two = vector.step(block(vector.stream, 20 * k, values_))
+        np.testing.assert_allclose(one.y, two.y, rtol=1e-6, atol=1e-9)
+        assert one.next_stream == two.next_stream
+
+
+def test_two_outputs() -> None:
+    record = trial(0, iterations=30, config=dataclasses.replace(CONFIG, outputs=2)).signals[-1]
+    assert record.y.shape == (100, 2)
+    assert np.isfinite(record.eta).all()
+
+
+def test_one_stream_alone_is_learned_and_never_left() -> None:
+    found = trial(0, modules=1, source=OscillatorySource(("x2",)))
+    (module,) = found.learner.modules
+    assert module.policy.tolist() == [0]
+    assert {record.next_stream for record in found.signals} == {0}
+    assert module.eta[0] == pytest.approx(0.006, abs=0.001)
+
+
+def test_ten_thousand_streams() -> None:
+    n = 10_000
+    spec = SourceSpec(tuple(map(str, range(n))), (2,), "float64")
+    learner = CuriousLearner(CONFIG, spec, 0)
+    tables = OscillatorySource().tables
+    for k in range(100):
+        stream = learner.stream
+        frames = freeze(np.take(tables[stream % 3], range(100 * k, 100 * k + 100), 0, mode="wrap"))
+        record = learner.step(block(stream, 100 * k, frames))
+    assert record.R.shape == (0, 2, 0)
+    assert record.Q.shape == (n, 2)
+    assert np.isfinite(record.Q).all()
+    assert record.Q.any()
