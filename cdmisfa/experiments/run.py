@@ -7,6 +7,7 @@ RUN/run.rrd the view. The loop knows nothing of where blocks come from.
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import platform
@@ -325,6 +326,7 @@ def _write_run(out: Path, result: RunResult, tables: Mapping[str, Any], rerun: b
         build_view(out, out / "run.rrd")
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages a result may depend on."""
     found = {"python": platform.python_version()}
