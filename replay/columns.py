@@ -136,8 +136,8 @@ class TensorColumn(Column):
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand n tensors over."""
-        column = _TensorBatch(tensor_array(np.asarray(values, dtype=np.float64), self._names))
-        self._recording.send_columns(self.path, times, [column])
+        batch: Any = _TensorBatch(tensor_array(np.asarray(values, dtype=np.float64), self._names))
+        self._recording.send_columns(self.path, times, [batch])
 
 
 class _TensorBatch:

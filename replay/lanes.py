@@ -53,7 +53,8 @@ class Lanes:
         self._put(signals, "lanes/5_chosen_by", *drawn)
         for s in self._shown:
             planned = (SWITCH, GREY) if signals.policy[s] else (STAY, colour(s))
-            self._put(signals, f"policy/{rr.escape_entity_path_part(self._names[s])}", *planned)
+            part = rr.escape_entity_path_part(f"{s + 1}_{self._names[s]}")
+            self._put(signals, f"policy/{part}", *planned)
 
     def end(self, frames: int) -> None:
         """Write all lanes; they end with the run.

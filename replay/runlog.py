@@ -262,6 +262,21 @@ def run_log(path: Path) -> Path:
     raise UsageError(f"{path} does not exist: name a run's folder or its {RUN_FILE}")
 
 
+def is_run(path: Path) -> bool:
+    """Whether a folder or a log is that of a run.
+
+    Raises:
+        UsageError: it does not exist.
+        LogDamagedError: it is no log, or a damaged one.
+    """
+    path = Path(path)
+    if path.is_dir():
+        whole = path / RUN_FILE
+        return whole.is_file() or partial_path(whole).is_file()
+    with LogReader(run_log(path)) as reader:
+        return any(record.name == METADATA for record in reader.metadata)
+
+
 def read_header(path: Path) -> RunHeader:
     """What stands at the beginning of a run's log.
 

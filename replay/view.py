@@ -5,15 +5,15 @@ The view can always be built again: the logs are the archive.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import rerun as rr
-import rerun.blueprint as rrb
 
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import partial_path
@@ -21,8 +21,9 @@ from replay.config import ViewConfig
 from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
 from replay.outline import Outline, read_outline
+from replay.recording_view import write_recording
 from replay.run_view import RunView
-from replay.runlog import run_log
+from replay.runlog import is_run, run_log
 from replay.summary import summary_text
 
 APPLICATION = "cdmisfa"
@@ -39,42 +40,47 @@ def build_view(
     force: bool = True,
     config: ViewConfig | None = None,
 ) -> None:
-    """Write the view of a run as an .rrd file, whole or not at all.
+    """Write the view of a run or a recording as an .rrd file, whole or not at all.
 
     Args:
-        path: a run's folder or its run.mcap.
+        path: a run's folder or its run.mcap, or a recording.
         out: the file.
         every: show every so many watched frames, of those that were kept.
         force: replace an existing file.
         config: everything else; `every` is then taken from it.
 
     Raises:
-        UsageError: there is no such run, or `out` exists and `force` is not set.
-        LogDamagedError: the run cannot be read.
+        UsageError: there is no such run or recording, or `out` exists and `force` is not set.
+        LogDamagedError: it cannot be read.
         CdmisfaError: the view cannot be written.
     """
     config = config or ViewConfig(every=every)
-    out = Path(out)
+    out, path = Path(out), Path(path)
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    if is_run(path):
+        log = run_log(path)
+        with _recording_to(out, _name(log), log) as recording:
+            _write_run(recording, log, config)
+    else:
+        with _recording_to(out, path.resolve().stem, path) as recording:
+            write_recording(recording, path, config)
+
+
+@contextlib.contextmanager
+def _recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStream]:
+    """A Rerun recording that becomes the file `out` once it is complete."""
     partial = partial_path(out)
-    log = run_log(path)
-    outline = read_outline(log)
-    folder = log.parent
-    modules = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
-    recording = rr.RecordingStream(APPLICATION, recording_id=_identity(log))
+    recording = rr.RecordingStream(APPLICATION, recording_id=_identity(name, source))
     recording.set_log_time_enabled(False)
     try:
         recording.save(partial)
         if not partial.exists():
             raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
-        recording.send_recording_name(_name(log))
-        _properties(recording, outline, folder)
-        text = summary_text(outline, _name(log))
-        document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-        recording.log("summary", document, static=True)
-        RunView(recording, log, outline, config).write(modules)
-        _finish(recording, RunLayout(outline).blueprint())
+        recording.send_recording_name(name)
+        yield recording
+        recording.flush(timeout_sec=FLUSH_SECONDS)
+        recording.disconnect()
         os.replace(partial, out)
     except (RuntimeError, OSError) as error:
         raise CdmisfaError(f"{out} cannot be written: {error}") from error
@@ -83,20 +89,24 @@ def build_view(
         partial.unlink(missing_ok=True)
 
 
-def _finish(recording: rr.RecordingStream, layout: rrb.Blueprint) -> None:
-    recording.send_blueprint(layout)
-    recording.flush(timeout_sec=FLUSH_SECONDS)
-    recording.disconnect()
+def _write_run(recording: rr.RecordingStream, log: Path, config: ViewConfig) -> None:
+    outline, folder = read_outline(log), log.parent
+    modules = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
+    _properties(recording, outline, folder)
+    text = summary_text(outline, _name(log))
+    recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    RunView(recording, log, outline, config).write(modules)
+    recording.send_blueprint(RunLayout(outline).blueprint())
 
 
 def _name(log: Path) -> str:
     return log.resolve().parent.name
 
 
-def _identity(log: Path) -> str:
+def _identity(name: str, source: Path) -> str:
     """A name no other run has: Rerun merges recordings of the same name."""
-    place = hashlib.sha256(str(log.resolve()).encode()).hexdigest()[:12]
-    return f"{_name(log)}-{place}"
+    place = hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]
+    return f"{name}-{place}"
 
 
 def _properties(recording: rr.RecordingStream, outline: Outline, folder: Path) -> None:
