@@ -194,10 +194,13 @@ def _open_log(
     path = folder / f"{view}.mcap"
     earlier = {p: whole_frames(p, view) for p in earlier_logs(path)} if resume else {}
     best = max(earlier, key=lambda p: earlier[p], default=None)
-    if best is None:
+    if best is None or not earlier[best]:
+        if path in earlier:
+            raise UsageError(f"{path} holds no frames of {view}: overwrite with --force")
+        for torn in earlier:
+            torn.unlink()
         return ViewLog(folder, view, identity, settings, pose=pose, force=force)
-    if earlier[best]:
-        check_identity(best, identity.metadata(view))
+    check_identity(best, identity.metadata(view))
     kept = keep(path, best)
     log = ViewLog(folder, view, identity, settings, pose=pose)
     try:

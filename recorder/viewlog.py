@@ -121,7 +121,6 @@ class ViewLog:
         self.stream = spec.streams.index(view)
         self.t = 0
         self._spec = spec
-        self._metadata = identity.metadata(view)
         self._pose = pose
         self._pose_every = max(round(spec.fps), 1)
         self._frame: ImageEncoder | VectorEncoder
@@ -138,7 +137,7 @@ class ViewLog:
             compression=settings.compression,
             chunk_size=settings.chunk_size,
         )
-        self._log.add_metadata(METADATA, self._metadata)
+        self._log.add_metadata(METADATA, identity.metadata(view))
         self._log.add_attachment(
             CONFIG_NAME, "application/json", identity.config_json(), log_time=spec.start_ns
         )
@@ -185,10 +184,8 @@ class ViewLog:
         """Take over the first frames of an earlier log of the same view.
 
         Raises:
-            UsageError: it is a log of something else.
             LogWriteError: the disk does not take it.
         """
-        check_identity(path, self._metadata)
         for channel, message in _messages(path):
             if message.sequence >= frames:
                 break
@@ -196,10 +193,6 @@ class ViewLog:
                 target = self._channels[channel.topic]
                 self._log.write(target, message.log_time, message.data, message.sequence)
         self.t = frames
-
-    def flush(self) -> None:
-        """Hand everything written to the operating system."""
-        self._log.flush()
 
     def finish(self) -> None:
         """Give the file its index and its name."""

@@ -1,0 +1,212 @@
+"""The iCub scene: the contract of a source, what is seen where, and a silent simulator."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from source_contract import SourceContract
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.config import build, load_preset
+from cdmisfa.errors import CdmisfaError, UsageError
+from recorder.config import EyesConfig, RecordConfig, SceneConfig, SphereConfig
+from recorder.eyes import LUMA, eye_matrix, grey, look, perspective
+from recorder.motions import Motions
+from recorder.scenes import SCENES, open_scene
+
+pytest.importorskip("pybullet")
+
+from recorder.live import TRUTH, LiveSource
+from recorder.picture import SIZE, scene_picture
+from recorder.world import World
+
+SCENE = SceneConfig(seed=1)
+FRAMES = 80
+
+
+def look_at(scene: SceneConfig, n: int = FRAMES) -> np.ndarray:
+    """All views of a scene's first frames, (views, n, height, width)."""
+    source = LiveSource(scene, RecordConfig())
+    views = []
+    for stream in range(3):
+        source.seek(0)
+        views.append(source.take(stream, n).frames)
+    source.close()
+    return np.stack(views)
+
+
+@pytest.fixture(scope="module")
+def seen() -> np.ndarray:
+    return look_at(SCENE)
+
+
+class TestLive(SourceContract):
+    def open(self) -> FrameSource:
+        return LiveSource(SCENE, RecordConfig())
+
+
+def test_the_preset_is_the_default_scene():
+    for kind in SCENES:
+        preset = load_preset(kind)
+        assert build(SceneConfig, "scene", preset["scene"]) == SceneConfig(kind=kind)
+        assert build(RecordConfig, "record", preset["record"]) == RecordConfig()
+
+
+def test_views_are_two_eyes_of_a_plain_table_and_one_object(seen):
+    assert seen.shape == (3, FRAMES, 48, 128)
+    assert len(set(seen[:, :, 0].ravel())) == 1
+    background = seen[0, 0, 0, 0]
+    for view in seen:
+        pixels = (view != background).sum(axis=(1, 2))
+        assert pixels.min() > 100
+        assert pixels.max() < 500
+        left, right = view[..., :64] != background, view[..., 64:] != background
+        assert left.any(axis=(1, 2)).all()
+        assert right.any(axis=(1, 2)).all()
+
+
+@pytest.mark.parametrize(("number", "view"), [(1, 0), (2, 1), (3, 2)])
+def test_each_object_is_seen_in_its_own_view_and_nowhere_else(seen, number, view):
+    name = f"object{number}"
+    painted = dataclasses.replace(getattr(SCENE, name), grey=0.9)
+    changed = look_at(dataclasses.replace(SCENE, **{name: painted})) != seen
+    pixels = changed.sum(axis=(2, 3))
+    assert pixels[view].min() > 50
+    # A far corner of the box reaches the center view's last column once in a while.
+    allowed = 2 if number == 1 else 0
+    others = np.delete(pixels, view, axis=0)
+    assert others.max() <= allowed
+    assert (others > 0).mean() < 0.05
+
+
+def test_the_truth_is_where_the_objects_are(seen):
+    source = LiveSource(SCENE, RecordConfig())
+    block = source.take(0, FRAMES)
+    source.close()
+    assert source.spec.truth == TRUTH
+    np.testing.assert_array_equal(block.truth, Motions(SCENE, 1).take(FRAMES).reshape(FRAMES, 6))
+    # The box stands farther left in the left view when its y is larger.
+    columns = np.array([np.nonzero(f[:, :64] != f[0, 0])[1].mean() for f in seen[0]])
+    y = block.truth[:, TRUTH.index("object1_y")]
+    assert columns[y == 0.6].max() < columns[y == 0.4].min()
+
+
+def test_drawing_over_the_table_is_drawing_the_table(seen):
+    """The table drawn once and the objects over it, against everything drawn each frame."""
+    eyes, motions = SCENE.eyes, Motions(SCENE, 1)
+    lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
+    differing = 0
+    with World(SCENE) as world:
+        for t, places in enumerate(motions.take(30)):
+            world.place(places)
+            for view, yaw in enumerate(eyes.yaw):
+                pair = [
+                    grey(world.render(m, lens, eyes.width, eyes.height, eyes.light)[0])
+                    for m in (eye_matrix(eyes, world.neck, yaw, side) for side in (1, -1))
+                ]
+                differing += int((np.hstack(pair) != seen[view, t]).sum())
+    assert differing <= 1
+
+
+def test_the_robot_does_not_see_itself(seen):
+    eyes = SCENE.eyes
+    lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
+    with World(SCENE, robot_seen=True) as world:
+        world.place(Motions(SCENE, 1).take(1)[0])
+        for view, yaw in enumerate(eyes.yaw):
+            world.turn_head(yaw)
+            matrix = eye_matrix(eyes, world.neck, yaw, 1)
+            image = grey(world.render(matrix, lens, eyes.width, eyes.height, eyes.light)[0])
+            assert (image != seen[view, 0, :, :64]).sum() <= 1
+
+
+def test_matrices_are_the_simulators_own():
+    import pybullet
+
+    place, target = np.array([0.1, -0.2, 0.3]), np.array([-0.5, 0.4, -0.1])
+    np.testing.assert_allclose(
+        look(place, target), pybullet.computeViewMatrix(place, target, (0, 0, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        perspective(38, 4 / 3, 0.1, 5), pybullet.computeProjectionMatrixFOV(38, 4 / 3, 0.1, 5),
+        atol=1e-5,
+    )  # fmt: skip
+
+
+def test_grey_is_rounded_luma():
+    colours = np.random.default_rng(0).integers(0, 256, (50, 50, 4), dtype=np.uint8)
+    exact = colours[..., :3] @ (np.array(LUMA) / 1000)
+    assert np.abs(grey(colours) - exact).max() <= 0.5 + 1e-9
+    assert grey(np.full((1, 1, 3), 255, np.uint8)) == 255
+
+
+def test_the_simulator_says_nothing():
+    code = (
+        "from recorder.scenes import open_scene\n"
+        "s = open_scene('icub'); s.take(0, 2); s.close(); print('done')"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "done\n", "")
+
+
+def test_another_seed_is_another_recording(seen):
+    other = look_at(dataclasses.replace(SCENE, seed=2), 5)
+    assert all((other[v] != seen[v, :5]).any() for v in range(3))
+
+
+def test_a_scene_of_another_size(seen):
+    eyes = EyesConfig(views=("one",), yaw=(10.0,), width=20, height=10)
+    source = LiveSource(SceneConfig(eyes=eyes, object3=SphereConfig(radius=0.03)), RecordConfig())
+    assert source.take(0, 3).frames.shape == (3, 10, 40)
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ({"robot": "iCubNowhere"}, r"scene\.robot is iCubNowhere: icub-models has .*V2_5"),
+        ({"robot": "left_hand_mk3"}, r"left_hand_mk3 has no neck"),
+        ({"eyes": {"yaw": [80, 0, -45]}}, r"scene\.eyes\.yaw has 80.*-50 to 50"),
+        ({"eyes": {"yaw": [0]}}, r"1 angles for the 3 views"),
+        ({"eyes": {"views": ["a", "a", "b"]}}, r"scene\.eyes\.views names one twice"),
+        ({"eyes": {"views": ["../a", "b", "c"]}}, r"scene\.eyes\.views has '\.\./a'"),
+        ({"eyes.titl": 3}, r"scene\.eyes\.titl: did you mean scene\.eyes\.tilt"),
+        ({"object1.grey": 2}, r"scene\.object1\.grey is 2"),
+        ({"eyes.near": 6}, r"scene\.eyes\.near is 6"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_named(scene, words):
+    with pytest.raises(UsageError, match=words):
+        open_scene("icub", build(SceneConfig, "scene", scene))
+
+
+def test_an_unknown_scene_names_the_nearest():
+    with pytest.raises(UsageError, match="did you mean icub"):
+        open_scene("icubb")
+
+
+def test_without_the_simulator_the_remedy_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(CdmisfaError, match=r"pybullet.*Python 3\.11.*pip install"):
+        open_scene("icub")
+    assert open_scene("oscillatory").take(0, 3).frames.shape == (3, 2)
+
+
+def test_the_picture_shows_the_robot_the_table_and_the_objects(tmp_path):
+    from PIL import Image
+
+    path = scene_picture(SceneConfig(), tmp_path / "scene.png")
+    with Image.open(path) as image:
+        assert image.size == SIZE
+        pixels = np.asarray(image).astype(int)
+    red = (pixels[..., 0] > 100) & (pixels[..., 1] < 60)
+    dark = pixels.max(axis=-1) < 45
+    assert red.sum() > 10_000
+    assert np.ptp(np.nonzero(red)[0]) > 300
+    assert dark.sum() > 3_000
+    with pytest.raises(UsageError, match="exists"):
+        scene_picture(SceneConfig(), path)
+    with pytest.raises(UsageError, match=r"\.png"):
+        scene_picture(SceneConfig(), tmp_path / "scene.jpg")

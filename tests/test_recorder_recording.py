@@ -1,0 +1,324 @@
+"""Recordings: the same bytes however they are made, readable by others, safe from any end."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf import RawImage_pb2
+from mcap.reader import make_reader
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.errors import UsageError
+from cdmisfa.streams import OscillatorySource
+from recorder import recording
+from recorder.config import RecordConfig, SceneConfig
+from recorder.logfile import LogWriteError, partial_path
+from recorder.recording import record
+from recorder.rendering import BLOCK, requests
+from recorder.scenes import open_scene
+from recorder.viewlog import METADATA, sha256, whole_frames
+
+ROOT = Path(__file__).parent.parent
+STREAMS = ("x1", "x2", "x3")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def oscillatory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole") / "oscillatory"
+    record("oscillatory", folder, frames=3000)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def icub(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("pybullet")
+    folder = tmp_path_factory.mktemp("whole") / "icub"
+    record("icub", folder, SceneConfig(seed=3), frames=150)
+    return folder
+
+
+def test_every_view_of_every_frame_is_there_and_equals_live(icub):
+    live = open_scene("icub", SceneConfig(seed=3))
+    for stream, view in enumerate(live.spec.streams):
+        live.seek(0)
+        block = live.take(stream, 150)
+        with (icub / f"{view}.mcap").open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            topics = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
+            assert {topic: schema.name for topic, schema in topics.items()} == {
+                f"/view/{view}": "foxglove.RawImage",
+                "/truth": "cdmisfa.GroundTruth",
+                "/head_pose": "foxglove.PoseInFrame",
+            }
+            messages = list(reader.iter_messages(topics=[f"/view/{view}"]))
+            images = [RawImage_pb2.RawImage.FromString(m.data) for _, _, m in messages]
+            pixels = [np.frombuffer(i.data, np.uint8).reshape(i.height, i.width) for i in images]
+            np.testing.assert_array_equal(np.stack(pixels), block.frames)
+            assert [m.log_time for _, _, m in messages] == [
+                live.spec.time_ns(t) for t in range(150)
+            ]
+            assert [m.sequence for _, _, m in messages] == list(range(150))
+            assert len(list(reader.iter_messages(topics=["/head_pose"]))) == 3
+            assert len(list(reader.iter_messages(topics=["/truth"]))) == 150
+    live.close()
+
+
+def test_a_file_says_what_it_is(icub):
+    with (icub / "center.mcap").open("rb") as file:
+        reader = make_reader(file)
+        values = next(m.metadata for m in reader.iter_metadata() if m.name == METADATA)
+        config = json.loads(next(a.data for a in reader.iter_attachments()))
+    expected = {
+        "scene": "icub",
+        "view": "center",
+        "stream_index": "1",
+        "streams": "left,center,right",
+        "frame_shape": "48x128",
+        "dtype": "uint8",
+        "fps": "50.0",
+        "seed": "3",
+    }
+    assert expected.items() <= values.items()
+    assert {"version_pybullet", "version_icub-models", "version_cdmisfa"} <= values.keys()
+    assert config["scene"]["seed"] == 3
+    assert config["record"]["fps"] == 50.0
+
+
+def test_rerun_shows_the_frames_as_images(icub):
+    chunk = pytest.importorskip("rerun.chunk")
+    rows, names = 0, set()
+    for piece in chunk.McapReader(str(icub / "left.mcap")).stream():
+        if piece.entity_path == "/view/left":
+            columns = piece.to_record_batch().schema.names
+            names.update(columns)
+            if "Image:buffer" in columns:
+                rows += piece.num_rows
+    assert rows == 150
+    assert "Image:format" in names
+
+
+@pytest.mark.parametrize("kind", ["icub", "oscillatory"])
+def test_bytes_do_not_depend_on_jobs(kind, request, tmp_path):
+    whole = request.getfixturevalue(kind)
+    seed, frames = (3, 150) if kind == "icub" else (0, 3000)
+    record(kind, tmp_path / "b", SceneConfig(seed=seed), frames=frames, jobs=2)
+    assert contents(tmp_path / "b") == contents(whole)
+
+
+def test_one_view_alone_is_the_same_file(icub, tmp_path):
+    files = record("icub", tmp_path / "b", SceneConfig(seed=3), frames=150, views=["right"])
+    assert [f.name for f in files] == ["right"]
+    assert files[0].sha256 == sha256(icub / "right.mcap")
+    assert files[0].bytes == (icub / "right.mcap").stat().st_size
+    assert os.listdir(tmp_path / "b") == ["right.mcap"]
+
+
+def test_another_seed_gives_other_bytes(icub, tmp_path):
+    record("icub", tmp_path / "b", SceneConfig(seed=4), frames=20, views=["center"])
+    record("icub", tmp_path / "c", SceneConfig(seed=3), frames=20, views=["center"])
+    assert contents(tmp_path / "b") != contents(tmp_path / "c")
+
+
+def test_progress_ends_at_the_number_of_frames(tmp_path):
+    told = []
+    record("oscillatory", tmp_path / "a", frames=150, progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 150
+
+
+def test_requests_cover_every_missing_frame_once_in_time_order():
+    starts = {0: 0, 1: 70, 2: 200}
+    wanted = list(requests(starts, 150))
+    for stream, start in starts.items():
+        mine = [(first, n) for s, first, n in wanted if s == stream]
+        frames = [t for first, n in mine for t in range(first, first + n)]
+        assert frames == list(range(start, 150))
+    assert [first // BLOCK for _, first, _ in wanted] == sorted(f // BLOCK for _, f, _ in wanted)
+
+
+def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    record("oscillatory", folder, frames=10)
+    before = contents(folder)
+    with pytest.raises(UsageError, match=r"a exists.*--force"):
+        record("oscillatory", folder, frames=3000)
+    assert contents(folder) == before
+    (folder / "notes.txt").write_text("mine")
+    record("oscillatory", folder, frames=3000, views=["x2"], force=True)
+    assert sorted(os.listdir(folder)) == ["notes.txt", "x2.mcap"]
+    assert sha256(folder / "x2.mcap") == sha256(oscillatory / "x2.mcap")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"frames": 0}, "--frames is 0"),
+        ({"jobs": 0}, "--jobs is 0"),
+        ({"views": ["left"]}, "no view 'left': the scene has x1, x2, x3"),
+        ({"force": True, "resume": True}, "one of them"),
+    ],
+)
+def test_wrong_arguments_are_named_and_nothing_is_made(tmp_path, options, words):
+    with pytest.raises(UsageError, match=words):
+        record("oscillatory", tmp_path / "a", **({"frames": 10} | options))
+    assert not (tmp_path / "a").exists()
+
+
+RECORD = """
+import sys
+from pathlib import Path
+from recorder.recording import record
+if __name__ == "__main__":
+    record("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]),
+           progress=lambda t: print(int(t), flush=True))
+"""
+
+
+def interrupt(folder: Path, number: int) -> tuple[int, int]:
+    """Record in another process and send it a signal; its exit code and last progress."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", RECORD, str(folder), "1000000"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    for line in process.stdout:
+        if int(line) > 500:
+            break
+    process.send_signal(number)
+    rest, _ = process.communicate(timeout=30)
+    return process.returncode, int(([line, *rest.splitlines()])[-1])
+
+
+def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path):
+    folder = tmp_path / "a"
+    code, told = interrupt(folder, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    for view in STREAMS:
+        assert whole_frames(partial_path(folder / f"{view}.mcap"), view) >= told - 50
+    files = record("oscillatory", folder, frames=3000, resume=True)
+    assert [f.frames for f in files] == [3000] * 3
+    assert contents(folder) == contents(oscillatory)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_everything_that_was_recorded(tmp_path, number):
+    code, told = interrupt(tmp_path / "a", number)
+    assert code == -number or (number == signal.SIGINT and code in (1, 130))
+    for view in STREAMS:
+        assert whole_frames(partial_path(tmp_path / "a" / f"{view}.mcap"), view) >= told
+    assert not list((tmp_path / "a").glob("*.mcap"))
+
+
+def test_resume_goes_on_from_any_torn_byte(oscillatory, tmp_path):
+    sizes = [(oscillatory / f"{view}.mcap").stat().st_size for view in STREAMS]
+    for cut in (0.0, 0.001, 0.37, 0.999):
+        folder = tmp_path / f"{cut}"
+        folder.mkdir()
+        for view, size in zip(STREAMS[:2], sizes, strict=False):
+            data = (oscillatory / f"{view}.mcap").read_bytes()[: int(cut * size)]
+            partial_path(folder / f"{view}.mcap").write_bytes(data)
+        record("oscillatory", folder, frames=3000, resume=True)
+        assert contents(folder) == contents(oscillatory)
+
+
+def test_resume_of_a_finished_recording_can_make_it_longer(oscillatory, tmp_path):
+    record("oscillatory", tmp_path / "a", frames=130)
+    record("oscillatory", tmp_path / "a", frames=3000, resume=True)
+    assert contents(tmp_path / "a") == contents(oscillatory)
+
+
+def test_resume_of_something_else_is_refused_and_changes_nothing(tmp_path):
+    folder = tmp_path / "a"
+    record("oscillatory", folder, frames=130)
+    before = contents(folder)
+    with pytest.raises(UsageError, match=r"x1\.mcap cannot be continued: its fps is '50\.0'"):
+        record("oscillatory", folder, None, RecordConfig(fps=25), frames=200, resume=True)
+    assert contents(folder) == before
+
+
+def test_resume_never_removes_a_file_it_did_not_write(tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    (folder / "x2.mcap").write_bytes(b"precious")
+    with pytest.raises(UsageError, match=r"x2\.mcap holds no frames of x2"):
+        record("oscillatory", folder, frames=10, resume=True)
+    assert (folder / "x2.mcap").read_bytes() == b"precious"
+
+
+class Breaking(OscillatorySource):
+    """A source that fails at frame 640."""
+
+    def take(self, stream, n):
+        if self.t >= 640:
+            raise OSError(errno.EIO, "the camera is gone")
+        return super().take(stream, n)
+
+
+def test_an_exception_leaves_readable_partials(tmp_path, monkeypatch):
+    def broken(*_: object) -> FrameSource:
+        return Breaking()
+
+    monkeypatch.setattr(recording, "open_scene", broken)
+    with pytest.raises(OSError, match="camera"):
+        record("oscillatory", tmp_path / "a", frames=1000)
+    for view in STREAMS:
+        assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) == 640
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogWriteError, match="file/a cannot be used"):
+        record("oscillatory", tmp_path / "file" / "a", frames=10)
+
+
+def test_rendering_processes_end_with_their_killed_parent(tmp_path):
+    code = RECORD.replace("frames=int", "jobs=2, frames=int")
+    script = tmp_path / "run.py"
+    script.write_text(code)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path / "a"), "1000000"],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    process.stdout.readline()
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    children = [int(word) for word in listed.read_text().split()]
+    assert len(children) >= 2
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 20
+    while any(running(child) for child in children) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(running(child) for child in children)
+
+
+def running(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_the_sample_logs_are_what_their_card_says():
+    folder = ROOT / "sample_logs"
+    card = (folder / "README.md").read_text()
+    logs = sorted(folder.glob("*/*.mcap"))
+    assert len(logs) == 6
+    assert sum(log.stat().st_size for log in logs) < 3_000_000
+    for log in logs:
+        name = log.relative_to(folder).as_posix()
+        assert f"| `{name}` | {log.stat().st_size:,} | `{sha256(log)}` |" in card
+    assert "CC BY-SA 4.0" in card
