@@ -166,6 +166,15 @@ class TestRuns:
         assert (differs.code, differs.json["identical"]) == (4, False)
         assert differs.json["first_difference"]["iteration"] == 0
 
+    def test_a_stopped_run_goes_on_as_if_it_never_stopped(
+        self, cdmisfa: Cdmisfa, tmp_path: Path
+    ) -> None:
+        words = ("learn", "oscillatory", "--no-rerun", "--json", "-o", tmp_path / "run")
+        assert cdmisfa(*words, "--max-iterations", 7).code == 0
+        resumed = cdmisfa(*words, "--max-iterations", 15, "--resume").json
+        whole = cdmisfa("learn", "oscillatory", "--max-iterations", 15, "--json").json
+        assert resumed["signals_sha256"] == whole["signals_sha256"]
+
     def test_end_of_a_recording_is_an_error_that_keeps_the_run(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
     ) -> None:
@@ -203,6 +212,7 @@ class TestErrors:
             (["learn"], 2, ["SOURCE", "cdmisfa learn --help"]),
             (["learn", "oscillatory", "--sead", "1"], 2, ["--seed"]),
             (["learn", "oscillatory", "--seed", "x"], 2, ["--seed"]),
+            (["learn", "oscillatory", "--resume"], 2, ["-o"]),
             (["learnn"], 2, ["did you mean learn?"]),
             (["view", "x", "--web", "--save", "y.rrd"], 2, ["--save"]),
             (["view", "x", "--at", "3"], 2, ["--screenshot"]),

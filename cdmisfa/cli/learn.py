@@ -32,6 +32,7 @@ TICK = 0.1
     help="End after so many modules; by default as many as there are streams.",
 )
 @click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@click.option("--resume", is_flag=True, help="Go on with the run in -o where it was stopped.")
 @click.option("--salvage", is_flag=True, help="Go on over damaged parts of a recording.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 @options.force
@@ -47,6 +48,7 @@ def learn_command(
     max_iterations: int | None,
     max_modules: int | None,
     loop: bool,
+    resume: bool,
     salvage: bool,
     no_rerun: bool,
     force: bool,
@@ -57,6 +59,10 @@ def learn_command(
     SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
     files of its views. The same seed gives the same signals, bit for bit, from each.
     """
+    if resume and out is None:
+        raise click.UsageError("--resume needs -o RUN, the run to go on with")
+    if resume and force:
+        raise click.UsageError("--force starts anew and --resume goes on: use one of them")
     from cdmisfa.experiments.run import learn
     from cdmisfa.experiments.sources import open_source
 
@@ -79,6 +85,7 @@ def learn_command(
                 rerun=not no_rerun,
                 progress=Reporter(shown),
                 stop=stop,
+                resume=resume,
             )
     finally:
         frames.close()
