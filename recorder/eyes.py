@@ -88,7 +88,7 @@ def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> 
 
 
 def grey(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Colours, (h, w, 3 or 4), as grey, (h, w): BT.601, rounded."""
+    """Colours, (..., 3 or 4), as grey, (...): BT.601, rounded."""
     red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
     mixed = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
     return ((mixed + 500) // 1000).astype(np.uint8)
@@ -114,7 +114,7 @@ class Eyes:
             [eye_matrix(eyes, world.neck, yaw, side) for side in (1, -1)] for yaw in eyes.yaw
         ]
         with world.only(table=True):
-            self._background = [[self._draw(m) for m in view] for view in self._matrices]
+            self._background = [[self._plate(m) for m in view] for view in self._matrices]
         world.hide_table()
 
     @property
@@ -126,20 +126,22 @@ class Eyes:
         """Write what a view shows now into `out`, (height, width of both eyes)."""
         width = self._eyes.width
         for eye, matrix in enumerate(self._matrices[view]):
-            image, depth = self._draw(matrix)
+            colours, depth = self._draw(matrix)
             table, table_depth = self._background[view][eye]
-            np.copyto(
-                out[:, eye * width : (eye + 1) * width],
-                np.where(depth < table_depth, image, table),
-            )
+            half = out[:, eye * width : (eye + 1) * width]
+            half[...] = table
+            seen = np.nonzero(depth < table_depth)
+            half[seen] = grey(colours[seen])
 
     def poses(self) -> Sequence[HeadPose]:
         """The head's pose in each view."""
         return [head_pose(self._world.neck, yaw) for yaw in self._eyes.yaw]
 
+    def _plate(self, matrix: Matrix) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """The grey picture and the depth of the world as it is, to be drawn over."""
+        colours, depth = self._draw(matrix)
+        return grey(colours), depth.copy()
+
     def _draw(self, matrix: Matrix) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         eyes = self._eyes
-        colours, depth = self._world.render(
-            matrix, self._projection, eyes.width, eyes.height, eyes.light
-        )
-        return grey(colours), depth.copy()
+        return self._world.render(matrix, self._projection, eyes.width, eyes.height, eyes.light)
