@@ -1,8 +1,8 @@
 """What every `FrameSource` promises, as tests: import `SourceContract` and say what to open.
 
-    class TestOscillatory(SourceContract):
-        def open(self) -> FrameSource:
-            return OscillatorySource()
+class TestOscillatory(SourceContract):
+def open(self) -> FrameSource:
+return OscillatorySource()
 """
 
 from __future__ import annotations

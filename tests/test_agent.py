@@ -22,7 +22,6 @@ from cdmisfa.agent import (
     recent_variance,
     rules,
     think,
-    track_output,
 )
 from cdmisfa.config import LearnerConfig
 from cdmisfa.gate import CONSTANT, NOVEL

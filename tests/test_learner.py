@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -331,7 +332,7 @@ def test_a_switch_of_stream_is_a_gap() -> None:
     for _ in range(30):
         streams.append(learner.stream)
         told += gaps_seen(learner, [source.take(learner.stream, 100)])
-    assert told == [True] + [a != b for a, b in zip(streams, streams[1:], strict=False)]
+    assert told == [True] + [a != b for a, b in itertools.pairwise(streams)]
     assert set(told) == {True, False}
 
 

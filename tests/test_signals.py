@@ -51,7 +51,7 @@ def example(seed: int = 0) -> BlockSignals:
 
 def test_changing_the_fields_means_raising_the_version() -> None:
     now = " ".join(f"{s.name}:{s.dtype}:{s.dims}" for s in signal_table())
-    assert SCHEMA_VERSION == max(GOLDEN), "add the new version's fields to GOLDEN"
+    assert max(GOLDEN) == SCHEMA_VERSION, "add the new version's fields to GOLDEN"
     assert now == GOLDEN[SCHEMA_VERSION], "the fields changed: raise SCHEMA_VERSION, extend GOLDEN"
 
 

@@ -22,7 +22,7 @@ from cdmisfa.agent import think
 from cdmisfa.blocks import FrameSource
 from cdmisfa.compiled import needs_compiling
 from cdmisfa.config import LearnerConfig, as_table
-from cdmisfa.errors import LogExhaustedError, UsageError
+from cdmisfa.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.checkpoint import (
     SET_ASIDE,
     Checkpoint,
@@ -247,12 +247,16 @@ def _run_log(
         set_aside(out, source.spec, manifest)
     elif out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
-    out.mkdir(parents=True, exist_ok=True)
     stale = [out / name for name in ("run.json", "modules.npz", "run.rrd")]
     if not resume:
         stale += [out / "run.mcap", out / SET_ASIDE, *checkpoints(out)]
-    for path in stale:
-        path.unlink(missing_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for path in stale:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"{out} cannot be a run's folder ({reason}): choose another") from error
     log = RunWriter(out / "run.mcap", source.spec, manifest, force=force or resume)
     try:
         yield log
@@ -337,11 +341,18 @@ def versions() -> dict[str, str]:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document so that the file is never seen half written."""
+    """Write a JSON document so that the file is never seen half written.
+
+    Raises:
+        CdmisfaError: the file cannot be written.
+    """
+    text = json.dumps(document, indent=2) + "\n"
     partial = path.with_name(path.name + ".partial")
-    with open(partial, "w", encoding="utf-8") as file:
-        json.dump(document, file, indent=2)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+    try:
+        with open(partial, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except OSError as error:
+        raise CdmisfaError(f"{path} cannot be written: {error.strerror or error}") from error
