@@ -179,7 +179,7 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
     coming = Group(np.zeros((GROUP, size)), np.zeros((GROUP, GROUP)), np.zeros((K, GROUP)))
     steps = Steps(np.ones(K), np.zeros((K, GROUP)), np.zeros((K, GROUP)))
     now = Features(np.empty(K), np.empty((J, K)))
-    tile, row = np.zeros(2 * GROUP * TILE), np.empty(size)
+    tile, row = np.zeros(GROUP * TILE), np.empty(TILE)
     if state.counts[2] == 0 or state.counts[2] >= REFRESH:
         refresh_gram(state.v, state.gram)
         state.counts[2] = 0
@@ -194,7 +194,7 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
         start += count
         following = group_length(n_frames - start, state.counts[1] == 1, gap and start == 0)
         apply_group(
-            state.v, state.mean, group.u, steps.shrink, steps.gain, steps.take, tile,
+            state.v, state.mean, group.u, count, steps.shrink, steps.gain, steps.take, tile,
             frames, start, following, state.counts[0], params.mean_window,
             coming.u, coming.g, coming.e,
         )  # fmt: skip

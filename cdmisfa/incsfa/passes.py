@@ -17,7 +17,7 @@ GROUP = 4
 """Frames applied in one pass."""
 
 TILE = 256
-"""Columns of a tile: the residuals of a group and the next group are 16 KB, inside L1."""
+"""Columns of a tile: the residuals of a group and the next group are 16 KB, half of L1."""
 
 _reordered = njit(cache=True, fastmath={"reassoc", "contract"})
 
@@ -82,22 +82,19 @@ def gram_tile(u: Float, start: int, g: Float) -> None:
 
 
 @_reordered
-def apply_tile(
-    v: Float, start: int, tile: Float, shrink: Float, gain: Float, take: Float, e: Float
-) -> None:
-    """Apply a group to all vectors in a tile and take their products with the next group.
+def apply_tile(v: Float, start: int, r: Float, shrink: Float, gain: Float, take: Float) -> None:
+    """Apply a group's steps to all vectors in a tile of columns.
 
     v_j <- v_j + gain_tj r_t; r_t <- r_t - take_tj v_j for each frame t; at last
-    v_j <- shrink_j v_j.
+    v_j <- shrink_j v_j. Two vectors at a time, so that each residual is loaded half as often.
 
     Args:
         v: (K, I) CCIPCA vectors, in place.
         start: first column.
-        tile: (2 * GROUP * TILE,) flat: the residuals, then the next frames.
+        r: (GROUP * TILE,) the group's frames in the tile, flat; overwritten.
         shrink: (K,).
         gain: (K, GROUP).
         take: (K, GROUP).
-        e: (K, GROUP) products with the next frames, added to.
     """
     K, size = v.shape
     width = min(TILE, size - start)
@@ -108,73 +105,80 @@ def apply_tile(
         cb0, cb1, cb2, cb3 = gain[j + 1, 0], gain[j + 1, 1], gain[j + 1, 2], gain[j + 1, 3]
         ga0, ga1, ga2, ga3 = take[j, 0], take[j, 1], take[j, 2], take[j, 3]
         gb0, gb1, gb2, gb3 = take[j + 1, 0], take[j + 1, 1], take[j + 1, 2], take[j + 1, 3]
+        for i in range(width):
+            x, y = va[i], vb[i]
+            rest = r[i]
+            x += ca0 * rest
+            rest -= ga0 * x
+            y += cb0 * rest
+            r[i] = rest - gb0 * y
+            rest = r[TILE + i]
+            x += ca1 * rest
+            rest -= ga1 * x
+            y += cb1 * rest
+            r[TILE + i] = rest - gb1 * y
+            rest = r[2 * TILE + i]
+            x += ca2 * rest
+            rest -= ga2 * x
+            y += cb2 * rest
+            r[2 * TILE + i] = rest - gb2 * y
+            rest = r[3 * TILE + i]
+            x += ca3 * rest
+            rest -= ga3 * x
+            y += cb3 * rest
+            r[3 * TILE + i] = rest - gb3 * y
+            va[i] = x * pa
+            vb[i] = y * pb
+    if K % 2 == 1:
+        j = K - 1
+        va, pa = v[j, start : start + width], shrink[j]
+        ca0, ca1, ca2, ca3 = gain[j, 0], gain[j, 1], gain[j, 2], gain[j, 3]
+        for i in range(width):
+            x = va[i] + ca0 * r[i] + ca1 * r[TILE + i]
+            x += ca2 * r[2 * TILE + i] + ca3 * r[3 * TILE + i]
+            va[i] = x * pa
+
+
+@_reordered
+def measure_tile(v: Float, start: int, u: Float, e: Float) -> None:
+    """Add a tile's share of the inner products of all vectors with a group's frames.
+
+    Args:
+        v: (K, I) CCIPCA vectors.
+        start: first column.
+        u: (GROUP, I) centred frames.
+        e: (K, GROUP), in place.
+    """
+    K, size = v.shape
+    width = min(TILE, size - start)
+    u0, u1 = u[0, start : start + width], u[1, start : start + width]
+    u2, u3 = u[2, start : start + width], u[3, start : start + width]
+    for j in range(0, K, 2):
+        # An odd last vector is measured together with the one before, and counted once.
+        a = min(j, max(K - 2, 0))
+        b = min(a + 1, K - 1)
+        va, vb = v[a, start : start + width], v[b, start : start + width]
         ea0 = ea1 = ea2 = ea3 = eb0 = eb1 = eb2 = eb3 = 0.0
         for i in range(width):
             x, y = va[i], vb[i]
-            r = tile[i]
-            x += ca0 * r
-            r -= ga0 * x
-            y += cb0 * r
-            tile[i] = r - gb0 * y
-            r = tile[TILE + i]
-            x += ca1 * r
-            r -= ga1 * x
-            y += cb1 * r
-            tile[TILE + i] = r - gb1 * y
-            r = tile[2 * TILE + i]
-            x += ca2 * r
-            r -= ga2 * x
-            y += cb2 * r
-            tile[2 * TILE + i] = r - gb2 * y
-            r = tile[3 * TILE + i]
-            x += ca3 * r
-            r -= ga3 * x
-            y += cb3 * r
-            tile[3 * TILE + i] = r - gb3 * y
-            x *= pa
-            y *= pb
-            va[i] = x
-            vb[i] = y
-            u = tile[4 * TILE + i]
-            ea0 += x * u
-            eb0 += y * u
-            u = tile[5 * TILE + i]
-            ea1 += x * u
-            eb1 += y * u
-            u = tile[6 * TILE + i]
-            ea2 += x * u
-            eb2 += y * u
-            u = tile[7 * TILE + i]
-            ea3 += x * u
-            eb3 += y * u
-        e[j, 0] += ea0
-        e[j, 1] += ea1
-        e[j, 2] += ea2
-        e[j, 3] += ea3
-        e[j + 1, 0] += eb0
-        e[j + 1, 1] += eb1
-        e[j + 1, 2] += eb2
-        e[j + 1, 3] += eb3
-    if K % 2 == 1:
-        j = K - 1
-        va = v[j, start : start + width]
-        pa = shrink[j]
-        ca0, ca1, ca2, ca3 = gain[j, 0], gain[j, 1], gain[j, 2], gain[j, 3]
-        ea0 = ea1 = ea2 = ea3 = 0.0
-        for i in range(width):
-            x = va[i]
-            x += ca0 * tile[i] + ca1 * tile[TILE + i]
-            x += ca2 * tile[2 * TILE + i] + ca3 * tile[3 * TILE + i]
-            x *= pa
-            va[i] = x
-            ea0 += x * tile[4 * TILE + i]
-            ea1 += x * tile[5 * TILE + i]
-            ea2 += x * tile[6 * TILE + i]
-            ea3 += x * tile[7 * TILE + i]
-        e[j, 0] += ea0
-        e[j, 1] += ea1
-        e[j, 2] += ea2
-        e[j, 3] += ea3
+            ea0 += x * u0[i]
+            eb0 += y * u0[i]
+            ea1 += x * u1[i]
+            eb1 += y * u1[i]
+            ea2 += x * u2[i]
+            eb2 += y * u2[i]
+            ea3 += x * u3[i]
+            eb3 += y * u3[i]
+        if a == j:
+            e[a, 0] += ea0
+            e[a, 1] += ea1
+            e[a, 2] += ea2
+            e[a, 3] += ea3
+        if b > j or a < j:
+            e[b, 0] += eb0
+            e[b, 1] += eb1
+            e[b, 2] += eb2
+            e[b, 3] += eb3
 
 
 @_reordered
@@ -182,6 +186,7 @@ def apply_group(
     v: Float,
     mean: Float,
     u: Float,
+    applied: int,
     shrink: Float,
     gain: Float,
     take: Float,
@@ -201,10 +206,11 @@ def apply_group(
         v: (K, I) CCIPCA vectors, in place.
         mean: (I,) running mean, in place.
         u: (GROUP, I) the group's centred frames.
+        applied: how many frames it has; with 0 the vectors stay.
         shrink: (K,) its steps, as the next two; see `apply_tile`.
         gain: (K, GROUP).
         take: (K, GROUP).
-        tile: (2 * GROUP * TILE,) scratch.
+        tile: (GROUP * TILE,) scratch.
         frames: (n, I) values or pixels.
         first: index of the next group's first frame.
         count: frames of the next group, 0 if there is none.
@@ -219,9 +225,11 @@ def apply_group(
     e_next[:] = 0.0
     for start in range(0, size, TILE):
         width = min(TILE, size - start)
-        centre_tile(frames, first, count, start, mean, n, window, u_next)
-        gram_tile(u_next, start, g_next)
-        for s in range(GROUP):
-            tile[s * TILE : s * TILE + width] = u[s, start : start + width]
-            tile[(GROUP + s) * TILE : (GROUP + s) * TILE + width] = u_next[s, start : start + width]
-        apply_tile(v, start, tile, shrink, gain, take, e_next)
+        if applied > 0:
+            for s in range(GROUP):
+                tile[s * TILE : s * TILE + width] = u[s, start : start + width]
+            apply_tile(v, start, tile, shrink, gain, take)
+        if count > 0:
+            centre_tile(frames, first, count, start, mean, n, window, u_next)
+            gram_tile(u_next, start, g_next)
+            measure_tile(v, start, u_next, e_next)

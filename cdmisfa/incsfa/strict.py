@@ -22,6 +22,9 @@ from cdmisfa.incsfa.state import (
     whitening_scale,
 )
 
+TILE = 256
+"""Columns of phi computed at a time, so that they stay in L1."""
+
 
 @compiled
 def centre(frame: NDArray, scale: float, mean: Float, n: int, window: float, u: Float) -> None:  # type: ignore[type-arg]
@@ -102,19 +105,30 @@ def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> f
         scale: (K,) whitening scales.
         v: (K, I) CCIPCA vectors.
         phi: (J, I) weights, in place.
-        row: (I,) scratch.
+        row: (width,) scratch: how many columns are done at a time.
     """
     xi = 0.0
-    for j in range(w.shape[0]):
-        row[:] = 0.0
-        for k in range(w.shape[1]):
-            factor = w[j, k] * scale[k]
-            for i in range(row.shape[0]):
-                row[i] += factor * v[k, i]
-        for i in range(row.shape[0]):
-            change = row[i] - phi[j, i]
-            xi += change * change
-            phi[j, i] = row[i]
+    K, size = v.shape
+    for start in range(0, size, row.shape[0]):
+        width = min(row.shape[0], size - start)
+        for j in range(w.shape[0]):
+            row[:] = 0.0
+            for k in range(0, K - 3, 4):
+                f0, f1 = w[j, k] * scale[k], w[j, k + 1] * scale[k + 1]
+                f2, f3 = w[j, k + 2] * scale[k + 2], w[j, k + 3] * scale[k + 3]
+                v0, v1 = v[k, start : start + width], v[k + 1, start : start + width]
+                v2, v3 = v[k + 2, start : start + width], v[k + 3, start : start + width]
+                for i in range(width):
+                    row[i] += (f0 * v0[i] + f1 * v1[i]) + (f2 * v2[i] + f3 * v3[i])
+            for k in range(K - K % 4, K):
+                f0, v0 = w[j, k] * scale[k], v[k, start : start + width]
+                for i in range(width):
+                    row[i] += f0 * v0[i]
+            old = phi[j, start : start + width]
+            for i in range(width):
+                change = row[i] - old[i]
+                xi += change * change
+                old[i] = row[i]
     return float(np.sqrt(xi))
 
 
@@ -134,7 +148,7 @@ def update(state: State, params: Params, frames: NDArray, gap: bool, xi: Float) 
     n_frames, D = frames.shape
     K = state.d.shape[0]
     pixel = PIXEL if frames.itemsize == 1 else 1.0
-    u, r, row = np.empty(D), np.empty(D), np.empty(D)
+    u, r, row = np.empty(D), np.empty(D), np.empty(min(D, TILE))
     z, z_dot, scale, step = np.empty(K), np.empty(K), np.empty(K), np.empty(K)
     for t in range(n_frames):
         state.counts[0] += 1
