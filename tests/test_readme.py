@@ -29,6 +29,7 @@ def commands() -> list[list[str]]:
 @pytest.fixture
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "sample_logs").symlink_to(ROOT / "sample_logs")
     return tmp_path
 
 
@@ -45,7 +46,13 @@ def test_every_command_works(cdmisfa: Cdmisfa, elsewhere: Path) -> None:
         assert program == "cdmisfa"
         done = cdmisfa(*args)
         assert done.code == 0, f"cdmisfa {shlex.join(args)}: {done.err}"
-    for made in ("live.rrd", "signals.parquet", "left-again.mcap", "runs/icub/run.rrd"):
+    for made in (
+        "live.rrd",
+        "signals.parquet",
+        "left-again.mcap",
+        "scene.png",
+        "runs/icub/run.rrd",
+    ):
         assert (elsewhere / made).stat().st_size > 0
     assert list((elsewhere / "figures").glob("*.png"))
 

@@ -22,7 +22,7 @@ SCENE = "icub"
 MODULES = 2
 """Views whose object has something slow about it: the one in the centre is pure noise."""
 
-CHECKED_ITERATIONS = 50
+CHECKED_ITERATIONS = 200
 """Length of the stretch on which live and recorded signals are compared."""
 
 SCORED_FRAMES = 4000
