@@ -68,7 +68,8 @@ def render_in_processes(
     )
     try:
         for request in wanted:
-            pending.append(pool.submit(_render, request))
+            with _interrupts_held():
+                pending.append(pool.submit(_render, request))
             if len(pending) > _AHEAD * jobs:
                 yield pending.popleft().result()
         while pending:
@@ -81,10 +82,23 @@ def render_in_processes(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Deliver Ctrl-C afterwards, and never to processes started meanwhile.
+
+    They inherit the mask. A terminal sends Ctrl-C to all of them, but only the writer may
+    decide when to end.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _start(kind: str, scene: SceneConfig, record: RecordConfig) -> None:
-    """Open a world in a rendering process, whose end is decided by its parent alone."""
+    """Open a world in a rendering process, which ends with its parent."""
     global _source
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _source = open_scene(kind, scene, record)
 
