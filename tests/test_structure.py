@@ -15,6 +15,7 @@ from conftest import Cdmisfa
 from cdmisfa.cli.app import COMMANDS, cli
 
 ROOT = Path(__file__).parents[1]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PACKAGES = ("cdmisfa", "recorder", "replay")
 HEAVY = ("numpy", "numba", "rerun", "pybullet", "matplotlib", "pyarrow", "mcap", "rich")
 
@@ -33,14 +34,24 @@ def test_imports_run_one_way() -> None:
     assert done.returncode == 0, done.stdout
 
 
+def test_no_module_of_the_mind_escapes_the_rules() -> None:
+    contracts = PYPROJECT["tool"]["importlinter"]["contracts"]
+    ruled = next(c["source_modules"] for c in contracts if c["name"].startswith("The mind"))
+    found = {
+        f"cdmisfa.{path.stem}"
+        for path in (ROOT / "cdmisfa").iterdir()
+        if (path.suffix == ".py" or (path / "__init__.py").exists()) and path.stem[0] != "_"
+    }
+    assert found - {"cdmisfa.cli", "cdmisfa.experiments"} == set(ruled)
+
+
 def test_every_package_is_listed() -> None:
-    document = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     found = {
         ".".join(file.parent.relative_to(ROOT).parts)
         for name in PACKAGES
         for file in (ROOT / name).rglob("__init__.py")
     }
-    assert set(document["tool"]["setuptools"]["packages"]) == found
+    assert set(PYPROJECT["tool"]["setuptools"]["packages"]) == found
 
 
 @pytest.mark.parametrize("package", PACKAGES)
