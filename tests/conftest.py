@@ -8,7 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import pytest
+
+# Compiling takes longer than any deadline, and a test run says the same thing every time.
+hypothesis.settings.register_profile("cdmisfa", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("cdmisfa")
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def test_nested_mistakes_name_the_whole_key(layer: dict[str, Any], message: str)
         st.builds(
             Inner,
             st.tuples(st.integers(0, 99), st.integers(0, 99)),
-            st.lists(st.text(), max_size=3).map(tuple),
+            st.lists(st.text(max_size=5), max_size=3).map(tuple),
         ),
         st.booleans(),
         st.none() | st.integers(0, 2**63 - 1),
