@@ -121,10 +121,13 @@ def record(
         )
         _prepare(folder, source.spec, force=force)
         with _stoppable() as stopped, ExitStack() as open_logs:
+            poses = _poses(source)
+            earlier = {v: _to_continue(folder, v, identity) for v in names} if resume else {}
             logs = []
             for name in names:
-                pose = _poses(source).get(name)
-                log = _open_log(folder, name, identity, settings, pose, frames, force, resume)
+                log = _open_log(
+                    folder, name, identity, settings, poses.get(name), frames, earlier.get(name)
+                )
                 open_logs.callback(log.abandon)
                 logs.append(log)
             by_stream = {log.stream: log for log in logs}
@@ -181,6 +184,25 @@ def _prepare(folder: Path, spec: SourceSpec, *, force: bool) -> None:
         raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
 
 
+def _to_continue(folder: Path, view: str, identity: Identity) -> tuple[Path, int] | None:
+    """The earlier log of a view that holds the most frames, and how many.
+
+    Raises:
+        UsageError: it is a recording of something else.
+    """
+    path = folder / f"{view}.mcap"
+    earlier = {p: whole_frames(p, view) for p in earlier_logs(path)}
+    best = max(earlier, key=lambda p: earlier[p], default=None)
+    if best is None or not earlier[best]:
+        if path in earlier:
+            raise UsageError(f"{path} holds no frames of {view}: overwrite with --force")
+        for torn in earlier:
+            torn.unlink()
+        return None
+    check_identity(best, identity.metadata(view))
+    return best, earlier[best]
+
+
 def _open_log(
     folder: Path,
     view: str,
@@ -188,23 +210,19 @@ def _open_log(
     settings: RecordConfig,
     pose: HeadPose | None,
     frames: int,
-    force: bool,
-    resume: bool,
+    earlier: tuple[Path, int] | None,
 ) -> ViewLog:
-    path = folder / f"{view}.mcap"
-    earlier = {p: whole_frames(p, view) for p in earlier_logs(path)} if resume else {}
-    best = max(earlier, key=lambda p: earlier[p], default=None)
-    if best is None or not earlier[best]:
-        if path in earlier:
-            raise UsageError(f"{path} holds no frames of {view}: overwrite with --force")
-        for torn in earlier:
-            torn.unlink()
-        return ViewLog(folder, view, identity, settings, pose=pose, force=force)
-    check_identity(best, identity.metadata(view))
-    kept = keep(path, best)
+    """A view's log, with the first frames taken over from an earlier one."""
+    if earlier is None:
+        return ViewLog(folder, view, identity, settings, pose=pose)
+    path, held = folder / f"{view}.mcap", min(earlier[1], frames)
+    try:
+        kept = keep(path, earlier[0])
+    except OSError as error:
+        raise LogWriteError(f"{path} cannot be continued: {error.strerror}") from error
     log = ViewLog(folder, view, identity, settings, pose=pose)
     try:
-        log.copy(kept, min(earlier[best], frames))
+        log.copy(kept, held)
     except BaseException:
         log.abandon()
         raise

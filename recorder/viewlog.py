@@ -98,7 +98,6 @@ class ViewLog:
         identity: what is recorded.
         settings: how it is written.
         pose: of the head in this view, where there is a head; written once a second.
-        force: whether an existing file may be overwritten.
 
     Attributes:
         view: name of the view.
@@ -114,7 +113,6 @@ class ViewLog:
         settings: RecordConfig,
         *,
         pose: HeadPose | None = None,
-        force: bool = False,
     ) -> None:
         spec = identity.spec
         self.view = view
@@ -132,7 +130,6 @@ class ViewLog:
         self._head = PoseEncoder(ROOT_FRAME)
         self._log = LogFile(
             folder / f"{view}.mcap",
-            force=force,
             library=f"cdmisfa {_version('cdmisfa')}",
             compression=settings.compression,
             chunk_size=settings.chunk_size,
@@ -253,7 +250,11 @@ def sha256(path: Path) -> str:
 
 
 def keep(path: Path, source: Path) -> Path:
-    """Move an earlier log aside, and remove the poorer ones."""
+    """Move an earlier log aside, and remove the poorer ones.
+
+    Returns:
+        Where it is now.
+    """
     kept = kept_path(path)
     if source != kept:
         os.replace(source, kept)

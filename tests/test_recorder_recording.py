@@ -242,8 +242,9 @@ def test_resume_of_a_finished_recording_can_make_it_longer(oscillatory, tmp_path
 def test_resume_of_something_else_is_refused_and_changes_nothing(tmp_path):
     folder = tmp_path / "a"
     record("oscillatory", folder, frames=130)
+    (folder / "x1.mcap").unlink()
     before = contents(folder)
-    with pytest.raises(UsageError, match=r"x1\.mcap cannot be continued: its fps is '50\.0'"):
+    with pytest.raises(UsageError, match=r"x2\.mcap cannot be continued: its fps is '50\.0'"):
         record("oscillatory", folder, None, RecordConfig(fps=25), frames=200, resume=True)
     assert contents(folder) == before
 
@@ -281,6 +282,29 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LogWriteError, match="file/a cannot be used"):
         record("oscillatory", tmp_path / "file" / "a", frames=10)
+
+
+@pytest.mark.parametrize("wait_for_frames", [False, True])
+def test_ctrl_c_reaches_the_writer_alone(tmp_path, wait_for_frames):
+    """A terminal sends Ctrl-C to every process of the group, whatever it is doing."""
+    script = tmp_path / "run.py"
+    script.write_text(RECORD.replace("frames=int", "jobs=2, frames=int"))
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path / "a"), "1000000"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    if wait_for_frames:
+        process.stdout.readline()
+    else:
+        while process.poll() is None and not list(tmp_path.glob("a/*.partial")):
+            time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, complaint = process.communicate(timeout=30)
+    assert process.returncode in (1, 130, -signal.SIGINT)
+    assert complaint.count("Traceback") <= 2
+    assert "spawn_main" not in complaint
+    assert len(list((tmp_path / "a").glob("*.partial"))) == 3
 
 
 def test_rendering_processes_end_with_their_killed_parent(tmp_path):
