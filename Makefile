@@ -6,7 +6,7 @@ INSTALLED := .venv/.installed
 .PHONY: demo test lint bench clean install
 
 demo: $(INSTALLED)
-	$(BIN)/cdmisfa demo
+	$(BIN)/cdmisfa demo --jobs 2
 
 test: lint
 	$(BIN)/pytest -n 2
@@ -22,6 +22,7 @@ bench: $(INSTALLED)
 install: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml
+	@echo "installing cdmisfa and what it needs into .venv, once (a minute or two)"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	touch $@
