@@ -311,7 +311,7 @@ class Structure:
                 return self._cut(f"from byte {self._at} on there are only zeros", limit)
             raise MalformedRecord("no record (opcode 0)")
         if end > limit:
-            if opcode == Opcode.CHUNK:
+            if opcode == Opcode.CHUNK and self._limit is None:
                 self._cut_chunk(content, length, limit)
             return self._cut(
                 f"the file ends within a record at byte {self._at}, {limit - self._at} bytes of it "

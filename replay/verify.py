@@ -50,6 +50,10 @@ def _check_file(path: Path, problems: list[dict[str, str]]) -> tuple[Crc, str]:
             found = survey(reader)
             for number in found.keys() - reader.channels.keys():
                 _note(problems, path, f"holds messages of channel {number}, never defined")
+            there = sum(channel.messages for channel in found.values())
+            if reader.statistics and not reader.problems and reader.statistics.messages != there:
+                stated = reader.statistics.messages
+                _note(problems, path, f"its summary states {stated} messages, there are {there}")
             for problem in reader.problems:
                 _note(problems, path, problem.what, problem.where)
             if reader.missing:

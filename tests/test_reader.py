@@ -1,0 +1,164 @@
+"""LogReader reads every valid MCAP file, in order, with bounded memory."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import mcap_files as files
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from cdmisfa.errors import LogDamagedError
+from replay.reader import LogReader
+
+
+def written(
+    times: list[int], *, compression: CompressionType = CompressionType.ZSTD, **options: object
+) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=compression, chunk_size=300, **options)  # type: ignore[arg-type]
+    writer.start()
+    schema = writer.register_schema("name", "encoding", b"data")
+    channels = [writer.register_channel(topic, "raw", schema) for topic in ("/a", "/b")]
+    for i, time in enumerate(times):
+        writer.add_message(channels[i % 2], time, bytes([i % 256]) * 40, max(time - 7, 0), i)
+    writer.finish()
+    return stream.getvalue()
+
+
+def read(path: Path, **options: object) -> list[tuple[str, int, int, int, bytes]]:
+    with LogReader(path) as reader:
+        found = [
+            (m.channel.topic, m.sequence, m.log_time, m.publish_time, m.data)
+            for m in reader.messages(**options)  # type: ignore[arg-type]
+        ]
+        assert reader.complete
+        assert not reader.missing
+        assert not reader.problems
+        return found
+
+
+@pytest.mark.parametrize("kind", files.KINDS)
+@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
+def test_every_variant_of_the_format_is_read(tmp_path: Path, kind: str, compression: str) -> None:
+    path = tmp_path / "variant.mcap"
+    for number, (of_kind, features) in enumerate(files.variants()):
+        if of_kind != kind:
+            continue
+        path.write_bytes(files.variant(kind, features, compression, crc=bool(number % 2)))
+        expected = [("example", *m) for m in files.messages_of(kind)]
+        assert read(path) == expected, sorted(features)
+        with LogReader(path) as reader:
+            assert len(reader.channels) == bool(expected)
+            attached = [(a.name, reader.attachment_data(a)) for a in reader.attachments]
+            assert attached == [("myFile", b"\1\2\3")] * (kind == "attachment")
+            assert [m.values for m in reader.metadata] == [{"foo": "bar"}] * (kind == "metadata")
+
+
+def test_the_generator_makes_what_others_can_read() -> None:
+    for kind, features in files.variants():
+        raw = files.variant(kind, features, "zstd")
+        found = NonSeekingReader(io.BytesIO(raw), validate_crcs=True).iter_messages()
+        assert [m.data for _, _, m in found] == [m[3] for m in files.messages_of(kind)]
+
+
+@given(
+    times=st.lists(st.integers(0, 2**64 - 1) | st.integers(0, 9), max_size=60),
+    chunked=st.booleans(),
+    index=st.sampled_from([IndexType.ALL, IndexType.NONE, IndexType.CHUNK]),
+)
+def test_order_is_by_log_time_then_by_place(
+    tmp_path_factory: pytest.TempPathFactory, times: list[int], chunked: bool, index: IndexType
+) -> None:
+    path = tmp_path_factory.mktemp("order") / "log.mcap"
+    path.write_bytes(written(times, use_chunking=chunked, index_types=index))
+    expected = sorted(enumerate(times), key=lambda pair: pair[1])
+    assert [(m[1], m[2]) for m in read(path)] == expected
+    assert [m[1] for m in read(path, ordered=False)] == list(range(len(times)))
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_it_agrees_with_the_reader_of_mcap(tmp_path: Path, compression: CompressionType) -> None:
+    raw = written([(37 * i) % 101 for i in range(500)], compression=compression)
+    (tmp_path / "log.mcap").write_bytes(raw)
+    theirs = make_reader(io.BytesIO(raw), validate_crcs=True)
+    for topics, start, stop in [(None, None, None), (["/a"], None, None), (["/b", "/c"], 20, 70)]:
+        expected = [
+            (c.topic, m.sequence, m.log_time, m.publish_time, m.data)
+            for _, c, m in theirs.iter_messages(topics, starting_at=start, ending_before=stop)
+        ]
+        assert read(tmp_path / "log.mcap", topics=topics, start=start, stop=stop) == expected
+    assert expected
+
+
+def test_channels_only_within_chunks_are_found(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(written([1, 2, 3], repeat_channels=False, repeat_schemas=False))
+    with LogReader(path) as reader:
+        assert {c.topic for c in reader.channels.values()} == {"/a", "/b"}
+        assert {s.name for s in reader.schemas.values()} == {"name"}
+
+
+def test_unknown_records_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    unknown = files.record(0x80, b"private") + files.record(0x7F, b"future")
+    inside = files.record(files.CHANNEL, files.channel(schema_id=0)) + unknown
+    inside += files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"x")) + unknown
+    data = files.MAGIC + files.header() + unknown + files.chunk(inside, 5, 5) + unknown
+    path.write_bytes(files.finish(data))
+    assert [m[4] for m in read(path)] == [b"x"]
+
+
+def test_absent_checksums_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    for options, absent in [({}, False), ({"enable_crcs": False}, True)]:
+        path.write_bytes(written([1, 2, 3], **options))
+        with LogReader(path) as reader:
+            assert bool(reader.crc_absent()) == absent
+    path.write_bytes(written([1], use_chunking=False, enable_data_crcs=True))
+    with LogReader(path) as reader:
+        assert not reader.crc_absent()
+
+
+@pytest.mark.parametrize("raw", [b"", b"\x89MC", b"not a log at all", b"\0" * 100])
+def test_what_is_no_log_is_refused(tmp_path: Path, raw: bytes) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(raw)
+    with pytest.raises(LogDamagedError, match=r"log\.mcap"):
+        LogReader(path)
+
+
+def test_a_growing_file_is_followed(tmp_path: Path) -> None:
+    raw = written(list(range(100)))
+    path = tmp_path / "log.mcap.partial"
+    path.write_bytes(raw[:1000])
+    seen = 0
+    with LogReader(path) as reader:
+        for end in range(1000, len(raw) + 700, 700):
+            with path.open("ab") as file:
+                file.write(raw[path.stat().st_size : end])
+            reader.refresh()
+            count = sum(1 for _ in reader.messages())
+            assert count >= seen
+            seen = count
+        assert reader.complete
+        assert seen == 100
+
+
+def test_a_long_file_is_read_in_little_memory(tmp_path: Path) -> None:
+    path = tmp_path / "long.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start()
+        channel = writer.register_channel("/a", "raw", 0)
+        block = bytes(500_000)
+        for i in range(400):
+            writer.add_message(channel, i, block, i, i)
+        writer.finish()
+    with LogReader(path) as reader:
+        assert sum(len(m.data) for m in reader.messages()) == 200_000_000
+        assert reader._cached <= 32 * 1024 * 1024

@@ -1,0 +1,335 @@
+"""Damaged, cut and hostile logs: no changed byte passes, nothing else than our error escapes."""
+
+from __future__ import annotations
+
+import io
+import os
+import resource
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import lz4.frame
+import mcap_files as files
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, IndexType, Writer
+
+from cdmisfa.errors import LogDamagedError
+from replay.reader import LogReader
+from replay.records import MAX_CHUNK
+
+MESSAGES = 40
+CASES = int(os.environ.get("CDMISFA_FUZZ_CASES", "1000"))
+"""Mutated files in a run; raise it for a long hunt."""
+
+
+def log(compression: CompressionType = CompressionType.ZSTD, **options: object) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=compression, chunk_size=400, **options)  # type: ignore[arg-type]
+    writer.start(profile="p", library="l")
+    schema = writer.register_schema("name", "encoding", b"data")
+    channels = [writer.register_channel(topic, "raw", schema) for topic in ("/a", "/b")]
+    writer.add_metadata("meta", {"key": "value"})
+    writer.add_attachment(1, 2, "file", "text/plain", b"attached")
+    for i in range(MESSAGES):
+        writer.add_message(channels[i % 2], i, payload(i), i, i)
+    writer.finish()
+    return stream.getvalue()
+
+
+def payload(i: int) -> bytes:
+    return bytes([i]) * (30 + i % 7)
+
+
+KINDS: dict[str, bytes] = {
+    "zstd": log(),
+    "lz4": log(CompressionType.LZ4),
+    "none": log(CompressionType.NONE, enable_data_crcs=True),
+    "without index": log(
+        index_types=IndexType.NONE, use_statistics=False, use_summary_offsets=False
+    ),
+    "without chunks": log(use_chunking=False, enable_data_crcs=True),
+}
+
+
+def read_all(path: Path, *, salvage: bool = False) -> list[tuple[str, int, bytes]]:
+    with LogReader(path, salvage=salvage) as reader:
+        for attachment in reader.attachments:
+            reader.attachment_data(attachment)
+        return [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
+
+
+TRUE = {("/ab"[0] + "ab"[i % 2], i, payload(i)) for i in range(MESSAGES)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_flipped_bit_is_never_believed(tmp_path: Path, kind: str) -> None:
+    raw, path = KINDS[kind], tmp_path / "log.mcap"
+    told = 0
+    for at in range(0, len(raw), 13):
+        path.write_bytes(raw[:at] + bytes([raw[at] ^ 1 << at % 8]) + raw[at + 1 :])
+        try:
+            found = read_all(path)
+        except LogDamagedError as error:
+            told += str(error).startswith(f"{path}: ")
+            continue
+        with LogReader(path) as reader:
+            whole = reader.complete
+        assert {(t, d) for _, t, d in found} <= {(t, d) for _, t, d in TRUE}
+        assert len(found) == MESSAGES or not whole
+    assert told > len(raw) / 26
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cut_leaves_everything_before_it(tmp_path: Path, kind: str) -> None:
+    raw, path = KINDS[kind], tmp_path / "log.mcap"
+    path.write_bytes(raw)
+    with LogReader(path) as reader:
+        ends = [
+            (s.data_offset + s.stored, sum((s.channel_counts() or {}).values()))
+            for s in reader.segments
+        ]
+    expected_when_known = kind not in ("without index", "without chunks")
+    before = 0
+    for size in range(8, len(raw), 19):
+        path.write_bytes(raw[:size])
+        with LogReader(path) as reader:
+            found = [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
+            assert not reader.complete
+            assert reader.missing
+        assert found == sorted(TRUE, key=lambda m: m[1])[: len(found)]
+        assert len(found) >= before
+        before = len(found)
+        if expected_when_known:
+            assert len(found) == sum(count for end, count in ends if end <= size)
+    assert before == MESSAGES
+
+
+def test_part_of_a_cut_chunk_is_read_when_asked(tmp_path: Path) -> None:
+    raw, path = KINDS["none"], tmp_path / "log.mcap"
+    path.write_bytes(raw)
+    with LogReader(path) as reader:
+        last = reader.segments[-1]
+    path.write_bytes(raw[: last.data_offset + last.stored - 10])
+    whole, salvaged = read_all(path), read_all(path, salvage=True)
+    assert len(whole) < len(salvaged) < MESSAGES
+
+
+def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
+    raw, path = bytearray(KINDS["zstd"]), tmp_path / "log.mcap"
+    path.write_bytes(raw)
+    with LogReader(path) as reader:
+        bad = reader.segments[1]
+    raw[bad.data_offset + bad.stored // 2] ^= 0xFF
+    path.write_bytes(raw)
+    with pytest.raises(LogDamagedError, match=rf"log time {bad.start} to {bad.end} ns"):
+        read_all(path)
+    lost = set(range(bad.start, bad.end + 1))
+    assert [m[1] for m in read_all(path, salvage=True)] == [
+        i for i in range(MESSAGES) if i not in lost
+    ]
+
+
+def test_reading_goes_on_behind_a_broken_length(tmp_path: Path) -> None:
+    raw, path = bytearray(KINDS["zstd"]), tmp_path / "log.mcap"
+    path.write_bytes(raw)
+    with LogReader(path) as reader:
+        bad = reader.segments[1]
+    raw[bad.offset + 1 : bad.offset + 9] = struct.pack("<Q", 2**60)
+    path.write_bytes(raw)
+    with pytest.raises(LogDamagedError, match=f"byte {bad.offset}"):
+        read_all(path)
+    assert len(read_all(path, salvage=True)) == MESSAGES - (bad.end - bad.start + 1)
+
+
+def one_chunk(made: bytes) -> bytes:
+    return files.finish(files.MAGIC + files.header() + made, crc=False)
+
+
+def body(*records: bytes) -> bytes:
+    start = files.record(files.CHANNEL, files.channel(schema_id=0))
+    return start + b"".join(records)
+
+
+def zstd_bomb(size: int) -> bytes:
+    compressor = zstandard.ZstdCompressor().compressobj()
+    zeros = bytes(1 << 20)
+    parts = [compressor.compress(zeros) for _ in range(size >> 20)]
+    return b"".join(parts) + compressor.flush()
+
+
+GOOD = files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"x"))
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "unknown compression": lambda: files.chunk(body(GOOD), 5, 5, compression="brotli"),
+    "size lies small": lambda: files.chunk(body(GOOD), 5, 5, compression="zstd", size=10),
+    "size lies large": lambda: files.chunk(body(GOOD), 5, 5, compression="zstd", size=10**6),
+    "size lies huge": lambda: files.chunk(body(GOOD), 5, 5, compression="lz4", size=2**40),
+    "lz4 lies": lambda: files.chunk(body(GOOD), 5, 5, compression="lz4", size=99),
+    "message too short": lambda: files.chunk(body(files.record(files.MESSAGE, b"abc")), 5, 5),
+    "message overruns": lambda: files.chunk(body(GOOD[:1] + b"\xff" * 8 + GOOD[9:]), 5, 5),
+    "chunk in chunk": lambda: files.chunk(body(files.chunk(GOOD, 5, 5)), 5, 5),
+    "garbage in chunk": lambda: files.chunk(body(GOOD, bytes(50)), 5, 5),
+    "unknown channel": lambda: files.chunk(GOOD, 5, 5),
+    "unknown schema": lambda: files.chunk(
+        files.record(files.CHANNEL, files.channel(schema_id=3)) + GOOD, 5, 5
+    ),
+    "times lie": lambda: files.chunk(body(GOOD), 6, 9),
+    "channel twice": lambda: files.chunk(
+        body(files.record(files.CHANNEL, files.channel(schema_id=0, topic="other")), GOOD), 5, 5
+    ),
+    "schema twice": lambda: (
+        files.record(files.SCHEMA, files.schema())
+        + files.record(files.SCHEMA, files.schema(name="Other"))
+    ),
+    "schema 0": lambda: files.record(files.SCHEMA, files.schema(0)),
+    "not UTF-8": lambda: files.record(files.SCHEMA, b"\1\0\2\0\0\0\xff\xff\0\0\0\0\0\0\0\0"),
+    "text of 4 GiB": lambda: files.record(files.SCHEMA, b"\1\0\xff\xff\xff\xff"),
+    "key twice": lambda: files.record(
+        files.METADATA, files.text("m") + struct.pack("<I", 20) + (files.text("k") * 4)
+    ),
+    "attachment of 2**40 bytes": lambda: files.record(
+        files.ATTACHMENT, bytes(16) + files.text("a") * 2 + struct.pack("<QI", 2**40, 0)
+    ),
+    "record of 2**60 bytes": lambda: struct.pack("<BQ", files.METADATA, 2**60),
+    "index without chunk": lambda: files.record(files.MESSAGE_INDEX, bytes(6)),
+    "index of 4 GiB": lambda: (
+        files.chunk(body(GOOD), 5, 5) + files.record(files.MESSAGE_INDEX, b"\1\0\xff\xff\xff\xff")
+    ),
+    "statistics among the data": lambda: files.record(files.STATISTICS, bytes(46)),
+    "second header": files.header,
+    "opcode 0": lambda: files.record(0, b""),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_lying_file_is_refused(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(one_chunk(HOSTILE[name]()))
+    with pytest.raises(LogDamagedError, match=r"log\.mcap"):
+        read_all(path)
+    assert len(read_all(path, salvage=True)) <= 1
+
+
+@pytest.mark.parametrize("places", [[(5, 0)], [(5, 2**50)], [(6, 42)], [(5, 42), (5, 42)], []])
+def test_a_lying_message_index_is_not_used(tmp_path: Path, places: list[tuple[int, int]]) -> None:
+    made = body(GOOD, GOOD)
+    pairs = b"".join(struct.pack("<QQ", *pair) for pair in places)
+    index = files.record(files.MESSAGE_INDEX, struct.pack("<HI", 1, len(pairs)) + pairs)
+    path = tmp_path / "log.mcap"
+    path.write_bytes(one_chunk(files.chunk(made, 5, 5) + index))
+    with LogReader(path) as reader:
+        assert [m.data for m in reader.messages()] == [b"x", b"x"]
+        assert reader.problems
+
+
+def test_a_summary_that_lies_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    data = files.MAGIC + files.header() + files.chunk(body(GOOD), 5, 5)
+    counts = struct.pack("<QHIIII", 1, 0, 1, 0, 0, 2) + struct.pack("<QQI", 5, 5, 0)
+    index = files.record(files.CHUNK_INDEX, struct.pack("<QQQ", 5, 5, 9999))
+    for summary in (files.record(files.STATISTICS, counts), index):
+        path.write_bytes(files.finish(data, summary))
+        with pytest.raises(LogDamagedError, match="summary"):
+            read_all(path)
+        assert len(read_all(path, salvage=True)) == 1
+
+
+BOMBS: dict[str, Callable[[], bytes]] = {
+    "zstd": lambda: files.chunk(b"", 0, 0, compression="zstd", size=2**30, stored=zstd_bomb(2**30)),
+    "zstd below the limit": lambda: files.chunk(
+        b"", 0, 0, compression="zstd", size=MAX_CHUNK, stored=zstd_bomb(2**30)
+    ),
+    "lz4 says 100 bytes": lambda: files.chunk(
+        b"",
+        0,
+        0,
+        compression="lz4",
+        size=100,
+        stored=lz4.frame.compress(bytes(2**30), store_size=False),
+    ),
+    "lz4 at the limit": lambda: files.chunk(
+        b"",
+        0,
+        0,
+        compression="lz4",
+        size=2**28,
+        stored=lz4.frame.compress(bytes(2**30), store_size=False),
+    ),
+}
+
+READ = """
+import resource, sys
+from cdmisfa.errors import LogDamagedError
+from replay.reader import LogReader
+try:
+    with LogReader(sys.argv[1]) as reader:
+        list(reader.messages())
+except LogDamagedError as error:
+    print(error)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_costs_neither_memory_nor_time(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(one_chunk(BOMBS[name]()))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    done = subprocess.run(
+        [sys.executable, "-c", READ, str(path)], capture_output=True, text=True, timeout=60
+    )
+    used = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+    assert done.returncode == 0, done.stderr
+    message, megabytes = done.stdout.splitlines()
+    assert "bomb.mcap" in message
+    assert int(megabytes) < 512
+    assert used < 5
+
+
+def mutated(random: Random) -> bytes:
+    """A valid log with one to four places changed as bugs and disks change them."""
+    raw = bytearray(KINDS[random.choice(sorted(KINDS))])
+    for _ in range(random.randint(1, 4)):
+        at, length = random.randrange(8, len(raw)), random.randint(1, 64)
+        match random.choice(["flip", "number", "delete", "repeat", "zero", "opcode"]):
+            case "flip":
+                raw[at] ^= 1 << random.randrange(8)
+            case "number":
+                width = random.choice([2, 4, 8])
+                big = 1 << 8 * width
+                number = random.choice([0, 1, big - 1, big >> 1, len(raw), 2**28 % big])
+                raw[at : at + width] = number.to_bytes(width, "little")
+            case "delete":
+                del raw[at : at + length]
+            case "repeat":
+                raw[at:at] = raw[at : at + length]
+            case "zero":
+                raw[at : at + length] = bytes(length)
+            case "opcode":
+                raw[at] = random.randrange(17)
+    return bytes(raw)
+
+
+@settings(max_examples=CASES, deadline=None, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**63))
+def test_nothing_else_than_our_error_escapes(fuzz_path: Path, seed: int) -> None:
+    fuzz_path.write_bytes(mutated(Random(seed)))
+    for salvage in (False, True):
+        try:
+            read_all(fuzz_path, salvage=salvage)
+        except LogDamagedError as error:
+            one_line = "\n" not in str(error)
+        else:
+            one_line = True
+        assert one_line
+
+
+@pytest.fixture(scope="module")
+def fuzz_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz") / "log.mcap"
