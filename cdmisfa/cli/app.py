@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import io
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "compare": ("runs", "Check that two runs' signals are the same, bit for bit."),
     "plot": ("runs", "Draw the figures of a run."),
     "export": ("runs", "Write a run's signals as Parquet, NumPy, CSV or Arrow."),
+    "sweep": ("sweep", "Learn many times, over a grid of settings and seeds."),
+    "results": ("results", "Print what a sweep found, mean and SD over seeds."),
     "signals": ("signals", "List every signal that a run records."),
+    "reproduce": ("reproduce", "Reproduce an experiment of the paper, or all of them."),
     "demo": ("demo", "Record, learn, check and show: the whole story in minutes."),
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }
@@ -78,6 +82,8 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Run the command line of this process."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
+        sys.stdout.reconfigure(errors="replace")
     sys.exit(run(sys.argv[1:]))
 
 

@@ -12,7 +12,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -87,21 +87,23 @@ class RunResult:
             "iterations": self.iterations,
             "frames": self.frames,
             "signals_sha256": self.signals_sha256,
-            "modules": [
-                {
-                    "index": m.index,
-                    "stream": self.streams[m.stream],
-                    "stream_index": m.stream,
-                    "iteration": m.iteration,
-                    "policy": m.policy.tolist(),
-                    "eta": m.eta.tolist(),
-                }
-                for m in self.modules
-            ],
+            "modules": [module_table(module, self.streams) for module in self.modules],
             "final_policy": list(self.final_policy),
             "epsilon": self.epsilon,
             "ended": self.ended,
         }
+
+
+def module_table(module: Module, streams: Sequence[str]) -> dict[str, Any]:
+    """What a result says about a module, as JSON values."""
+    return {
+        "index": module.index,
+        "stream": streams[module.stream],
+        "stream_index": module.stream,
+        "iteration": module.iteration,
+        "policy": module.policy.tolist(),
+        "eta": module.eta.tolist(),
+    }
 
 
 def learn(

@@ -1,0 +1,148 @@
+"""`cdmisfa sweep`: many trials over a grid of settings and seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.interrupts import interruptible
+from cdmisfa.cli.progress import bar
+
+MOST_SEEDS = 1_000_000
+
+
+@click.command("sweep")
+@click.argument("source", nargs=-1, required=True)
+@options.out("Folder of the sweep; what is finished in it is not computed again.", required=True)
+@click.option(
+    "--grid",
+    multiple=True,
+    metavar="KEY=V1,V2,...",
+    help="Values to try for a configuration key; several grids multiply.",
+)
+@click.option(
+    "--seeds",
+    default="0:20",
+    show_default=True,
+    metavar="FIRST:END",
+    help="Seeds of every point: a range without its end, or numbers with commas.",
+)
+@options.preset
+@options.settings
+@click.option("--max-iterations", type=click.IntRange(1), help="End each trial after so many.")
+@click.option("--max-modules", type=click.IntRange(1), help="End each trial after so many.")
+@click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@options.jobs
+@click.option(
+    "--engine",
+    type=click.Choice(["local", "dask", "ray"]),
+    default="local",
+    show_default=True,
+    help="Where to compute.",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler or ray head that runs.")
+@click.option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
+@click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
+@options.as_json
+@click.pass_context
+def sweep_command(
+    ctx: click.Context,
+    source: tuple[str, ...],
+    out: Path,
+    grid: tuple[str, ...],
+    seeds: str,
+    preset: str | None,
+    settings: tuple[str, ...],
+    max_iterations: int | None,
+    max_modules: int | None,
+    loop: bool,
+    jobs: int,
+    engine: str,
+    scheduler: str | None,
+    keep_logs: bool,
+    retry_failed: bool,
+    as_json: bool,
+) -> None:
+    """Learn from a source many times, over a grid of settings and seeds.
+
+    SOURCE is what learn takes. A sweep that was stopped goes on when it is asked for
+    again. Look at what it found with: cdmisfa results DIR
+    """
+    from cdmisfa.experiments.sweep import sweep
+
+    with bar("sweep", "trials") as shown, interruptible():
+
+        def progress(finished: int, failed: int, total: int) -> None:
+            shown.update(finished, total, f"{failed} failed" if failed else "")
+
+        report = sweep(
+            source,
+            out,
+            grid=parse_grid(grid),
+            seeds=parse_seeds(seeds),
+            preset=preset,
+            settings=settings,
+            loop=loop,
+            max_iterations=max_iterations,
+            max_modules=max_modules,
+            jobs=jobs,
+            engine=engine,
+            scheduler=scheduler,
+            keep_logs=keep_logs,
+            retry_failed=retry_failed,
+            progress=progress,
+        )
+    failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
+    if as_json:
+        options.print_json(
+            {
+                "schema": options.SCHEMA,
+                "sweep": report.folder,
+                "trials": report.trials,
+                "skipped": report.skipped,
+                "computed": report.computed,
+                "failed": failed,
+            }
+        )
+    else:
+        click.echo(
+            f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
+            f"before, {len(failed)} failed"
+        )
+        for row in failed:
+            at = " ".join(f"{key}={value}" for key, value in row["point"].items())
+            click.echo(f"failed: {at} seed {row['seed']}: {row['error']}")
+        click.echo(f"look at it: cdmisfa results {out}")
+    if failed:
+        ctx.exit(1)
+
+
+def parse_grid(words: tuple[str, ...]) -> dict[str, list[str]]:
+    """`KEY=V1,V2` words as values by key."""
+    grid: dict[str, list[str]] = {}
+    for word in words:
+        key, equals, values = word.partition("=")
+        found = [value.strip() for value in values.split(",") if value.strip()]
+        if not (equals and key.strip() and found):
+            raise click.UsageError(f"--grid {word}: write it as section.key=value,value")
+        if key.strip() in grid:
+            raise click.UsageError(f"--grid {key.strip()} is given twice: put all values in one")
+        grid[key.strip()] = found
+    return grid
+
+
+def parse_seeds(text: str) -> list[int]:
+    """`0:20` (without 20), `3`, or `1,5,9:12` as seeds."""
+    seeds: list[int] = []
+    try:
+        for part in text.split(","):
+            first, colon, end = part.partition(":")
+            span = range(int(first), int(end) if colon else int(first) + 1)
+            if not span or span[0] < 0 or len(seeds) + len(span) > MOST_SEEDS:
+                raise ValueError
+            seeds.extend(span)
+    except ValueError:
+        raise click.UsageError(f"--seeds {text}: write it as 0:20 or 1,5,9") from None
+    return seeds

@@ -1,0 +1,175 @@
+"""What a sweep found: mean and standard deviation over seeds at each point of its grid."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.experiments.statistics import Summary, summary
+from cdmisfa.experiments.sweep import DONE, FAILED, REQUEST, read_rows
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PointResult:
+    """One point of the grid.
+
+    Attributes:
+        point: the grid's keys and this point's values.
+        trials: how many were asked for.
+        failed: how many of them failed.
+        missing: how many were not computed yet.
+        measures: mean and SD over the finished trials, by name.
+        orders: how often which streams were learned in which order, the most frequent first.
+    """
+
+    point: Mapping[str, str]
+    trials: int
+    failed: int
+    missing: int
+    measures: Mapping[str, Summary]
+    orders: Mapping[str, int]
+
+    @property
+    def done(self) -> int:
+        """How many trials the measures are about."""
+        return self.trials - self.failed - self.missing
+
+
+def results(folder: Path) -> list[PointResult]:
+    """The points of what was asked of a sweep last, in the grid's order.
+
+    Raises:
+        UsageError: the folder holds no sweep.
+        LogDamagedError: its files are damaged.
+    """
+    folder = Path(folder)
+    path = folder / REQUEST
+    try:
+        asked = json.loads(path.read_text("utf-8"))
+        trials = [(str(t["id"]), dict(t["point"])) for t in asked["trials"]]
+    except OSError as error:
+        raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogDamagedError(f"{path} is damaged: run the sweep again to write it") from error
+    rows = {row["id"]: row for row in read_rows(folder)}
+    points: dict[tuple[tuple[str, str], ...], list[Any]] = {}
+    for number, point in trials:
+        points.setdefault(tuple(point.items()), []).append(rows.get(number))
+    return [_point(dict(key), found) for key, found in points.items()]
+
+
+def _point(point: Mapping[str, str], rows: Sequence[Mapping[str, Any] | None]) -> PointResult:
+    found = [row["result"] for row in rows if row is not None and row["status"] == DONE]
+    measures = {
+        "modules": summary([len(r["modules"]) for r in found]),
+        "iterations": summary([r["iterations"] for r in found]),
+    }
+    for k in range(max((len(r["modules"]) for r in found), default=0)):
+        saved = [r["modules"][k] for r in found if len(r["modules"]) > k]
+        measures[f"iteration_{k + 1}"] = summary([m["iteration"] for m in saved])
+        measures[f"eta_{k + 1}"] = summary([m["eta"][0] for m in saved])
+    orders = Counter(" ".join(m["stream"] for m in r["modules"]) for r in found)
+    return PointResult(
+        point=point,
+        trials=len(rows),
+        failed=sum(row is not None and row["status"] == FAILED for row in rows),
+        missing=sum(row is None for row in rows),
+        measures=measures,
+        orders=dict(orders.most_common()),
+    )
+
+
+def as_json(points: Sequence[PointResult]) -> dict[str, Any]:
+    """The results as one JSON document."""
+    return {
+        "schema": SCHEMA,
+        "points": [
+            {
+                "point": dict(p.point),
+                "trials": p.trials,
+                "done": p.done,
+                "failed": p.failed,
+                "missing": p.missing,
+                "measures": {
+                    name: {"mean": s.mean, "sd": s.sd, "n": s.n} for name, s in p.measures.items()
+                },
+                "orders": dict(p.orders),
+            }
+            for p in points
+        ],
+    }
+
+
+def measure_names(points: Sequence[PointResult]) -> list[str]:
+    """Every measure that some point has, in order."""
+    return list(dict.fromkeys(name for p in points for name in p.measures))
+
+
+def as_csv(points: Sequence[PointResult]) -> str:
+    """A line a point; two columns a measure, empty where there is no number."""
+    names = measure_names(points)
+    keys = list(points[0].point) if points else []
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = [f"{name}_{part}" for name in names for part in ("mean", "sd")]
+    writer.writerow([*keys, "trials", "done", "failed", *columns, "order", "order_count"])
+    for p in points:
+        cells: list[Any] = [*p.point.values(), p.trials, p.done, p.failed]
+        for name in names:
+            found = p.measures.get(name)
+            for value in (found.mean, found.sd) if found else (math.nan, math.nan):
+                cells.append("" if math.isnan(value) else repr(value))
+        order, count = next(iter(p.orders.items()), ("", 0))
+        writer.writerow([*cells, order, count])
+    return text.getvalue()
+
+
+def as_table(points: Sequence[PointResult]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows for a person: mean ± SD, and the most frequent order with its share."""
+    names = measure_names(points)
+    keys = list(points[0].point) if points else []
+    head = [*keys, "done", "failed", *names, "order"]
+    rows = []
+    for p in points:
+        order, count = next(iter(p.orders.items()), ("", 0))
+        shown = f"{order} ({count}/{p.done})" if order else ""
+        cells = [_cell(p.measures.get(name)) for name in names]
+        rows.append([*p.point.values(), f"{p.done}/{p.trials}", str(p.failed), *cells, shown])
+    return head, rows
+
+
+def as_latex(points: Sequence[PointResult]) -> str:
+    """A booktabs table with the columns of `as_table`."""
+    head, rows = as_table(points)
+    lines = [
+        r"\begin{tabular}{" + "l" * len(head) + "}",
+        r"\toprule",
+        _latex_line(head),
+        r"\midrule",
+        *map(_latex_line, rows),
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(found: Summary | None) -> str:
+    if found is None or not found.n:
+        return ""
+    return f"{found.mean:.4g}" if math.isnan(found.sd) else f"{found.mean:.4g} ± {found.sd:.2g}"
+
+
+def _latex_line(cells: Sequence[str]) -> str:
+    special = {"_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "±": r"$\pm$"}
+    escaped = ["".join(special.get(c, c) for c in cell) for cell in cells]
+    return " & ".join(escaped) + r" \\"
