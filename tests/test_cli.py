@@ -319,6 +319,12 @@ class TestInterrupts:
         assert_one_line(Outcome(process.returncode, out, err.lstrip()), 143, "interrupted")
         assert cdmisfa("info", recording, "--json").json["complete"] is False
 
+    def test_terminal_without_greek_letters(self) -> None:
+        with start("signals", PYTHONIOENCODING="ascii", PYTHONUTF8="0") as process:
+            out, err = process.communicate(timeout=60)
+        assert (process.returncode, err) == (0, "")
+        assert "eta_dot" in out
+
     def test_closed_pipe_is_quiet(self) -> None:
         with start("signals") as process:
             assert process.stdout is not None

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-
-import click
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -53,7 +52,8 @@ def stoppable() -> Iterator[Stop]:
         if stop():
             raise KeyboardInterrupt
         stop.number = number
-        click.echo("stopping after this iteration; again to stop at once", err=True)
+        # not print: the signal may have come in the middle of one
+        os.write(2, b"stopping after this iteration; again to stop at once\n")
 
     with _handled_by(ask):
         yield stop

@@ -72,7 +72,7 @@ def learn_command(
     for warning in getattr(frames, "warnings", ()):
         click.echo(f"warning: {warning}", err=True)
     try:
-        with bar("learning", "iterations") as shown, stoppable() as stop:
+        with bar("learning", "blocks") as shown, stoppable() as stop:
             result = learn(
                 frames,
                 configuration.learner,
@@ -115,7 +115,7 @@ class Reporter:
         now = time.monotonic()
         if now >= self._next:
             self._next = now + TICK
-            note = f"{progress.modules} modules, epsilon {progress.epsilon:.3f}"
+            note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
             self._shown.update(progress.iteration, progress.max_iterations, note)
 
 

@@ -84,7 +84,7 @@ def path_argument(name: str) -> Callable[[Command], Command]:
 
 def print_json(document: Mapping[str, Any]) -> None:
     """One JSON document on stdout; what JSON has no number for (NaN) becomes null."""
-    click.echo(json.dumps(_plain(document), ensure_ascii=False, allow_nan=False))
+    click.echo(json.dumps(_plain(document), allow_nan=False))
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -110,9 +110,9 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Repor
             force=True,
             progress=lambda done: bar.update(done, frames),
         )
-    with stage("2/4 learning from the recording", "iterations") as bar:
+    with stage("2/4 learning from the recording", "blocks") as bar:
         result = _learn([recording], configuration, run, seed, bar, max_modules=MODULES)
-    with stage("3/4 checking live against recorded", "iterations") as bar:
+    with stage("3/4 checking live against recorded", "blocks") as bar:
         _check(recording, configuration, seed, min(CHECKED_ITERATIONS, frames // 40), bar)
     with stage("4/4 drawing figures", "modules") as bar, _opened([recording], seed) as source:
         learned = tuple(_score(module, source) for module in result.modules)
@@ -130,7 +130,7 @@ def _learn(
     max_modules: int | None = None,
 ) -> RunResult:
     def shown(progress: Progress) -> None:
-        note = f"{progress.modules} modules, epsilon {progress.epsilon:.3f}"
+        note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
         if progress.iteration % 10 == 0:
             bar.update(progress.iteration, progress.max_iterations, note)
 
