@@ -36,7 +36,8 @@ class Difference:
         if not self.signal:
             return f"iteration {self.iteration}: {self.first} against {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
-        return f"iteration {self.iteration}: {self.signal}{place} is {self.first} against {self.second}"
+        where = f"iteration {self.iteration}: {self.signal}{place}"
+        return f"{where} is {self.first} against {self.second}"
 
     def as_json(self) -> dict[str, Any]:
         """The difference as JSON values."""
@@ -74,18 +75,20 @@ def _difference(iteration: int, a: BlockSignals, b: BlockSignals) -> Difference:
             return Difference(
                 iteration, signal.name, (), f"of shape {x.shape}", f"of shape {y.shape}"
             )
-        differs = np.flatnonzero(_bits(x) != _bits(y))
+        differs = np.flatnonzero(_differ(x, y))
         if len(differs):
             place = tuple(int(i) for i in np.unravel_index(differs[0], x.shape))
             return Difference(iteration, signal.name, place, _text(x[place]), _text(y[place]))
     raise AssertionError("records with different bytes have the same values")
 
 
-def _bits(value: NDArray[Any]) -> NDArray[np.uint8]:
-    """One integer an element, equal only where every bit is."""
-    width = np.dtype(f"u{value.dtype.itemsize}")
-    bits: NDArray[np.uint8] = np.ascontiguousarray(value).view(width).reshape(-1)
-    return bits
+def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where two arrays differ in a bit, (size,); one NaN is as good as another."""
+    both_nan = np.ravel(np.isnan(x) & np.isnan(y))
+    width = np.dtype(f"u{x.dtype.itemsize}")
+    bits = [np.ascontiguousarray(value).view(width).reshape(-1) for value in (x, y)]
+    differ: NDArray[np.bool_] = (bits[0] != bits[1]) & ~both_nan
+    return differ
 
 
 def _text(value: Any) -> str:

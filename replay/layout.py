@@ -89,7 +89,7 @@ class RunLayout:
 
     def _overview(self) -> rrb.Container:
         sees = rrb.Vertical(
-            self._watched(),
+            self._watched("What it sees"),
             rrb.TextDocumentView(origin="/summary", name="What happened"),
             self._weights("/abstraction/phi", "What it looks for: weights φ"),
             row_shares=[3, 6, 3],
@@ -114,7 +114,9 @@ class RunLayout:
             self._lines("Recent variance of the output", ["/signals/variance"]),
         )
         now = rrb.Vertical(
-            self._watched(), self._weights("/abstraction/phi", "Weights φ"), row_shares=[2, 3]
+            self._watched("Input x"),
+            self._weights("/abstraction/phi", "Weights φ"),
+            row_shares=[2, 3],
         )
         return rrb.Horizontal(now, curves, column_shares=[2, 5], name="Abstraction")
 
@@ -174,9 +176,9 @@ class RunLayout:
         learned = rrb.TextLogView(origin="/events", name="Events")
         return rrb.Vertical(*rows, *truth, learned, name="Modules")
 
-    def _watched(self) -> rrb.View:
+    def _watched(self, name: str) -> rrb.View:
         if self._images:
-            return rrb.Spatial2DView(origin="/world/watched", name="What it sees")
+            return rrb.Spatial2DView(origin="/world/watched", name=name)
         near = rr.VisibleTimeRange(
             FRAME,
             start=rr.TimeRangeBoundary.cursor_relative(seq=-500),
@@ -190,7 +192,7 @@ class RunLayout:
         )
         return rrb.TimeSeriesView(
             origin="/world/watched",
-            name="What it sees: the last 500 frames",
+            name=f"{name}: the last 500 frames",
             plot_legend=LEGEND,
             time_ranges=[near],
             axis_x=axis,

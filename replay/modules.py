@@ -60,7 +60,7 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     path = Path(path)
     path = path / MODULES_FILE if path.is_dir() else path
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             _refuse_large(stored.zip)
             indices = sorted(int(stored[name]) for name in stored.files if name.endswith("_index"))
             return tuple(_module(stored, index) for index in indices)

@@ -1,0 +1,227 @@
+"""A run's log gives back what was written, to the bit, whole or cut anywhere."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from run_data import IMAGE, VECTOR, run_of, signals_of, write_run
+
+from cdmisfa.blocks import SourceSpec
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.modules import Module
+from cdmisfa.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
+from replay import matrix_message, signals_message
+from replay.modules import load_modules, save_modules
+from replay.runlog import (
+    RunWriter,
+    is_run,
+    read_events,
+    read_header,
+    read_phi,
+    read_signals,
+    read_truth,
+    read_watched,
+)
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    streams=st.integers(1, 70),
+    tau=st.integers(3, 60),
+    modules=st.integers(0, 4),
+    outputs=st.integers(1, 3),
+    k=st.integers(0, 10_000),
+)
+def test_a_record_of_any_shape_comes_back_to_the_bit(seed, streams, tau, modules, outputs, k):
+    spec = SourceSpec(tuple(f"s{i}" for i in range(streams)), (2,), "float64")
+    rng = np.random.default_rng(seed)
+    signals = signals_of(spec, k, rng, tau=tau, modules=modules, outputs=outputs)
+    back = signals_message.decode(signals_message.encode(signals))
+    assert canonical_bytes(back) == canonical_bytes(signals)
+
+
+@given(bits=st.lists(st.integers(0, 2**64 - 1), min_size=1, max_size=8))
+def test_every_pattern_of_bits_of_a_number_survives(bits):
+    rng = np.random.default_rng(0)
+    signals = signals_of(VECTOR, 1, rng, tau=len(bits), modules=0)
+    y = np.array(bits, dtype=np.uint64).view(np.float64)[:, None]
+    signals = type(signals)(**{n: getattr(signals, n) for n in SIGNALS if n != "y"}, y=y)
+    back = signals_message.decode(signals_message.encode(signals))
+    assert back.y.tobytes() == y.tobytes()
+
+
+@given(data=st.binary(max_size=300))
+def test_bytes_that_are_no_record_fail_in_words_or_not_at_all(data):
+    for decode in (signals_message.decode, matrix_message.decode):
+        with contextlib.suppress(LogDamagedError):
+            decode(data, "here")
+
+
+def test_a_record_whose_sizes_lie_is_refused():
+    rng = np.random.default_rng(0)
+    data = signals_message.encode(signals_of(VECTOR, 1, rng, tau=77, modules=0))
+    at = data.rindex(bytes((77, 1, 0, 77, 1)))  # the sizes of y and y_frozen
+    with pytest.raises(LogDamagedError, match=r"y has 77 values for shape \(78, 1\)"):
+        signals_message.decode(data[:at] + b"\x4e" + data[at + 1 :])
+
+
+@pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
+def test_a_run_reads_back_as_written(spec, tmp_path):
+    path = tmp_path / "run" / "run.mcap"
+    path.parent.mkdir()
+    written = write_run(path, spec, 30, watched_every=7, phi_every=10)
+    back = list(read_signals(path.parent))
+    assert [canonical_bytes(s) for s in back] == [canonical_bytes(s) for s in written]
+    header = read_header(path)
+    assert header.spec == spec
+    assert header.schema == SCHEMA_VERSION
+    assert header.setting("learner", "tau") == 40
+    assert header.manifest["seed"] == 0
+    blocks = [block for _, block in run_of(spec, 30)]
+    frames = np.concatenate([b.frames for b in blocks])
+    watched = list(read_watched(path))
+    if spec.dtype == "uint8":
+        assert [t for t, _ in watched] == list(range(0, 1200, 7))
+        assert all((image[0] == frames[t]).all() for t, image in watched)
+    else:
+        assert np.concatenate([w for _, w in watched]).tobytes() == frames.tobytes()
+    truth = list(read_truth(path))
+    assert [t for t, _ in truth] == [b.t for b in blocks]
+    assert all(v.tobytes() == b.truth.tobytes() for (_, v), b in zip(truth, blocks, strict=True))
+    assert [(t, phi[0, 0]) for t, phi in read_phi(path)] == [(0, 0.0), (400, 10.0), (800, 20.0)]
+    (event,) = read_events(path)
+    assert (event.t, event.iteration, event.level) == (1200, 29, "INFO")
+    assert event.text == "stopped: the test is over"
+
+
+def test_the_same_run_is_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        write_run(tmp_path / name, VECTOR, 12)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_the_log_opens_without_us_and_tells_its_units(tmp_path):
+    path = tmp_path / "run.mcap"
+    written = write_run(path, IMAGE, 5)
+    with open(path, "rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        messages = list(reader.iter_messages(["/signals"]))
+    assert [m.log_time for _, _, m in messages] == [s.log_time for s in written]
+    schema = messages[0][0]
+    assert (schema.name, schema.encoding) == ("cdmisfa.BlockSignals", "protobuf")
+    assert "η̇".encode() in schema.data
+    assert b"unit 1/frame" in schema.data
+
+
+def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
+    program = """
+        import os, signal, sys
+        sys.path.insert(0, sys.argv[2])
+        from pathlib import Path
+        import numpy as np
+        from run_data import VECTOR, run_of
+        from replay.runlog import RunWriter
+        writer = RunWriter(Path(sys.argv[1]), VECTOR, {})
+        for signals, block in run_of(VECTOR, 100):
+            writer.block(signals, block, np.zeros((1, 2)))
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    path = tmp_path / "run.mcap"
+    here = str(Path(__file__).parent)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program), str(path), here], timeout=60
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert not path.exists()
+    back = list(read_signals(tmp_path))
+    # A block is 0.8 s long: at most two of them were not flushed yet.
+    assert 98 <= len(back) <= 100
+    for signals, (expected, _) in zip(back, run_of(VECTOR, 100), strict=False):
+        assert canonical_bytes(signals) == canonical_bytes(expected)
+
+
+def test_a_partial_log_reads_wherever_it_was_cut(tmp_path):
+    whole = tmp_path / "whole.mcap"
+    expected = [canonical_bytes(s) for s in write_run(whole, VECTOR, 20)]
+    data = whole.read_bytes()
+    cut = tmp_path / "run.mcap.partial"
+    lengths = []
+    for size in np.linspace(len(data) // 2, len(data) - 1, 12).astype(int):
+        cut.write_bytes(data[:size])
+        back = [canonical_bytes(s) for s in read_signals(tmp_path)]
+        assert back == expected[: len(back)]
+        lengths.append(len(back))
+    assert lengths == sorted(lengths)
+    assert 5 < lengths[0] < lengths[-1] == 20
+
+
+def test_a_finished_log_that_lost_its_end_is_damaged(tmp_path):
+    path = tmp_path / "run.mcap"
+    write_run(path, VECTOR, 20)
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(LogDamagedError, match="cut short"):
+        list(read_signals(path))
+
+
+def test_an_existing_run_is_kept(tmp_path):
+    path = tmp_path / "run.mcap"
+    write_run(path, VECTOR, 3)
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match="--force"):
+        RunWriter(path, VECTOR, {})
+    assert path.read_bytes() == before
+
+
+def test_what_is_no_run_is_refused_by_name(tmp_path):
+    with pytest.raises(UsageError, match=r"holds no run\.mcap"):
+        read_header(tmp_path)
+    with pytest.raises(UsageError, match="does not exist"):
+        list(read_signals(tmp_path / "nothing"))
+    assert not is_run(tmp_path)
+
+
+def test_modules_come_back(tmp_path):
+    rng = np.random.default_rng(1)
+    modules = [
+        Module(
+            index=i,
+            stream=i % 2,
+            iteration=100 * i,
+            phi=rng.standard_normal((2, 5)),
+            mean=rng.standard_normal(5),
+            band_mean=rng.random(2),
+            band_sd=rng.random(2),
+            eta=rng.random(2),
+            policy=np.array([0, 1, 1]),
+        )
+        for i in range(1, 12)
+    ]
+    save_modules(tmp_path / "modules.npz", modules)
+    back = load_modules(tmp_path)
+    assert [m.index for m in back] == list(range(1, 12))
+    for a, b in zip(modules, back, strict=True):
+        assert (a.stream, a.iteration) == (b.stream, b.iteration)
+        for name in ("phi", "mean", "band_mean", "band_sd", "eta", "policy"):
+            assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"PK\x03\x04 no zip", b"\x93NUMPY"], ids=["empty", "zip", "npy"]
+)
+def test_damaged_modules_are_refused_in_words(data, tmp_path):
+    (tmp_path / "modules.npz").write_bytes(data)
+    with pytest.raises(LogDamagedError, match=r"modules\.npz"):
+        load_modules(tmp_path)
+    with pytest.raises(UsageError, match="does not exist"):
+        load_modules(tmp_path / "elsewhere")

@@ -1,0 +1,311 @@
+"""The view of a run holds every signal of every iteration, and shows it without a report."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import rerun as rr
+from PIL import Image
+from rerun.chunk import RrdReader
+from run_data import DELTA, IMAGE, VECTOR, run_of, write_run
+
+from cdmisfa.blocks import SourceSpec
+from cdmisfa.errors import CdmisfaError, UsageError
+from cdmisfa.modules import Module
+from cdmisfa.signals import SIGNALS
+from recorder.config import SceneConfig
+from recorder.recording import record
+from replay import viewer
+from replay.columns import tensor_array
+from replay.config import ViewConfig
+from replay.modules import save_modules
+from replay.view import build_view
+
+ITERATIONS = 24
+TAU = 40
+
+
+@pytest.fixture(autouse=True)
+def _strict(monkeypatch):
+    """Rerun drops data that it does not understand, with a warning only, unless told so."""
+    monkeypatch.setenv("RERUN_STRICT", "1")
+
+
+def rows_of(path):
+    """Per entity: its columns over all chunks in the order of frames."""
+    chunks = defaultdict(list)
+    for chunk in RrdReader(str(path)).stream():
+        if not chunk.is_static:
+            chunks[chunk.entity_path].append(chunk.to_record_batch())
+    entities = {}
+    for entity, batches in chunks.items():
+        columns = {}
+        for name in batches[0].schema.names:
+            values = [
+                batch.column(name).to_pylist() for batch in batches if name in batch.schema.names
+            ]
+            columns[name] = [v for part in values for v in part]
+        if "frame" in columns:
+            order = np.argsort(columns["frame"], kind="stable")
+            columns = {name: [c[i] for i in order] for name, c in columns.items()}
+        entities[entity] = columns
+    return entities
+
+
+def statics_of(path):
+    return {chunk.entity_path for chunk in RrdReader(str(path)).stream() if chunk.is_static}
+
+
+def scalars(entity):
+    return np.array(entity["Scalars:scalars"], dtype=np.float64)
+
+
+@pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
+def shown(request, tmp_path_factory):
+    """A run, its records, and the rows of its view."""
+    folder = tmp_path_factory.mktemp("run")
+    records = write_run(folder / "run.mcap", request.param, ITERATIONS, phi_every=10)
+    size = int(np.prod(request.param.frame_shape))
+    module = Module(
+        index=1,
+        stream=0,
+        iteration=8,
+        phi=np.ones((1, size)),
+        mean=np.zeros(size),
+        band_mean=np.zeros(1),
+        band_sd=np.ones(1),
+        eta=np.ones(1),
+        policy=np.array([0, 1, 1]),
+    )
+    save_modules(folder / "modules.npz", [module])
+    build_view(folder, folder / "run.rrd", every=20)
+    return request.param, records, rows_of(folder / "run.rrd"), folder
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in SIGNALS if n not in ("iteration", "t", "log_time", "R", "Q")]
+)
+def test_every_signal_of_every_iteration_is_there(name, shown):
+    _, records, rows, _ = shown
+    if SIGNALS[name].dims.startswith("M"):
+        for module in (1, 2):
+            expected = [
+                getattr(s, name)[module - 1].reshape(-1, 1)
+                for s in records
+                if len(s.y_frozen) >= module
+            ]
+            found = scalars(rows[f"/signals/{name}/{module}"])
+            np.testing.assert_array_equal(found, np.concatenate(expected))
+        return
+    per_frame = SIGNALS[name].dims.startswith("T")
+    values = [np.asarray(getattr(s, name), dtype=float) for s in records]
+    expected = [v.reshape(TAU if per_frame else 1, -1) for v in values]
+    entity = rows[f"/signals/{name}"]
+    np.testing.assert_array_equal(scalars(entity), np.concatenate(expected))
+    repeat = TAU if per_frame else 1
+    assert entity["iteration"] == [s.iteration for s in records for _ in range(repeat)]
+    assert entity["frame"] == [s.t + i for s in records for i in range(repeat)]
+
+
+@pytest.mark.parametrize("name", ["R", "Q"])
+def test_tensors_are_there(name, shown):
+    _, records, rows, _ = shown
+    found = rows[f"/signals/{name}"]["Tensor:data"]
+    for signals, (tensor,) in zip(records, found, strict=True):
+        expected = getattr(signals, name)
+        assert tensor["shape"] == list(expected.shape)
+        np.testing.assert_array_equal(np.reshape(tensor["buffer"], expected.shape), expected)
+
+
+def test_all_stand_on_the_clock_of_the_log(shown):
+    spec, records, rows, _ = shown
+    times = rows["/signals/xi"]["message_log_time"]
+    found = [np.datetime64(t, "ns").astype(int) for t in times]
+    assert found == [s.log_time for s in records]
+    times = rows["/signals/y"]["message_log_time"]
+    assert np.datetime64(times[-1], "ns").astype(int) == spec.time_ns(ITERATIONS * TAU - 1)
+
+
+def test_what_was_watched_is_there(shown):
+    spec, _, rows, _ = shown
+    frames = np.concatenate([block.frames for _, block in run_of(spec, ITERATIONS)])
+    entity = rows["/world/watched"]
+    if spec is IMAGE:
+        assert entity["frame"] == list(range(0, ITERATIONS * TAU, 20))
+        for t, (pixels,) in zip(entity["frame"], entity["Image:buffer"], strict=True):
+            assert bytes(pixels) == frames[t].tobytes()
+    else:
+        np.testing.assert_array_equal(scalars(entity), frames)
+    truth = np.concatenate([block.truth for _, block in run_of(spec, ITERATIONS)])
+    np.testing.assert_array_equal(scalars(rows["/world/truth"]), truth)
+
+
+def test_lanes_say_what_was_the_case(shown):
+    spec, records, rows, _ = shown
+
+    def at(entity, t):
+        states = zip(rows[entity]["frame"], rows[entity]["StateChange:state"], strict=True)
+        return [state for frame, state in states if frame <= t][-1]
+
+    for s in records:
+        assert at("/lanes/1_stream", s.t) == [spec.streams[s.stream]]
+        verdict = "novel" if s.novel else f"known by {s.known_by}" if s.known_by > 0 else "constant"
+        assert at("/lanes/3_gate", s.t) == [verdict]
+        assert at("/lanes/4_action", s.t) == [["stay", "switch"][s.action]]
+        for i, name in enumerate(spec.streams):
+            assert at(f"/policy/{i + 1}_{name}", s.t) == [["stay", "switch"][s.policy[i]]]
+
+
+def test_eyes_get_threshold_band_weights_and_events(shown):
+    spec, records, rows, folder = shown
+    assert set(np.ravel(scalars(rows["/abstraction/delta"]))) == {DELTA}
+    band = scalars(rows["/gate/band/1"])
+    np.testing.assert_allclose(band, np.tile([0.008, 0.012], (len(band), 1)))
+    assert rows["/abstraction/phi"]["iteration"] == [0, 10, 20]
+    assert rows["/modules/1/weights"]["iteration"] == [8]
+    assert rows["/events"]["TextLog:text"] == [["stopped: the test is over"]]
+    assert "/summary" in statics_of(folder / "run.rrd")
+    stay = scalars(rows[f"/decision/R_stay/{spec.streams[1]}"])[:, 0]
+    np.testing.assert_array_equal(stay, [s.R[1, 0, 1] for s in records])
+
+
+def test_the_file_has_a_layout_and_properties(shown):
+    *_, folder = shown
+    reader = RrdReader(str(folder / "run.rrd"))
+    assert len(reader.blueprints()) == 1
+    properties = {c.entity_path for c in reader.stream() if "__properties" in c.entity_path}
+    assert {"/__properties/learner", "/__properties/result"} <= properties
+
+
+def test_many_streams_show_the_most_watched(tmp_path):
+    spec = SourceSpec(tuple(f"s{i}" for i in range(70)), (2,), "float64", (), 50.0, 0)
+    records = write_run(tmp_path / "run.mcap", spec, 30)
+    build_view(tmp_path, tmp_path / "run.rrd", config=ViewConfig(streams=5))
+    rows = rows_of(tmp_path / "run.rrd")
+    lanes = {entity for entity in rows if entity.startswith("/policy/")}
+    assert len(lanes) == 5
+    visits = np.bincount([s.stream for s in records], minlength=70)
+    shown = [int(entity.split("s")[-1]) for entity in lanes]
+    assert min(visits[shown]) >= np.sort(visits)[-5]
+
+
+def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 0)
+    build_view(tmp_path, tmp_path / "empty.rrd")
+    assert "/signals/y" not in rows_of(tmp_path / "empty.rrd")
+    data = (tmp_path / "run.mcap").read_bytes()
+    assert len(data) > 0
+    torn = tmp_path / "torn"
+    torn.mkdir()
+    write_run(torn / "run.mcap", VECTOR, 20)
+    whole = (torn / "run.mcap").read_bytes()
+    (torn / "run.mcap").unlink()
+    (torn / "run.mcap.partial").write_bytes(whole[: len(whole) // 2])
+    build_view(torn, torn / "run.rrd")
+    assert 3 < len(rows_of(torn / "run.rrd")["/signals/xi"]["frame"]) < 20
+
+
+def test_tensors_are_encoded_as_rerun_does():
+    block = np.arange(24.0).reshape(2, 3, 2, 2)
+    names = ("stream", "action", "next stream")
+    found = tensor_array(block, names)
+    for row, tensor in zip(found.to_pylist(), block, strict=True):
+        batch = rr.Tensor(tensor, dim_names=names).as_component_batches()[0]
+        assert row == batch.as_arrow_array().to_pylist()
+
+
+def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    out = tmp_path / "run.rrd"
+    out.write_bytes(b"mine")
+    with pytest.raises(UsageError, match="--force"):
+        build_view(tmp_path, out, force=False)
+    assert out.read_bytes() == b"mine"
+    with pytest.raises(CdmisfaError, match="cannot be written"):
+        build_view(tmp_path, tmp_path / "nowhere" / "run.rrd")
+    with pytest.raises(UsageError, match="does not exist"):
+        build_view(tmp_path / "nothing", tmp_path / "b.rrd")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
+
+
+def test_a_recording_has_a_view(tmp_path):
+    folder = tmp_path / "recording"
+    record("oscillatory", folder, SceneConfig(kind="oscillatory"), frames=120)
+    build_view(folder, tmp_path / "r.rrd")
+    rows = rows_of(tmp_path / "r.rrd")
+    for name in ("x1", "x2", "x3"):
+        assert rows[f"/views/{name}"]["frame"] == list(range(120))
+    assert len(rows["/world/truth"]["frame"]) == 120
+
+
+needs_driver = pytest.mark.skipif(bool(viewer.missing_driver()), reason=viewer.missing_driver())
+
+
+@needs_driver
+def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
+    """Opens the view, scrubs to two frames, and looks at the pixels."""
+    write_run(tmp_path / "run.mcap", IMAGE, ITERATIONS)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    blocks = [block for _, block in run_of(IMAGE, ITERATIONS)]
+    with viewer.headless_viewer() as client:
+        client.open(str(tmp_path / "run.rrd"))
+        views = {view.name: view for view in eventually(lambda: all_views(client))}
+        assert "What happened" in views
+        assert [view.reports for view in views.values()] == [[]] * len(views)
+        for block in (blocks[3], next(b for b in blocks if b.stream != blocks[3].stream)):
+            client.set_time("frame", sequence=block.t, play_state="paused")
+            grey = int(block.frames[0].min())
+            eventually(lambda g=grey: shows(client, views["What it sees"].view_id, g))
+
+
+def all_views(client):
+    state = client.get_state()
+    found = [view for view in state.views if view.name == "What it sees"]
+    return state.views if found and not state.loading else None
+
+
+def shows(client, view, grey):
+    """Whether most of an image view's pixels of colour are this grey."""
+    picture = np.asarray(Image.open(io.BytesIO(client.take_screenshot(view))).convert("L"))
+    return np.mean(np.abs(picture.astype(int) - grey) < 6) > 0.2
+
+
+def eventually(ask, seconds=30.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        try:
+            answer = ask()
+            if answer:
+                return answer
+        except ConnectionError:
+            pass
+        time.sleep(0.1)
+    raise AssertionError("it did not happen in time")
+
+
+@needs_driver
+def test_a_screenshot_is_a_picture(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 6)
+    viewer.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
+    with Image.open(tmp_path / "s.png") as picture:
+        assert picture.size in ((800, 500), (1600, 1000))
+        assert len(np.unique(np.asarray(picture.convert("L")))) > 20
+    with pytest.raises(UsageError, match="--force"):
+        viewer.screenshot(tmp_path, tmp_path / "s.png")
+
+
+def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    monkeypatch.setattr(viewer, "DRIVERS", str(tmp_path / "*.json"))
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    with pytest.raises(CdmisfaError, match="mesa-vulkan-drivers"):
+        viewer.screenshot(tmp_path, tmp_path / "s.png")
+
+
+def test_telemetry_is_off():
+    assert viewer.environment()["CI"] == "1"
+    assert viewer.program().is_file()
