@@ -1,0 +1,267 @@
+"""A recording plays back to the bit what was recorded, and says where it cannot."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from source_contract import SourceContract, same
+
+from cdmisfa.blocks import Block, FrameSource, SourceSpec
+from cdmisfa.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.streams import OscillatorySource
+from recorder.config import RecordConfig
+from recorder.recording import record
+from recorder.viewlog import Identity, ViewLog
+from replay.info import describe
+from replay.reader import LogReader
+from replay.recorded import RecordedSource
+from replay.recover import recover
+from replay.verify import verify
+
+FRAMES = 330
+IMAGES = SourceSpec(("left", "right"), (12, 16), "uint8", ("x", "y"), 50.0, 10**18)
+
+
+def picture_blocks(spec: SourceSpec, frames: int) -> list[Block]:
+    random = np.random.default_rng(7)
+    truth = random.normal(size=(frames, len(spec.truth)))
+    truth[: frames // 2, 0] = 0.0
+    return [
+        Block(s, 0, random.integers(0, 256, (frames, *spec.frame_shape), np.uint8), truth)
+        for s in range(len(spec.streams))
+    ]
+
+
+def write_pictures(folder: Path, **settings: object) -> list[Block]:
+    blocks = picture_blocks(IMAGES, FRAMES)
+    for block in blocks:
+        name = IMAGES.streams[block.stream]
+        identity = Identity("icub", 3, IMAGES, {})
+        log = ViewLog(folder, name, identity, RecordConfig(**settings))  # type: ignore[arg-type]
+        log.write(block)
+        log.finish()
+    return blocks
+
+
+@pytest.fixture(scope="module")
+def vectors(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("vectors")
+    record("oscillatory", folder, frames=FRAMES)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures")
+    write_pictures(folder)
+    return folder
+
+
+@pytest.fixture
+def copy(vectors: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(vectors, tmp_path / "copy"))
+
+
+class TestRecordedVectors(SourceContract):
+    ends = True
+    long = 200
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, vectors: Path) -> None:
+        self.folder = vectors
+
+    def open(self) -> FrameSource:
+        return RecordedSource(self.folder)
+
+
+class TestRecordedPictures(SourceContract):
+    ends = True
+    long = 200
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, pictures: Path) -> None:
+        self.folder = pictures
+
+    def open(self) -> FrameSource:
+        return RecordedSource(self.folder)
+
+
+class TestLoopedPictures(TestRecordedPictures):
+    ends = False
+
+    def open(self) -> FrameSource:
+        return RecordedSource(self.folder, loop=True)
+
+
+def test_recorded_equals_live_to_the_bit(vectors: Path) -> None:
+    live, recorded = OscillatorySource(), RecordedSource(vectors)
+    for i in range(FRAMES // 30):
+        same(live.take(i % 3, 30), recorded.take(i % 3, 30))
+    assert recorded.spec.streams == live.spec.streams
+    assert not recorded.warnings
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_pixels_and_truth_come_back(tmp_path: Path, compression: str) -> None:
+    blocks = write_pictures(tmp_path, compression=compression)
+    source = RecordedSource(tmp_path)
+    for block in blocks:
+        source.seek(0)
+        same(source.take(block.stream, FRAMES), block)
+
+
+def test_a_loop_begins_again(pictures: Path) -> None:
+    looped, once = RecordedSource(pictures, loop=True), RecordedSource(pictures)
+    looped.seek(FRAMES * 5 - 10)
+    block = looped.take(1, 25)
+    assert block.t == FRAMES * 5 - 10
+    once.seek(FRAMES - 10)
+    np.testing.assert_array_equal(block.frames[:10], once.take(1, 10).frames)
+    once.seek(0)
+    np.testing.assert_array_equal(block.frames[10:], once.take(1, 15).frames)
+    assert looped.spec.length is None
+
+
+def test_the_end_names_the_remedy(vectors: Path) -> None:
+    source = RecordedSource(vectors)
+    with pytest.raises(LogExhaustedError, match="--loop"):
+        source.take(0, FRAMES + 1)
+
+
+def test_the_shortest_view_is_the_length(copy: Path) -> None:
+    raw = (copy / "x2.mcap").read_bytes()
+    (copy / "x2.mcap").unlink()
+    (copy / "x2.mcap.partial").write_bytes(raw[: len(raw) // 2])
+    source = RecordedSource(copy)
+    assert source.spec.length is not None
+    assert 0 < source.spec.length < FRAMES
+    assert any("x2.mcap.partial" in w for w in source.warnings)
+    same(source.take(1, 50), OscillatorySource().take(1, 50))
+    with pytest.raises(LogExhaustedError):
+        source.seek(source.spec.length + 1)
+
+
+def test_files_may_be_named_in_any_order(vectors: Path) -> None:
+    source = RecordedSource([vectors / "x3.mcap", vectors / "x1.mcap"])
+    assert source.spec.streams == ("x1", "x3")
+    np.testing.assert_array_equal(source.take(1, 9).frames, OscillatorySource().take(2, 9).frames)
+
+
+def test_what_does_not_belong_together_is_refused(vectors: Path, pictures: Path) -> None:
+    with pytest.raises(LogDamagedError, match="not of"):
+        RecordedSource([vectors, pictures])
+    with pytest.raises(LogDamagedError, match="doubled"):
+        RecordedSource([vectors / "x1.mcap", vectors / "x1.mcap"])
+    with pytest.raises(UsageError, match="no such"):
+        RecordedSource(vectors / "nothing")
+
+
+def damage(path: Path) -> tuple[int, int]:
+    """Flip a byte in the third chunk; give its first and last log time."""
+    raw = bytearray(path.read_bytes())
+    with LogReader(path) as reader:
+        chunk = reader.segments[2]
+    raw[chunk.data_offset + chunk.stored // 2] ^= 4
+    path.write_bytes(raw)
+    return chunk.start, chunk.end
+
+
+def test_damage_stops_and_is_named(copy: Path) -> None:
+    start, end = damage(copy / "x1.mcap")
+    with pytest.raises(LogDamagedError, match=rf"x1\.mcap.*{start} to {end}"):
+        RecordedSource(copy)
+
+
+def test_salvage_leaves_the_damage_out_of_every_view(copy: Path) -> None:
+    damage(copy / "x1.mcap")
+    source = RecordedSource(copy, salvage=True)
+    assert source.frames == FRAMES - 50
+    assert any("50 frames" in w for w in source.warnings)
+    live = OscillatorySource()
+    expected = np.concatenate([live.take(2, FRAMES).frames[:100], live_frames(2, 150, FRAMES)])
+    np.testing.assert_array_equal(source.take(2, FRAMES - 50).frames, expected)
+
+
+def live_frames(stream: int, start: int, stop: int) -> np.ndarray:
+    live = OscillatorySource()
+    live.seek(start)
+    return live.take(stream, stop - start).frames
+
+
+def test_verify_finds_what_is_wrong(vectors: Path, copy: Path) -> None:
+    assert verify(vectors)["ok"]
+    damage(copy / "x1.mcap")
+    raw = (copy / "x2.mcap").read_bytes()
+    (copy / "x2.mcap").write_bytes(raw[:-500])
+    (copy / "x3.mcap").unlink()
+    report = verify(copy)
+    assert not report["ok"]
+    told = " | ".join(f"{p['where']}: {p['what']}" for p in report["problems"])
+    for expected in ("CRC", "frames 100 to 149 are missing", "x2.mcap: ", "'x3'"):
+        assert expected in told
+
+
+def test_info_says_what_is_there(vectors: Path, copy: Path, pictures: Path) -> None:
+    whole = describe(vectors)
+    assert (whole["kind"], whole["complete"], whole["crc"]) == ("recording", True, "ok")
+    views = [c for c in whole["channels"] if c["topic"].startswith("/view/")]
+    assert [c["messages"] for c in views] == [FRAMES] * 3
+    assert {c["schema"] for c in views} == {"cdmisfa.Vector"}
+    assert views[0]["end_ns"] - views[0]["start_ns"] == (FRAMES - 1) * 20_000_000
+    damage(copy / "x1.mcap")
+    assert describe(copy / "x1.mcap")["crc"] == "bad"
+    raw = (copy / "x2.mcap").read_bytes()
+    (copy / "x2.mcap").write_bytes(raw[: len(raw) // 2])
+    torn = describe(copy / "x2.mcap")
+    assert not torn["complete"]
+    assert torn["channels"][0]["messages"] > 0
+
+
+def test_recover_saves_what_is_readable(copy: Path, tmp_path: Path) -> None:
+    damage(copy / "x1.mcap")
+    report = recover(copy / "x1.mcap", tmp_path / "saved.mcap")
+    assert not report["complete"]
+    assert {(c["topic"], c["kept"], c["lost"]) for c in report["channels"]} == {
+        ("/view/x1", FRAMES - 50, 50),
+        ("/truth", FRAMES - 50, 50),
+    }
+    with (
+        LogReader(copy / "x1.mcap", salvage=True) as old,
+        LogReader(tmp_path / "saved.mcap") as new,
+    ):
+        assert new.complete
+        assert [m.data for m in old.messages()] == [m.data for m in new.messages()]
+        assert old.metadata == new.metadata
+    with pytest.raises(UsageError, match="--force"):
+        recover(copy / "x1.mcap", tmp_path / "saved.mcap")
+
+
+def test_a_recovered_folder_plays(copy: Path, tmp_path: Path) -> None:
+    raw = (copy / "x2.mcap").read_bytes()
+    (copy / "x2.mcap").unlink()
+    (copy / "x2.mcap.partial").write_bytes(raw[: len(raw) // 2])
+    report = recover(copy, tmp_path / "saved")
+    assert not report["complete"]
+    assert any(c["lost"] is None for c in report["channels"])
+    assert (tmp_path / "saved" / "x2.mcap").exists()
+    same(RecordedSource(tmp_path / "saved").take(1, 90), OscillatorySource().take(1, 90))
+
+
+def test_recovering_a_whole_log_keeps_everything(vectors: Path, tmp_path: Path) -> None:
+    report = recover(vectors, tmp_path / "saved")
+    assert report["complete"]
+    assert not report["lost"]
+    assert verify(tmp_path / "saved")["ok"]
+
+
+def test_memory_does_not_grow_with_the_length(pictures: Path) -> None:
+    source = RecordedSource(pictures, loop=True)
+    source.take(0, 40)
+    reader = source._views[0][0].reader
+    held = reader._cached
+    for _ in range(30):
+        source.take(0, 40)
+    assert reader._cached <= max(held, 1024 * 1024)
