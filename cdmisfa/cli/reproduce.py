@@ -68,7 +68,7 @@ def reproduce_command(
                 request,
                 engine=engine,
                 scheduler=scheduler,
-                progress=lambda done, total, shown=shown: shown.update(done, total),
+                progress=shown.update,
             )
         seconds = time.monotonic() - started
         click.echo(

@@ -1,0 +1,138 @@
+"""Panels of the paper's figures, drawn without a screen; every figure as PNG and SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Float = NDArray[np.float64]
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, told apart by every kind of eye; one for each stream."""
+
+STREAM_NAMES = ("$s_1$", "$s_2$", "$s_3$")
+
+
+def figure(rows: int, columns: int, *, width: float = 3.4, height: float = 2.4) -> tuple[Any, Any]:
+    """A figure of panels and its (rows, columns) axes.
+
+    Args:
+        rows: of panels.
+        columns: of panels.
+        width: of a panel, inches.
+        height: of a panel, inches.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn = Figure(figsize=(columns * width, rows * height), layout="constrained")
+    FigureCanvasAgg(drawn)
+    return drawn, drawn.subplots(rows, columns, squeeze=False)
+
+
+def save(drawn: Figure, folder: Path, name: str) -> list[Path]:
+    """Write NAME.png and NAME.svg; the same figure gives the same bytes."""
+    import matplotlib
+
+    paths = [folder / f"{name}.png", folder / f"{name}.svg"]
+    with matplotlib.rc_context({"svg.hashsalt": name}):
+        drawn.savefig(paths[0], dpi=150, metadata={"Software": None})
+        drawn.savefig(paths[1], metadata={"Date": None})
+    return paths
+
+
+def label(axes: Axes, letter: str, x: str, y: str) -> None:
+    """Letter a panel and name its axes."""
+    axes.set_title(f"({letter})", loc="left", fontsize=9)
+    axes.set_xlabel(x, fontsize=8)
+    axes.set_ylabel(y, fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def stack(curves: Sequence[NDArray[Any]]) -> Float:
+    """Curves of different lengths as one array (trials, longest, ...), NaN after their ends."""
+    longest = max(len(c) for c in curves)
+    out = np.full((len(curves), longest, *curves[0].shape[1:]), np.nan)
+    for row, curve in zip(out, curves, strict=True):
+        row[: len(curve)] = curve
+    return out
+
+
+def mean_sd(stacked: Float) -> tuple[Float, Float]:
+    """Mean and standard deviation over trials, of those that still run."""
+    count = np.isfinite(stacked).sum(axis=0)
+    safe = np.maximum(count, 1)
+    mean = np.where(count > 0, np.nansum(stacked, axis=0) / safe, np.nan)
+    square = np.nansum((stacked - mean) ** 2, axis=0) / safe
+    return mean, np.where(count > 0, np.sqrt(square), np.nan)
+
+
+def eta_dot(axes: Axes, curves: Sequence[NDArray[Any]], delta: float, letter: str) -> None:
+    """Derivative of slowness over iterations: every trial, their mean dashed, and delta."""
+    stacked = stack([np.max(np.asarray(c), axis=-1) for c in curves])
+    for row in stacked:
+        axes.plot(row, color=COLOURS[0], alpha=0.25, linewidth=0.5)
+    axes.plot(mean_sd(stacked)[0], color="black", linestyle="--", linewidth=0.9, label="mean")
+    axes.axhline(delta, color=COLOURS[1], linewidth=0.8, label=r"$\delta$")
+    axes.set_yscale("log")
+    axes.legend(fontsize=6)
+    label(axes, letter, "iteration", r"$|\dot\eta|$")
+
+
+def per_stream(
+    axes: Axes,
+    curves: Sequence[NDArray[Any]],
+    letter: str,
+    y: str,
+    *,
+    each: bool = False,
+    names: Sequence[str] = STREAM_NAMES,
+) -> None:
+    """One colour a stream: every trial where `each`, else mean and a band of one SD.
+
+    Args:
+        axes: panel.
+        curves: (N, S) of each trial.
+        letter: of the panel.
+        y: name of the axis.
+        each: draw every trial.
+        names: of the streams.
+    """
+    stacked = stack(curves)
+    mean, sd = mean_sd(stacked)
+    steps = np.arange(stacked.shape[1])
+    for s in range(stacked.shape[2]):
+        colour = COLOURS[s % len(COLOURS)]
+        if each:
+            for row in stacked[:, :, s]:
+                axes.plot(row, color=colour, alpha=0.25, linewidth=0.4)
+        else:
+            axes.fill_between(
+                steps, mean[:, s] - sd[:, s], mean[:, s] + sd[:, s], color=colour, alpha=0.2, lw=0
+            )
+        axes.plot(mean[:, s], color=colour, linewidth=1.0, label=names[s])
+    settled = stacked[:, 30:] if stacked.shape[1] > 60 else stacked
+    low, high = np.nanquantile(settled, 0.001), np.nanquantile(settled, 0.999)
+    axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+    axes.legend(fontsize=6)
+    label(axes, letter, "iteration", y)
+
+
+def policy_bars(axes: Axes, policies: Sequence[NDArray[Any]], letter: str, title: str) -> None:
+    """Share of trials whose policy leaves each stream: 0 all stay, 1 all switch."""
+    stacked = np.asarray(policies, dtype=float)
+    for s in range(stacked.shape[1]):
+        axes.bar(s, stacked[:, s].mean(), color=COLOURS[s], width=0.7)
+        axes.plot([s - 0.35, s + 0.35], [stacked[:, s].mean()] * 2, color=COLOURS[s], linewidth=2)
+    axes.set_xticks(range(stacked.shape[1]), STREAM_NAMES[: stacked.shape[1]])
+    axes.set_ylim(-0.05, 1.05)
+    axes.set_yticks([0, 1], ["stay", "switch"])
+    label(axes, letter, title, "policy, mean over trials")
