@@ -44,6 +44,8 @@ class IncSFA:
             xi, (n,): change of phi at each frame, NaN at the first after a gap.
         """
         xi = np.empty(len(frames))
+        frames = frames.view()
+        frames.flags.writeable = False  # numba compiles read-only and writable arrays apart
         self._kernel(self.state, self.params, frames, gap, xi)
         return xi
 

@@ -82,7 +82,7 @@ def group_length(left: int, pending: bool, gap: bool) -> int:
         pending: the frame before followed a gap.
         gap: the first of these frames follows a gap.
     """
-    return min(left, 1 if pending else 2 if gap else GROUP)
+    return min(left, 2 if gap else 1 if pending else GROUP)
 
 
 @compiled
@@ -153,7 +153,7 @@ def learn_group(
             xi[t] = np.nan
             state.counts[1] = 1
             continue
-        mca_step(state.w, z_dot, nu, work)
+        mca_step(state.w, z_dot, now.scale, nu, work)
         features_in_vectors(state.w, state.d, now.scale, now.m)
         if state.counts[1] == 0:
             xi[t] = change_of_features(
@@ -189,7 +189,7 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
     start = count = 0
     while True:
         new_episode = gap and start == 0
-        pending = count > 0 and (state.counts[1] == 1 or (new_episode and count > 1))
+        spans = count > (1 if new_episode else 0) and (new_episode or state.counts[1] == 1)
         learn_group(state, params.nu, group, count, new_episode, steps, now, xi[start:])
         start += count
         following = group_length(n_frames - start, state.counts[1] == 1, gap and start == 0)
@@ -198,11 +198,11 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
             frames, start, following, state.counts[0], params.mean_window,
             coming.u, coming.g, coming.e,
         )  # fmt: skip
-        if pending:
+        if spans:
             xi[start - 1] = slow_features(state.w, now.scale, state.v, state.phi, row)
         if following == 0:
             break
         count = following
         group, coming = coming, group
-    if state.counts[1] == 0 and not pending:
+    if state.counts[1] == 0 and not spans:
         slow_features(state.w, now.scale, state.v, state.phi, row)

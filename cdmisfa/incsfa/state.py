@@ -140,8 +140,8 @@ def amnesic_weight(n: int) -> float:
 def rank_floor(d: Float) -> float:
     """Variance at or below which a component is rounding noise.
 
-    Such a component is whitened to 0, contributes nothing to phi and does not shrink
-    any further; it comes back as soon as the input varies along it.
+    Such a component is whitened to 0, contributes nothing to phi (see also `mca_step`) and
+    does not shrink any further; it comes back as soon as the input varies along it.
 
     Args:
         d: (K,) lengths of the CCIPCA vectors.
@@ -159,20 +159,26 @@ def whitening_scale(d: float, floor: float) -> float:
 
 
 @compiled
-def mca_step(w: Float, z_dot: Float, nu: float, step: Float) -> None:
+def mca_step(w: Float, z_dot: Float, scale: Float, nu: float, step: Float) -> None:
     """Turn each row of w towards the next slowest direction, in place.
 
     Source: Peng and Yi 2006 with sequential addition, as in the authors' IncSFA:
-    gamma = .24 / nu, rate nu / (1 + 1.2 j) for output j from 0.
+    gamma = .24 / nu, rate nu / (1 + 1.2 j) for output j from 0. A component that is
+    rounding noise would look perfectly slow: it counts as unchanged, and its share of a
+    row is halved, so that rows turn to the components that live.
 
     Args:
         w: (J, K) rows of length 1.
-        z_dot: (K,) change of the whitened frame.
+        z_dot: (K,) change of the whitened frame; set to 0 for rounding noise.
+        scale: (K,) whitening scales, 0 for rounding noise.
         nu: learning rate.
         step: (K,) scratch.
     """
     J, K = w.shape
     gamma = 0.24 / nu
+    for k in range(K):
+        if scale[k] == 0.0:
+            z_dot[k] = 0.0
     for j in range(J):
         rate = nu / (1.0 + 1.2 * j)
         along = 0.0
@@ -190,6 +196,8 @@ def mca_step(w: Float, z_dot: Float, nu: float, step: Float) -> None:
         length = 0.0
         for k in range(K):
             w[j, k] = (1.5 - rate) * w[j, k] - rate * step[k]
+            if scale[k] == 0.0:
+                w[j, k] *= 0.5
             length += w[j, k] * w[j, k]
         length = 1.0 / np.sqrt(length)
         for k in range(K):

@@ -167,6 +167,6 @@ def update(state: State, params: Params, frames: NDArray, gap: bool, xi: Float) 
             xi[t] = np.nan
             state.counts[1] = 1
         else:
-            mca_step(state.w, z_dot, params.nu, step)
+            mca_step(state.w, z_dot, scale, params.nu, step)
             xi[t] = slow_features(state.w, scale, state.v, state.phi, row)
             state.counts[1] = 0

@@ -1,0 +1,62 @@
+"""Batch slow feature analysis: the oracle incremental results are compared with.
+
+Source: Wiskott and Sejnowski 2002.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -> Float:
+    """Slowest linear features of unit variance, slowest first.
+
+    Directions whose variance is below `tolerance` times the largest are left out, as
+    they hold rounding noise.
+
+    Args:
+        frames: (n, I) consecutive frames.
+        outputs: J, how many features.
+        tolerance: least share of the largest variance.
+
+    Returns:
+        (J, I) weights of the centred frame.
+
+    Raises:
+        ValueError: the frames vary in fewer than J directions.
+    """
+    x = np.asarray(frames, dtype=np.float64)
+    x = x - x.mean(axis=0)
+    _, deviation, directions = np.linalg.svd(x / np.sqrt(len(x)), full_matrices=False)
+    kept = deviation**2 > tolerance * deviation[0] ** 2
+    if kept.sum() < outputs:
+        raise ValueError(f"{outputs} features asked of frames that vary in {kept.sum()} directions")
+    whitening = directions[kept] / deviation[kept, None]
+    change = np.diff(x @ whitening.T, axis=0)
+    _, rotation = np.linalg.eigh(change.T @ change / len(change))
+    return np.asarray(rotation[:, :outputs].T @ whitening)
+
+
+def slowness(y: Float) -> Float:
+    """Slowness of each output over a whole sequence; smaller is slower.
+
+    Equation: 2
+
+    Args:
+        y: (n, J) outputs of consecutive frames.
+
+    Returns:
+        (J,) in 1/frame: sqrt(E(ydot^2) / Var(y)) / (2 pi).
+    """
+    change = np.diff(y, axis=0)
+    return np.asarray(np.sqrt((change**2).mean(axis=0) / y.var(axis=0)) / (2 * np.pi))
+
+
+def direction_cosine(a: Float, b: Float) -> float:
+    """|cos| of the angle between two vectors of weights: 1 for the same feature up to sign."""
+    return float(abs(a @ b) / np.sqrt((a @ a) * (b @ b)))

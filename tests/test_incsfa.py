@@ -1,0 +1,264 @@
+"""The IncSFA kernels: against the equations, batch SFA and each other."""
+
+import numpy as np
+import pytest
+
+from cdmisfa.blocks import freeze
+from cdmisfa.config import LearnerConfig
+from cdmisfa.expansion import quadratic
+from cdmisfa.incsfa import IncSFA, copy_into, gram, new_state, parameters, project, strict
+from cdmisfa.incsfa.state import PIXEL, State, rank_floor
+from cdmisfa.sfa import batch_sfa, direction_cosine, slowness
+from cdmisfa.streams import OscillatorySource, one_period
+
+
+class PlainIncSFA:
+    """The rule written once more, frame by frame in numpy, in any float type."""
+
+    def __init__(self, state: State, config: LearnerConfig, dtype=np.float64):
+        self.config, self.n, self.dtype = config, 0, dtype
+        self.mean, self.v, self.w = (x.astype(dtype) for x in (state.mean, state.v, state.w))
+        self.phi = state.phi.astype(dtype)
+        self.z_prev = None
+
+    def learn(self, x, gap=False):
+        nu, one = self.dtype(self.config.nu), self.dtype(1)
+        x = x.astype(self.dtype)
+        self.n += 1
+        self.mean = self.mean + max(2 * one / (self.config.mean_window + 1), one / self.n) * (
+            x - self.mean
+        )
+        u = x if self.n == 1 else x - self.mean
+        k = self.dtype(self.n + 1)
+        amnesia = 0 if k < 20 else 3 * (k - 20) / 180 if k < 200 else 3 + (k - 200) / 2000
+        weight = (1 + amnesia) / k
+        r = u.copy()
+        for v in self.v:
+            v[:] = (1 - weight) * v + weight * (r @ v) / np.sqrt(v @ v) * r
+            r -= (r @ v) / (v @ v) * v
+        scale = np.sqrt((self.v**2).sum(axis=1)) ** self.dtype(-1.5)
+        z = (self.v @ u) * scale
+        before, self.z_prev = self.z_prev, z
+        if gap or before is None:
+            return np.nan
+        z_dot = z - before
+        for j, w in enumerate(self.w):
+            step = z_dot * (z_dot @ w)
+            for p in self.w[:j]:
+                step += (24 * one / 100) / nu * p * (p @ w)
+            rate = nu / (1 + 12 * one / 10 * j)
+            w[:] = (3 * one / 2 - rate) * w - rate * step
+            w /= np.sqrt(w @ w)
+        old, self.phi = self.phi, (self.w * scale) @ self.v
+        return float(np.sqrt(((self.phi - old) ** 2).sum()))
+
+
+def config_of(components: int, outputs: int, **more) -> LearnerConfig:
+    return LearnerConfig(components=components, outputs=outputs, nu=0.02, **more)
+
+
+def latent_frames(n: int, size: int, seed: int = 0) -> np.ndarray:
+    """Frames of a few latents of different speed, with noise, around one half."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n)[:, None]
+    latents = np.sin(t * np.linspace(0.02, 1.3, 10) + np.arange(10)) * np.linspace(1.0, 0.3, 10)
+    mixing = rng.standard_normal((10, size)) / 10
+    return freeze(0.5 + latents @ mixing + 0.02 * rng.standard_normal((n, size)))
+
+
+def learn_in(kernel, config, frames, cuts, gaps=(), seed=3):
+    """State and xi after learning from blocks of the lengths `cuts`; `gaps` are block numbers."""
+    state = new_state(np.random.default_rng(seed), frames.shape[1], config)
+    xi = np.full(len(frames), -1.0)
+    start = 0
+    for number, length in enumerate(cuts):
+        part = slice(start, start + length)
+        kernel.update(state, parameters(config), frames[part], number in gaps, xi[part])
+        start += length
+    assert start == len(frames)
+    return state, xi
+
+
+def assert_states_close(a: State, b: State, rtol: float) -> None:
+    for name in ("mean", "v", "d", "w", "z_prev", "phi"):
+        x, y = getattr(a, name), getattr(b, name)
+        np.testing.assert_allclose(x, y, rtol=0, atol=rtol * np.abs(x).max(), err_msg=name)
+    np.testing.assert_array_equal(a.counts[:2], b.counts[:2])
+
+
+@pytest.mark.parametrize("stream", [0, 1, 2])
+def test_each_oscillatory_stream_alone_gives_the_slow_feature_of_batch_sfa(stream):
+    config = LearnerConfig()
+    sfa = IncSFA(config, 5, np.random.default_rng(stream))
+    source = OscillatorySource()
+    for _ in range(300):
+        sfa.update(quadratic(source.take(stream, 100).frames))
+    x = quadratic(one_period(f"x{stream + 1}"))
+    y = project(sfa.phi, sfa.phi @ sfa.mean, np.tile(x, (4, 1)))
+    assert slowness(y)[0] == pytest.approx([0.008, 0.006, 0.004][stream], rel=0.01)
+    assert y.var() == pytest.approx(1.0, abs=0.1)
+    assert direction_cosine(sfa.phi[0], batch_sfa(np.tile(x, (2, 1)), 1)[0]) > 0.99
+
+
+@pytest.mark.parametrize("kernel", [strict, gram])
+@pytest.mark.parametrize(("size", "components", "outputs"), [(5, 5, 3), (300, 7, 1), (513, 6, 5)])
+def test_kernels_follow_the_equations(kernel, size, components, outputs):
+    config = config_of(components, outputs, mean_window=50)
+    frames = latent_frames(300, size)
+    cuts, gaps = [1, 1, 2, 3, 43, 50, 1, 1, 98, 100], (3, 5, 6, 9)
+    state, xi = learn_in(kernel, config, frames, cuts, gaps)
+    start = new_state(np.random.default_rng(3), size, config)
+    plain = PlainIncSFA(start, config, np.longdouble)
+    starts = np.cumsum([0, *cuts])
+    expected = [plain.learn(x, t in starts[list(gaps)]) for t, x in enumerate(frames)]
+    np.testing.assert_allclose(xi, expected, rtol=1e-8)
+    for name in ("mean", "v", "w", "z_prev", "phi"):
+        x, y = getattr(state, name), getattr(plain, name).astype(float)
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-9 * np.abs(y).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 41])
+@pytest.mark.parametrize("gap", [False, True])
+def test_gram_kernel_follows_the_strict_one_whatever_the_blocks_length(length, gap):
+    config = config_of(6, 2)
+    frames = latent_frames(5 * length, 260)
+    cuts, gaps = [length] * 5, (2, 3) if gap else ()
+    a, xi_a = learn_in(strict, config, frames, cuts, gaps)
+    b, xi_b = learn_in(gram, config, frames, cuts, gaps)
+    np.testing.assert_allclose(xi_b, xi_a, rtol=1e-9)
+    assert np.isnan(xi_a).sum() == 1 + len(gaps)
+    assert_states_close(a, b, 1e-10)
+    np.testing.assert_allclose(b.gram, b.v @ b.v.T, rtol=0, atol=1e-12 * b.gram.max())
+
+
+def test_gram_kernel_is_as_near_to_long_double_as_two_direct_orders_are():
+    config = config_of(8, 2)
+    frames = freeze(np.round(latent_frames(2400, 400) * 255) / 255)
+    order = np.random.default_rng(5).permutation(400)
+    start = new_state(np.random.default_rng(3), 400, config)
+    shuffled = new_state(np.random.default_rng(3), 400, config)
+    shuffled.v[:] = start.v[:, order]
+    xi = np.empty(len(frames))
+    strict.update(
+        shuffled, parameters(config), freeze(np.ascontiguousarray(frames[:, order])), False, xi
+    )
+    direct, _ = learn_in(strict, config, frames, [2400])
+    block, _ = learn_in(gram, config, frames, [40] * 60)
+    plain = PlainIncSFA(start, config, np.longdouble)
+    for x in frames:
+        plain.learn(x)
+    exact = plain.phi.astype(float)
+    back = np.argsort(order)
+    spread = max(np.abs(direct.phi - exact).max(), np.abs(shuffled.phi[:, back] - exact).max())
+    assert np.abs(block.phi - exact).max() < 5 * spread + 1e-12 * np.abs(exact).max()
+
+
+def test_error_of_the_carried_gram_matrix_does_not_grow():
+    config = config_of(7, 1)
+    frames = latent_frames(4000, 256)
+    state, _ = learn_in(gram, config, frames, [40] * 100)
+    lengths = state.d[:, None] * state.d
+    assert np.abs((state.gram - state.v @ state.v.T) / lengths).max() < 1e-12
+
+
+@pytest.mark.parametrize("kernel", [strict, gram])
+def test_pixels_are_learned_like_their_255ths(kernel):
+    config = config_of(5, 1)
+    pixels = freeze(np.round(latent_frames(120, 320) * 255).clip(0, 255).astype(np.uint8))
+    a, xi_a = learn_in(kernel, config, pixels, [40] * 3)
+    b, xi_b = learn_in(kernel, config, freeze(pixels * PIXEL), [40] * 3)
+    np.testing.assert_allclose(xi_a, xi_b, rtol=1e-9)
+    assert_states_close(a, b, 1e-11)
+    y = project(a.phi, a.phi @ a.mean, pixels)
+    np.testing.assert_allclose(y, (pixels / 255.0 - a.mean) @ a.phi.T, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", [strict, gram])
+@pytest.mark.parametrize("rank", [0, 1, 2])
+def test_directions_without_variance_give_no_output(kernel, rank):
+    """60,000 frames later the vectors that nothing feeds have shrunk to the floor, and rest."""
+    config = config_of(5, 1)
+    rng = np.random.default_rng(0)
+    t = np.arange(500)[:, None]
+    latents = np.sin(t * 2 * np.pi * np.array([1, 7])[:rank] / 500)
+    frames = freeze(0.5 + latents @ rng.standard_normal((rank, 220)))
+    state = new_state(rng, 220, config)
+    state.counts[0] = 10_000_000
+    state.mean[:] = frames.mean(axis=0)
+    if rank == 0:
+        state.v[:] *= 1e-25
+        state.d[:] *= 1e-25
+    xi = np.empty(500)
+    for _ in range(120):
+        kernel.update(state, parameters(config), frames, False, xi)
+    assert all(np.isfinite(a).all() for a in state)
+    floor = rank_floor(state.d)
+    at_rest = state.d <= floor
+    assert at_rest.sum() == (5 if rank == 0 else 4 if rank == 1 else 2)
+    assert (state.d[at_rest] > 0.9 * floor).all()
+    assert (state.z_prev[at_rest] == 0).all()
+    if rank == 1:
+        y = project(state.phi, state.phi @ state.mean, frames)
+        assert slowness(y)[0] == pytest.approx(1 / 500, rel=0.05)
+        assert y.var() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_component_at_rest_wakes_when_the_input_varies_along_it():
+    config = config_of(2, 1)
+    state = new_state(np.random.default_rng(0), 3, config)
+    state.counts[0] = 1000
+    state.v[:] = [[1.0, 0.0, 0.0], [0.0, 1e-14, 0.0]]
+    state.d[:] = [1.0, 1e-14]
+    frames = freeze(np.random.default_rng(1).standard_normal((400, 3)) * [1.0, 0.5, 0.0])
+    strict.update(state, parameters(config), frames, True, np.empty(400))
+    assert state.d[1] > 1e-3
+    assert np.abs(state.z_prev[1]) > 0
+
+
+@pytest.mark.parametrize("size", [5, 300])
+def test_same_blocks_give_the_same_bits_and_inputs_stay(size):
+    config = config_of(4, 2)
+    frames = latent_frames(200, size)
+    results = []
+    for _ in range(2):
+        sfa = IncSFA(config, size, np.random.default_rng(0))
+        xi = np.concatenate([sfa.update(frames[k : k + 40], k == 80) for k in range(0, 200, 40)])
+        results.append((xi.tobytes(), *(a.tobytes() for a in sfa.state)))
+    assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("kernel", [strict, gram])
+def test_a_saved_state_goes_on_with_the_same_bits(kernel):
+    config = config_of(4, 1)
+    frames = latent_frames(2400, 210)
+    a, xi = learn_in(kernel, config, frames, [40] * 60)
+    half, _ = learn_in(kernel, config, frames[:1200], [40] * 30)
+    copy = new_state(np.random.default_rng(9), 210, config)
+    copy_into(half, copy)
+    rest = np.empty(1200)
+    for k in range(0, 1200, 40):
+        block = frames[1200 + k : 1240 + k]
+        kernel.update(copy, parameters(config), block, False, rest[k : k + 40])
+    assert rest.tobytes() == xi[1200:].tobytes()
+    assert all(x.tobytes() == y.tobytes() for x, y in zip(a, copy, strict=True))
+
+
+def test_strict_bits_do_not_depend_on_how_frames_are_cut():
+    config = config_of(5, 1)
+    frames = latent_frames(300, 5)
+    a, xi_a = learn_in(strict, config, frames, [300])
+    b, xi_b = learn_in(strict, config, frames, [1, 99, 7, 193])
+    assert xi_a.tobytes() == xi_b.tobytes()
+    assert a.phi.tobytes() == b.phi.tobytes()
+
+
+def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it():
+    rng = np.random.default_rng(0)
+    phi, offset = rng.standard_normal((4, 1300)), rng.standard_normal(4)
+    frames = rng.standard_normal((9, 1300))
+    stacked = project(phi, offset, frames)
+    np.testing.assert_allclose(stacked, frames @ phi.T - offset, rtol=1e-10, atol=1e-10)
+    for row in range(4):
+        alone = project(phi[row : row + 1], offset[row : row + 1], frames[2:5])
+        assert alone[:, 0].tobytes() == stacked[2:5, row].tobytes()
+    assert project(phi[:0], offset[:0], frames).shape == (9, 0)
