@@ -1,0 +1,243 @@
+"""Other people's camera logs become the frames they should, or are refused by name."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from PIL import Image
+from source_contract import SourceContract
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.errors import LogDamagedError, UsageError
+from replay.foreign import ForeignSource
+from replay.images import ENCODINGS, RawPixels, gray, image_decoder, shrink
+from replay.records import MalformedRecord
+
+RANDOM = np.random.default_rng(5)
+GRAY = RANDOM.integers(0, 256, (6, 8), np.uint8)
+COLOUR = RANDOM.integers(0, 256, (6, 8, 3), np.uint8)
+
+
+def cdr(*, height: int, width: int, encoding: str, big: int, step: int, data: bytes) -> bytes:
+    out = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + struct.pack("<I", 4) + b"cam\0"
+    out += struct.pack("<II", height, width)
+    out += struct.pack("<I", len(encoding) + 1) + encoding.encode() + b"\0" + bytes([big])
+    out += bytes(-(len(out) - 4) % 4) + struct.pack("<II", step, len(data))
+    return out + data
+
+
+def ros1(*, height: int, width: int, encoding: str, big: int, step: int, data: bytes) -> bytes:
+    out = struct.pack("<III", 1, 5, 6) + struct.pack("<I", 3) + b"cam"
+    out += struct.pack("<II", height, width) + struct.pack("<I", len(encoding)) + encoding.encode()
+    return out + bytes([big]) + struct.pack("<II", step, len(data)) + data
+
+
+def raw_protobuf(**fields: object) -> bytes:
+    fields.pop("big")
+    return RawImage(frame_id="cam", **fields).SerializeToString()  # type: ignore[arg-type]
+
+
+def raw_json(**fields: object) -> bytes:
+    data = base64.b64encode(fields.pop("data")).decode()  # type: ignore[arg-type]
+    return json.dumps(fields | {"data": data, "frame_id": "cam"}).encode()
+
+
+RAW: dict[tuple[str, str], Callable[..., bytes]] = {
+    ("sensor_msgs/msg/Image", "cdr"): cdr,
+    ("sensor_msgs/Image", "ros1"): ros1,
+    ("foxglove.RawImage", "protobuf"): raw_protobuf,
+    ("foxglove.RawImage", "json"): raw_json,
+}
+
+
+def pixels(encoding: str, *, big: bool = False, pad: int = 0) -> tuple[bytes, int, int]:
+    """The test image in a format: its bytes, its step, and its height."""
+    if encoding in ("mono8", "8UC1"):
+        rows = GRAY.reshape(6, 8)
+    elif encoding in ("mono16", "16UC1"):
+        rows = (GRAY.astype(np.uint16) << 8 | 77).astype(">u2" if big else "<u2").view(np.uint8)
+    else:
+        planes = COLOUR if encoding.startswith("rgb") else COLOUR[:, :, ::-1]
+        if "a" in encoding or encoding == "8UC4":
+            planes = np.concatenate([planes, np.full((6, 8, 1), 9, np.uint8)], axis=2)
+        rows = planes.reshape(6, -1)
+    rows = np.concatenate([rows.reshape(6, -1), np.full((6, pad), 123, np.uint8)], axis=1)
+    return rows.tobytes(), rows.shape[1], 6
+
+
+@pytest.mark.parametrize("kind", RAW)
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("pad", [0, 5])
+def test_pixels_of_every_format_become_gray(kind: tuple[str, str], encoding: str, pad: int) -> None:
+    data, step, height = pixels(encoding, pad=pad)
+    made = RAW[kind](height=height, width=8, encoding=encoding, big=0, step=step, data=data)
+    decoder = image_decoder(*kind)
+    assert decoder is not None
+    expected = GRAY
+    if encoding not in ("mono8", "mono16", "8UC1", "16UC1"):
+        expected = np.asarray(Image.fromarray(COLOUR).convert("L"))
+    np.testing.assert_array_equal(decoder(made), expected)
+
+
+def test_big_endian_pixels_are_read_as_such() -> None:
+    data, step, height = pixels("mono16", big=True)
+    for kind in (("sensor_msgs/msg/Image", "cdr"), ("sensor_msgs/Image", "ros1")):
+        made = RAW[kind](height=height, width=8, encoding="mono16", big=1, step=step, data=data)
+        decoder = image_decoder(*kind)
+        assert decoder is not None
+        np.testing.assert_array_equal(decoder(made), GRAY)
+
+
+def encoded(image: np.ndarray, kind: str) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, kind, **({"quality": 95} if kind == "JPEG" else {}))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+@pytest.mark.parametrize("image", [GRAY, COLOUR], ids=["gray", "colour"])
+def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
+    smooth = np.asarray(Image.fromarray(image).resize((64, 48), Image.Resampling.BICUBIC))
+    data = encoded(smooth, kind)
+    header = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + struct.pack("<I", 4) + b"cam\0"
+    ros2 = (
+        header + struct.pack("<I", 5) + b"jpeg\0" + bytes(3) + struct.pack("<I", len(data)) + data
+    )
+    one = struct.pack("<IIII", 1, 5, 6, 3) + b"cam" + struct.pack("<I", 4) + b"jpeg"
+    one += struct.pack("<I", len(data)) + data
+    messages = {
+        ("foxglove.CompressedImage", "protobuf"): CompressedImage(data=data).SerializeToString(),
+        ("foxglove.CompressedImage", "json"): raw_json(data=data, format="jpeg"),
+        ("sensor_msgs/msg/CompressedImage", "cdr"): ros2,
+        ("sensor_msgs/CompressedImage", "ros1"): one,
+    }
+    expected = np.asarray(Image.fromarray(smooth).convert("L"), np.int64)
+    for which, message in messages.items():
+        decoder = image_decoder(*which)
+        assert decoder is not None
+        assert abs(decoder(message) - expected).max() <= (0 if kind == "PNG" else 6)
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "32FC1", "yuv422", ""])
+def test_other_formats_are_refused_by_name(encoding: str) -> None:
+    with pytest.raises(MalformedRecord, match=repr(encoding)):
+        gray(RawPixels(6, 8, encoding, False, 8, bytes(48)))
+
+
+@given(data=st.binary(max_size=300), which=st.sampled_from(sorted(RAW)))
+def test_bytes_that_are_no_image_are_refused(data: bytes, which: tuple[str, str]) -> None:
+    decoder = image_decoder(*which)
+    assert decoder is not None
+    try:
+        image = decoder(data)
+    except MalformedRecord:
+        return
+    assert image.dtype == np.uint8
+
+
+def test_an_image_is_averaged_over_areas() -> None:
+    image = RANDOM.integers(0, 256, (96, 256), np.uint8)
+    expected = image.reshape(48, 2, 128, 2).mean(axis=(1, 3))
+    assert abs(shrink(image, 48, 128) - expected).max() <= 1
+    with pytest.raises(MalformedRecord, match="--size"):
+        shrink(image, 100, 128)
+
+
+def write(
+    path: Path, streams: dict[str, tuple[int, int]], *, schema: str = "foxglove.RawImage"
+) -> None:
+    """A log with `count` images on each topic, `step` milliseconds apart; all are of one value."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=3000)
+        writer.start()
+        number = writer.register_schema(schema, "protobuf", b"")
+        messages = []
+        for topic, (count, step) in streams.items():
+            channel = writer.register_channel(topic, "protobuf", number)
+            for i in range(count):
+                image = RawImage(width=8, height=6, step=8, encoding="mono8", data=bytes([i]) * 48)
+                messages.append((1000 + i * step, channel, image.SerializeToString()))
+        for time, channel, data in sorted(messages):
+            writer.add_message(channel, time * 1_000_000, data, time * 1_000_000)
+        writer.finish()
+
+
+class TestForeign(SourceContract):
+    ends = True
+
+    @pytest.fixture(autouse=True)
+    def _log(self, tmp_path: Path) -> None:
+        self.path = tmp_path / "cameras.mcap"
+        write(self.path, {"/left": (120, 20), "/right": (120, 20)})
+
+    def open(self) -> FrameSource:
+        return ForeignSource(self.path, ["/left", "/right"], size=(3, 4))
+
+
+def test_frames_come_in_order_at_their_rate(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (30, 20)})
+    source = ForeignSource(tmp_path / "a.mcap", ["/right", "/left"], size=(3, 4))
+    assert source.spec.streams == ("/right", "/left")
+    assert (source.spec.fps, source.spec.length) == (50.0, 30)
+    assert source.take(1, 30).frames[:, 0, 0].tolist() == list(range(30))
+    assert source.alignment["/left"] == {"messages": 30, "repeated": 0, "dropped": 0}
+
+
+def test_streams_that_differ_are_refused_with_what_would_work(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (15, 40)})
+    topics = ["/left", "/right"]
+    with pytest.raises(UsageError, match=r"--topic /right --align time --rate 50 "):
+        ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4))
+    source = ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=50)
+    right = source.take(1, 29).frames[:, 0, 0].tolist()
+    assert right == [i // 2 for i in range(29)]
+    assert source.alignment["/right"] == {"messages": 15, "repeated": 14, "dropped": 0}
+    assert source.alignment["/left"] == {"messages": 30, "repeated": 0, "dropped": 1}
+    slow = ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4), align="time", rate=25)
+    assert slow.take(0, 15).frames[:, 0, 0].tolist() == list(range(0, 30, 2))
+    index = ForeignSource(tmp_path / "a.mcap", topics, size=(3, 4), align="index")
+    assert index.spec.length == 15
+    assert index.alignment["/left"]["dropped"] == 15
+
+
+def test_one_log_a_stream(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        write(tmp_path / f"{name}.mcap", {"/image": (10, 20)})
+    files = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    source = ForeignSource(files, size=(3, 4), loop=True)
+    assert source.spec.streams == ("one/image", "two/image")
+    source.seek(8)
+    assert source.take(1, 4).frames[:, 0, 0].tolist() == [8, 9, 0, 1]
+
+
+def test_topics_are_named_where_they_are_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, {"/left": (3, 20), "/right": (3, 20)})
+    with pytest.raises(UsageError, match="/left, /right"):
+        ForeignSource(path, size=(3, 4))
+    with pytest.raises(UsageError, match="no topic /lefd"):
+        ForeignSource(path, ["/lefd"], size=(3, 4))
+    write(path, {"/imu": (3, 20)}, schema="foxglove.Imu")
+    with pytest.raises(UsageError, match=r"foxglove\.Imu in protobuf"):
+        ForeignSource(path, ["/imu"], size=(3, 4))
+
+
+def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write(path, {"/left": (3, 20)})
+    source = ForeignSource(path, size=(60, 80))
+    with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns.*--size"):
+        source.take(0, 1)
+    assert source.t == 0
