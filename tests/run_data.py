@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -83,18 +84,33 @@ def signals_of(
 
 
 def run_of(
-    spec: SourceSpec, iterations: int, *, tau: int = 40, seed: int = 0, outputs: int = 1
+    spec: SourceSpec,
+    iterations: int,
+    *,
+    tau: int = 40,
+    seed: int = 0,
+    outputs: int = 1,
+    saves: bool = False,
 ) -> Iterator[tuple[BlockSignals, Block]]:
     """A run in which a module is frozen after every third of it."""
     rng = np.random.default_rng(seed)
     for k in range(iterations):
         modules = 3 * k // max(iterations, 1)
         signals = signals_of(spec, k, rng, tau=tau, modules=modules, outputs=outputs)
+        saved = saves and 3 * (k + 1) // iterations > modules
+        signals = dataclasses.replace(signals, saved=saved)
         yield signals, block_of(spec, signals.stream, signals.t, tau, rng)
 
 
 def write_run(
-    path: Path, spec: SourceSpec, iterations: int, *, tau: int = 40, seed: int = 0, **options: Any
+    path: Path,
+    spec: SourceSpec,
+    iterations: int,
+    *,
+    tau: int = 40,
+    seed: int = 0,
+    saves: bool = False,
+    **options: Any,
 ) -> list[BlockSignals]:
     """Write such a run to a file and return its records."""
     config = {"learner": {"tau": tau, "delta": DELTA}}
@@ -102,7 +118,7 @@ def write_run(
     writer = RunWriter(path, spec, manifest, **options)
     phi_size = int(np.prod(spec.frame_shape))
     records = []
-    for signals, block in run_of(spec, iterations, tau=tau, seed=seed):
+    for signals, block in run_of(spec, iterations, tau=tau, seed=seed, saves=saves):
         phi = np.full((1, phi_size), float(signals.iteration))
         writer.block(signals, block, phi)
         records.append(signals)
