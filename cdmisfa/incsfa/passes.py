@@ -63,12 +63,12 @@ def centre_tile(
 
 @_reordered
 def gram_tile(u: Float, start: int, g: Float) -> None:
-    """Add a tile's share of the inner products of a group's frames.
+    """Add a tile's share of the inner products of vectors with each other.
 
     Args:
-        u: (GROUP, I) centred frames.
+        u: (K, I) vectors.
         start: first column.
-        g: (GROUP, GROUP), in place.
+        g: (K, K), in place.
     """
     stop = min(start + TILE, u.shape[1])
     for s in range(u.shape[0]):
@@ -231,5 +231,5 @@ def apply_group(
             apply_tile(v, start, tile, shrink, gain, take)
         if count > 0:
             centre_tile(frames, first, count, start, mean, n, window, u_next)
-            gram_tile(u_next, start, g_next)
+            measure_tile(u_next, start, u_next, g_next)
             measure_tile(v, start, u_next, e_next)

@@ -39,12 +39,14 @@ def project(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
     for t in range(n):
         for start in range(0, size, CHUNK):
             width = min(CHUNK, size - start)
+            frame = frames[t, start : start + width]
             for i in range(width):
-                x[i] = frames[t, start + i] * scale
+                x[i] = frame[i] * scale
             for r in range(rows):
                 total = 0.0
+                weights = phi[r, start : start + width]
                 for i in range(width):
-                    total += x[i] * phi[r, start + i]
+                    total += x[i] * weights[i]
                 y[t, r] += total
         for r in range(rows):
             y[t, r] -= offset[r]

@@ -62,11 +62,12 @@ def ccipca_step(v: Float, d: Float, weight: float, r: Float) -> None:
     K, D = v.shape
     floor = rank_floor(d)
     for j in range(K):
+        rate = weight / d[j]  # ahead of the products, which it would otherwise wait for
         projection = 0.0
         for i in range(D):
             projection += r[i] * v[j, i]
         keep = 1.0 - weight if d[j] > floor else 1.0
-        gain = weight * projection / d[j]
+        gain = rate * projection
         square = 0.0
         projection = 0.0
         for i in range(D):
