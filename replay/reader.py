@@ -6,7 +6,6 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 
 from __future__ import annotations
 
-import zlib
 from collections import OrderedDict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from replay.records import (
     MalformedRecord,
     Schema,
     Statistics,
+    crc32,
     decompress,
     decompress_prefix,
 )
@@ -380,7 +380,7 @@ class LogReader:
             table, definitions = walked_table(raw, cut=True)
         else:
             raw = decompress(stored, segment.compression, segment.size)
-            if segment.crc and zlib.crc32(raw) != segment.crc:
+            if segment.crc and crc32(raw) != segment.crc:
                 raise MalformedRecord("its CRC does not match: damaged")
             table, definitions = self._table_of(segment, raw)
             self._check_times(segment, table)

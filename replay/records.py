@@ -18,6 +18,11 @@ from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
 
+try:  # the same number, several times faster
+    from isal.isal_zlib import crc32 as _crc32
+except ImportError:
+    from zlib import crc32 as _crc32
+
 MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD_HEADER: Final = struct.Struct("<BQ")
 MAX_CHUNK: Final = 192 * 1024 * 1024
@@ -211,6 +216,11 @@ def decompress(stored: bytes, compression: str, size: int) -> bytes:
     if len(data) != size:
         raise MalformedRecord(f"it states {size} bytes decompressed and holds {len(data)}")
     return data
+
+
+def crc32(data: bytes, value: int = 0) -> int:
+    """CRC-32 of bytes, going on from the `value` of those before."""
+    return int(_crc32(data, value))
 
 
 def check_size(compression: str, size: int) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from replay.records import (
     channel,
     check_size,
     chunk_header,
+    crc32,
     schema,
     statistics,
 )
@@ -187,7 +187,7 @@ class RandomFile:
         """CRC-32 of the bytes from `offset` to `stop`."""
         value = 0
         for block in self.blocks(offset, stop):
-            value = zlib.crc32(block, value)
+            value = crc32(block, value)
         return value
 
     def close(self) -> None:
