@@ -109,7 +109,8 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     for key, value, group in groups(trials):
         point = point_of_no_return(group)
         points.setdefault(key, {})[value] = point
-        shown = Summary(point.value, math.nan, point.n)
+        inside = CHANGES[-1] <= point.value <= CHANGES[0]
+        shown = Summary(point.value if inside else math.nan, math.nan, point.n)
         lines.append(
             Line(
                 f"epsilon^d at {key} = {value:g}",
@@ -154,15 +155,18 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
             " ".join(f"{v:.3f}" if v < 2 else "above 1" for v in order),
         ),
     ]
-    notes = ["An interval without upper bound: no trial reached the new optimum at any epsilon^c."]
+    notes = [
+        "No value and no upper bound: at no epsilon^c did most trials reach the new optimum, so "
+        "epsilon^d lies above 1."
+    ]
     return Findings(lines, claims, notes)
 
 
 def _rank(point: Midpoint) -> float:
-    """Epsilon^d for comparison: beyond every epsilon where no trial followed the change."""
+    """Epsilon^d for comparison; 2 where it lies above every epsilon^c, 0 where below."""
     if math.isnan(point.value):
-        return 2.0 if math.isinf(point.high) and point.high > 0 else 0.0
-    return point.value
+        return 2.0 if point.low == CHANGES[0] else 0.0
+    return 2.0 if point.value > CHANGES[0] else point.value
 
 
 def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:

@@ -61,9 +61,14 @@ def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     }
 
 
+def expanded_period(stream: int) -> NDArray[np.float64]:
+    """One period of a stream as the learner sees it, (500, 5)."""
+    return quadratic(one_period(STREAMS[stream]))
+
+
 def slowness_on(module: Module) -> float:
     """Slowness of a module's output on one period of its own stream, in cycles per frame."""
-    x = quadratic(one_period(STREAMS[module.stream]))
+    x = expanded_period(module.stream)
     return float(instantaneous_slowness((x - module.mean) @ module.phi[0]))
 
 

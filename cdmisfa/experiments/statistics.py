@@ -101,12 +101,13 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
     total: Float = np.bincount(inverse).astype(np.float64)
     hits = np.asarray(np.bincount(inverse, weights=answer), dtype=np.float64)
     span = float(levels[-1] - levels[0])
-    slopes = np.geomspace(FLATTEST / span, STEEPEST / span, 161)
+    slopes = np.geomspace(FLATTEST / span, STEEPEST / span, 61)
     low, high = float(levels[0] - 2 * span), float(levels[-1] + 2 * span)
     bounds = (-math.inf, math.inf)
-    for _ in range(3):
-        m = np.linspace(low, high, 401)
-        heights = _log_likelihood(levels, hits, total, m, slopes)
+    for _ in range(4):
+        m = np.linspace(low, high, 121)
+        used = slopes
+        heights = _log_likelihood(levels, hits, total, m, used)
         profile = heights.max(axis=1)
         top = int(np.argmax(profile))
         inside = np.flatnonzero(profile > profile[top] - CHI_SQUARE_95 / 2)
@@ -116,8 +117,12 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
             float(m[last]) if last < len(m) - 1 else bounds[1],
         )
         low, high = float(m[max(first - 1, 0)]), float(m[min(last + 1, len(m) - 1)])
-    slope = slopes[int(np.argmax(heights[top]))]
-    return Midpoint(float(m[top]), bounds[0], bounds[1], float(slope), n)
+        likely = np.flatnonzero(heights[inside].max(axis=0) > profile[top] - CHI_SQUARE_95)
+        slopes = np.geomspace(
+            slopes[max(likely[0] - 1, 0)], slopes[min(likely[-1] + 1, len(slopes) - 1)], 61
+        )
+        slope = float(used[int(np.argmax(heights[top]))])
+    return Midpoint(float(m[top]), bounds[0], bounds[1], slope, n)
 
 
 def _log_likelihood(x: Float, hits: Float, total: Float, m: Float, k: Float) -> Float:

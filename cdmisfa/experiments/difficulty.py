@@ -1,0 +1,211 @@
+"""How difficult each stream is for IncSFA alone, by the frames it needs."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.config import LearnerConfig
+from cdmisfa.experiments import icub, oscillatory, panels
+from cdmisfa.experiments.reproduce import Claim, Findings, Line, Request, Settings, Trial
+from cdmisfa.experiments.statistics import stays_above, summary
+from cdmisfa.sfa import batch_sfa, direction_cosine, slowness
+
+TITLE = "Learning difficulty"
+
+THRESHOLD = 0.95
+"""Direction cosine with batch SFA above which a stream counts as learned."""
+
+WHITE_NOISE = math.sqrt(2) / (2 * math.pi)
+"""Slowness of white noise: E(ydot^2) = 2 Var(y)."""
+
+LEARNABLE = 2 / 3
+"""Share of white noise's slowness below which, on held-out frames, a stream is learnable."""
+
+FRAMES = {"oscillatory": 10_000, "icub": 12_000}
+"""Frames IncSFA gets."""
+
+STEP = 20
+"""Frames between two looks at the direction."""
+
+TRAINING = 4000
+"""Frames of a view that batch SFA learns from; as many others test it."""
+
+
+def plan(request: Request) -> list[dict[str, Any]]:
+    """20 seeds of each stream; the iCub's views where there is a recording."""
+    n = request.count(20, 3)
+    trials: list[dict[str, Any]] = [
+        {"scene": "oscillatory", "stream": stream, "recording": None, "identity": None, "seed": s}
+        for stream in range(3)
+        for s in range(n)
+    ]
+    recording = _recording(request)
+    if recording is not None:
+        who = icub.identity(str(recording))
+        trials += [
+            {"scene": "icub", "stream": v, "recording": str(recording), "identity": who, "seed": s}
+            for v in range(3)
+            for s in range(n)
+        ]
+    return trials
+
+
+def _recording(request: Request) -> Path | None:
+    """The recording given, or the one that the experiment `icub` made."""
+    if request.recording is not None and str(request.recording) != icub.LIVE:
+        return request.recording
+    made = request.folder.parent / "icub-recording"
+    return made if (made / "finished.json").exists() and not request.quick else None
+
+
+def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Learn one stream alone and compare with batch SFA as it goes."""
+    scene = settings["scene"]
+    if scene == "oscillatory":
+        config = oscillatory.learner_config()
+        frames = oscillatory.expanded_period(settings["stream"])
+        frames = np.concatenate([frames] * (FRAMES[scene] // len(frames)))
+        # The stream is deterministic: the second half holds nothing that the first does not.
+        training = held_out = frames[: 4 * 500]
+    else:
+        config = icub.learner_config()
+        frames = _view(settings["recording"], settings["stream"], FRAMES[scene])
+        training, held_out = frames[:TRAINING], frames[TRAINING : 2 * TRAINING]
+    return compare(frames, training, held_out, config, settings["seed"])
+
+
+def _view(recording: str, stream: int, count: int) -> NDArray[Any]:
+    """The first frames of a view, flat."""
+    from replay.recorded import RecordedSource
+
+    with contextlib.closing(RecordedSource(recording)) as source:
+        count = min(count, source.frames)
+        return source.take(stream, count).frames.reshape(count, -1)
+
+
+def compare(
+    frames: NDArray[Any],
+    training: NDArray[Any],
+    held_out: NDArray[Any],
+    config: LearnerConfig,
+    seed: int,
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Frames until IncSFA's slowest output stays in the direction of batch SFA's."""
+    from cdmisfa.incsfa import IncSFA
+
+    oracle = slowest(training, config.components)
+    y = (held_out / _unit(held_out)) @ oracle
+    eta = float(slowness(y[:, None])[0])
+    rng = np.random.default_rng(np.random.SeedSequence(seed))
+    sfa = IncSFA(config, frames.shape[1], rng)
+    cosines = []
+    for start in range(0, len(frames) - STEP + 1, STEP):
+        sfa.update(frames[start : start + STEP])
+        cosines.append(direction_cosine(sfa.phi[0], oracle))
+    first = stays_above(cosines, THRESHOLD)
+    learnable = eta < LEARNABLE * WHITE_NOISE
+    row = {
+        "eta_held_out": eta,
+        "learnable": learnable,
+        "frames": (first + 1) * STEP if first >= 0 else None,
+        "cosine": float(np.median(cosines[-50:])),
+    }
+    return row, {"cosine": np.array(cosines, dtype=np.float32)}
+
+
+def slowest(frames: NDArray[Any], components: int) -> NDArray[np.float64]:
+    """Weights of the slowest feature within the leading principal components, by batch SFA."""
+    x = frames / _unit(frames)
+    x = x - x.mean(axis=0)
+    if x.shape[1] > components:
+        moments = x.T @ x if x.shape[1] <= len(x) else x @ x.T
+        _, vectors = np.linalg.eigh(moments)
+        leading = vectors[:, -components:]
+        if x.shape[1] > len(x):
+            leading = x.T @ leading
+            leading /= np.linalg.norm(leading, axis=0)
+    else:
+        leading = np.eye(x.shape[1])
+    return np.asarray(leading @ batch_sfa(x @ leading, 1)[0])
+
+
+def _unit(frames: NDArray[Any]) -> float:
+    return 255.0 if frames.dtype == np.uint8 else 1.0
+
+
+def evaluate(trials: Sequence[Trial]) -> Findings:
+    """Order of the frames needed, and which streams cannot be learned."""
+    lines: list[Line] = []
+    means: dict[tuple[str, int], float] = {}
+    learnable: dict[tuple[str, int], bool] = {}
+    names = {"oscillatory": "stream x{}", "icub": "iCub view {}"}
+    for scene, stream in dict.fromkeys((t.settings["scene"], t.settings["stream"]) for t in trials):
+        group = [
+            t for t in trials if (t.settings["scene"], t.settings["stream"]) == (scene, stream)
+        ]
+        name = names[scene].format(stream + 1)
+        learnable[scene, stream] = all(t.row["learnable"] for t in group)
+        eta = summary([t.row["eta_held_out"] for t in group])
+        lines.append(Line(f"{name}: slowness of batch SFA on held-out frames", "-", eta, digits=4))
+        if learnable[scene, stream]:
+            needed = [t.row["frames"] for t in group]
+            reached = summary([math.nan if f is None else f for f in needed])
+            means[scene, stream] = math.inf if None in needed else reached.mean
+            lines.append(Line(f"{name}: frames until learned", "-", reached, digits=0))
+    order = [means.get(("oscillatory", s), math.inf) for s in range(3)]
+    claims = [
+        Claim(
+            "x1 is easier than x2, and x2 than x3",
+            order[0] < order[1] < order[2] < math.inf,
+            " < ".join(f"{v:.0f}" for v in order) + " frames",
+        )
+    ]
+    if any(scene == "icub" for scene, _ in learnable):
+        one, three = means.get(("icub", 0), math.inf), means.get(("icub", 2), math.inf)
+        claims.append(
+            Claim("view 1 is easier than view 3", one < three, f"{one:.0f} and {three:.0f} frames")
+        )
+        claims.append(
+            Claim(
+                "view 2 is not learnable",
+                not learnable["icub", 1],
+                f"slowness below {LEARNABLE * WHITE_NOISE:.3f} on held-out frames would be",
+            )
+        )
+    notes = [
+        f"White noise has slowness {WHITE_NOISE:.4f}. Only learnable streams have frames; a trial "
+        "that does not stay above a direction cosine of .95 counts as never."
+    ]
+    return Findings(lines, claims, notes)
+
+
+def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
+    """Direction cosine over frames, a colour a stream."""
+    scenes = list(dict.fromkeys(t.settings["scene"] for t in trials))
+    drawn, axes = panels.figure(1, len(scenes))
+    for panel, scene, letter in zip(axes[0], scenes, "ab", strict=False):
+        for stream in range(3):
+            curves = [
+                t.arrays["cosine"]
+                for t in trials
+                if (t.settings["scene"], t.settings["stream"]) == (scene, stream)
+            ]
+            if not curves:
+                continue
+            mean, sd = panels.mean_sd(panels.stack(curves))
+            at = (np.arange(len(mean)) + 1) * STEP
+            colour = panels.COLOURS[stream]
+            panel.fill_between(at, mean - sd, mean + sd, color=colour, alpha=0.2, linewidth=0)
+            panel.plot(at, mean, color=colour, linewidth=1, label=panels.STREAM_NAMES[stream])
+        panel.axhline(THRESHOLD, color="grey", linestyle=":", linewidth=0.8)
+        panel.set_xscale("log")
+        panel.legend(fontsize=6)
+        panels.label(panel, letter, f"frames ({scene})", "|cos| with batch SFA")
+    return panels.save(drawn, folder, "difficulty")

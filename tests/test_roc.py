@@ -1,0 +1,100 @@
+"""Clustering and rewards of CD-MISFA 1.0."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from cdmisfa import roc
+from cdmisfa.blocks import SourceSpec
+from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import UsageError
+from cdmisfa.learner import CuriousLearner
+from cdmisfa.reward import add_reward_locally
+from cdmisfa.streams import OscillatorySource
+from cdmisfa.trial import run_trial
+
+
+def node(streams: int = 2, places: int = 3, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((streams, places, n, 1)), np.zeros((streams, places))
+
+
+def block(value: float, n: int = 4) -> np.ndarray:
+    return np.full((n, 1), value)
+
+
+def test_an_empty_node_is_as_far_as_the_output_is_large() -> None:
+    centres, counts = node()
+    assert roc.nearest(centres[0], counts[0], block(3.0)) == (-1, 3.0)
+
+
+def test_repeated_outputs_become_centres_and_their_errors_vanish() -> None:
+    centres, counts = node()
+    first = [roc.cluster(centres, counts, 0, block(v), 0.3, 40.0) for v in (1.0, -1.0, 5.0)]
+    assert first == [1.0, 2.0, 4.0]
+    again = [roc.cluster(centres, counts, 0, block(v), 0.3, 40.0) for v in (1.0, -1.0, 5.0)]
+    assert again == [0.0, 0.0, 0.0]
+    assert not counts[1].any()
+
+
+def test_a_near_centre_moves_by_one_over_its_count() -> None:
+    centres, counts = node()
+    roc.cluster(centres, counts, 0, block(1.0), 0.3, 1e12)
+    assert roc.cluster(centres, counts, 0, block(1.2), 0.3, 1e12) == pytest.approx(0.2)
+    np.testing.assert_allclose(centres[0, 0], 1.1)
+
+
+def test_a_far_output_takes_the_place_of_the_weakest_centre() -> None:
+    centres, counts = node(places=2)
+    for value in (1.0, 1.0, -1.0, 9.0):
+        roc.cluster(centres, counts, 0, block(value), 0.3, 100.0)
+    assert sorted(centres[0, :, 0, 0].tolist()) == [1.0, 9.0]
+
+
+def test_centres_that_are_not_seen_are_forgotten() -> None:
+    centres, counts = node()
+    roc.cluster(centres, counts, 1, block(1.0), 0.3, 10.0)
+    for _ in range(8):
+        roc.cluster(centres, counts, 0, block(2.0), 0.3, 10.0)
+    assert not counts[1].any()
+    assert counts[0].max() > 1
+
+
+def test_a_block_is_known_to_the_first_module_that_is_near_under_its_label() -> None:
+    centres, counts = node()
+    roc.cluster(centres, counts, 0, block(1.0), 0.3, 40.0)
+    stack, seen = np.stack([centres, centres]), np.stack([counts, counts])
+    outputs = np.stack([block(7.0), block(1.05)])
+    assert roc.known_to(stack, seen, 0, outputs, 0.1) == 2
+    assert roc.known_to(stack, seen, 0, outputs, 0.01) == 0
+    assert roc.known_to(stack, seen, 1, outputs, 0.1) == 0
+
+
+def test_a_local_reward_changes_one_entry_and_the_norm() -> None:
+    stay, switch, dense = np.zeros(3), np.zeros(3), np.zeros((3, 2, 3))
+    add_reward_locally(stay, switch, dense, 0, 0, 0, 1.0, 0.5)
+    add_reward_locally(stay, switch, dense, 1, 1, 0, 2.0, 0.5)
+    norm = add_reward_locally(stay, switch, dense, 1, 1, 2, -4.0, 0.5)
+    assert np.count_nonzero(dense) == 3
+    np.testing.assert_array_equal(stay, [0.5, 0, 0])
+    np.testing.assert_array_equal(switch, [0, 1.0 - 2.0, 0])
+    assert norm == pytest.approx(math.sqrt(0.25 + 1 + 4))
+
+
+def test_1_0_learns_modules_and_its_reward_function_has_norm_1() -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(LearnerConfig(algorithm="1.0"), source.spec, 0)
+    for _ in range(60):
+        signals = learner.step(source.take(learner.stream, learner.tau))
+    assert np.linalg.norm(signals.R) == pytest.approx(1.0)
+    trial = run_trial(LearnerConfig(algorithm="1.0"), seed=0, max_iterations=3000)
+    assert trial.modules
+    assert trial.modules[0].counts.any()
+
+
+def test_1_0_refuses_more_streams_than_its_table_has() -> None:
+    spec = SourceSpec(tuple(f"s{i}" for i in range(65)), (2,), "float64")
+    with pytest.raises(UsageError, match="at most 64 streams"):
+        CuriousLearner(LearnerConfig(algorithm="1.0"), spec, 0)

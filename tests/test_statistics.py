@@ -1,0 +1,91 @@
+"""Statistics with known answers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdmisfa.experiments import statistics
+
+LEVELS = (1.0, 0.96, 0.93, 0.9, 0.86, 0.83, 0.8, 0.76, 0.73, 0.7, 0.6, 0.5, 0.3, 0.1)
+
+
+def answers(
+    midpoint: float, slope: float, seed: int, trials: int = 10
+) -> tuple[list[float], list[bool]]:
+    rng = np.random.default_rng(seed)
+    x = np.repeat(LEVELS, trials)
+    return x.tolist(), (rng.random(len(x)) < 1 / (1 + np.exp(-slope * (x - midpoint)))).tolist()
+
+
+def test_two_levels_with_much_data_have_the_closed_form_fit() -> None:
+    yes = [True] * 1000 + [False] * 9000 + [True] * 6000 + [False] * 4000
+    fit = statistics.logistic_midpoint([0.0] * 10_000 + [1.0] * 10_000, yes)
+    low, high = math.log(1 / 9), math.log(6 / 4)
+    assert fit.value == pytest.approx(-low / (high - low), abs=1e-3)
+    assert fit.slope == pytest.approx(high - low, rel=0.01)
+
+
+def test_confidence_interval_covers_the_true_midpoint() -> None:
+    fits = [statistics.logistic_midpoint(*answers(0.8, 40.0, seed)) for seed in range(25)]
+    covered = sum(fit.low <= 0.8 <= fit.high for fit in fits)
+    assert covered >= 21  # binomial(25, .95) is below 21 once in 4000 times
+    assert all(fit.high - fit.low < 0.1 for fit in fits)
+
+
+def test_answers_that_part_cleanly_have_a_midpoint_between_them() -> None:
+    x = np.repeat(LEVELS, 10)
+    fit = statistics.logistic_midpoint(x, x > 0.81)
+    assert 0.8 < fit.low < fit.value < fit.high < 0.83
+
+
+def test_one_answer_only_has_no_midpoint_but_a_bound() -> None:
+    never = statistics.logistic_midpoint([0.2, 0.9], [False, False])
+    assert math.isnan(never.value)
+    assert (never.low, never.high) == (0.9, math.inf)
+    always = statistics.logistic_midpoint([0.2, 0.9], [True, True])
+    assert (always.low, always.high) == (-math.inf, 0.2)
+
+
+def test_no_interval_where_the_answers_do_not_depend_on_x() -> None:
+    fit = statistics.logistic_midpoint([0, 0, 1, 1] * 5, [0, 1, 0, 1] * 5)
+    assert (fit.low, fit.high) == (-math.inf, math.inf)
+
+
+@settings(max_examples=10, deadline=None)
+@given(shift=st.floats(-5, 5), scale=st.floats(0.2, 5))
+def test_midpoint_moves_with_the_axis(shift: float, scale: float) -> None:
+    x, yes = answers(0.75, 20.0, seed=3)
+    plain = statistics.logistic_midpoint(x, yes)
+    moved = statistics.logistic_midpoint(np.array(x) * scale + shift, yes)
+    assert moved.value == pytest.approx(plain.value * scale + shift, abs=2e-3 * scale)
+
+
+def test_wilson_interval_has_the_textbook_values() -> None:
+    assert statistics.wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert statistics.wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    assert statistics.wilson(0, 0) == (0.0, 1.0)
+
+
+def test_summary_leaves_out_what_is_not_a_number() -> None:
+    assert statistics.summary([2.0, 4.0, math.nan, math.inf]) == statistics.Summary(
+        3.0, math.sqrt(2), 2
+    )
+    assert statistics.summary([]).n == 0
+    assert math.isnan(statistics.summary([1.0]).sd)
+
+
+def test_stays_above_counts_from_the_last_fall() -> None:
+    assert statistics.stays_above([0.99, 0.9, 0.96, 0.97], 0.95) == 2
+    assert statistics.stays_above([0.99, 0.96], 0.95) == 0
+    assert statistics.stays_above([0.99, math.nan], 0.95) == -1
+
+
+def test_correlation_ignores_sign_and_survives_a_constant() -> None:
+    a = np.arange(10.0)
+    assert statistics.correlation(a, 3 - 2 * a) == pytest.approx(1.0)
+    assert statistics.correlation(a, np.ones(10)) == 0.0
