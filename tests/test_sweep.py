@@ -1,0 +1,428 @@
+"""Sweeps compute every trial once, whoever computes it and whatever dies meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import importlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import psutil
+import pytest
+from click.testing import CliRunner
+from engine_tasks import trace
+
+from cdmisfa.cli.results import results_command
+from cdmisfa.cli.sweep import parse_grid, parse_seeds, sweep_command
+from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.experiments import engines
+from cdmisfa.experiments import results as reading
+from cdmisfa.experiments import sweep as sweeping
+from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
+from cdmisfa.experiments.run import learn
+from cdmisfa.experiments.sweep import ROWS, plan, read_rows, sweep
+from cdmisfa.streams import OscillatorySource
+from recorder.recording import record
+
+GRID = {"learner.sigma": [0, 0.0009]}
+
+
+def rows_of(folder: Path) -> dict[str, Any]:
+    """Rows by trial, without where the logs are."""
+    return {row["id"]: {k: v for k, v in row.items() if k != "run"} for row in read_rows(folder)}
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Rows of a sweep in this process."""
+    folder = tmp_path_factory.mktemp("local")
+    report = sweep("oscillatory", folder, grid=GRID, seeds=range(8))
+    assert (report.trials, report.computed, report.failed) == (16, 16, ())
+    return rows_of(folder)
+
+
+# Trials and their identity
+
+
+def test_a_trial_is_named_by_what_it_depends_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def number(**more: Any) -> str:
+        (trial,) = plan("oscillatory", **{"grid": {}, "seeds": [0]} | more)
+        return trial.id
+
+    assert number() == number() == number(settings=["learner.nu=0.05"])
+    others = {
+        number(seeds=[1]),
+        number(settings=["learner.nu=0.06"]),
+        number(grid={"learner.nu": [0.07]}),
+        number(settings=["scene.streams=x1,x2"]),
+        number(max_iterations=10),
+    }
+    monkeypatch.setattr(sweeping, "code", lambda: "0.0.0+another")
+    others.add(number())
+    assert len(others | {number(max_modules=1)}) == 7
+
+
+def test_a_recording_is_named_by_its_bytes(tmp_path: Path) -> None:
+    for name, frames in (("a", 200), ("b", 200), ("c", 300)):
+        record("oscillatory", tmp_path / name, frames=frames)
+    a, b, c = (plan(tmp_path / n, grid={}, seeds=[0])[0] for n in ("a", "b", "c"))
+    assert a.id == b.id != c.id
+
+
+def test_the_grid_is_checked_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"did you mean learner\.sigma"):
+        sweep("oscillatory", tmp_path / "s", grid={"learner.sigm": [1]})
+    with pytest.raises(UsageError, match=r"learner\.tau"):
+        sweep("oscillatory", tmp_path / "s", grid={"learner.tau": [40, "many"]})
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_trial_is_a_run(tmp_path: Path) -> None:
+    report = sweep("oscillatory", tmp_path, seeds=[5], keep_logs=True, max_iterations=600)
+    (row,) = read_rows(tmp_path)
+    result = learn(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
+    assert row["result"] == {key: result[key] for key in row["result"]}
+    assert (Path(row["run"]) / "run.mcap").is_file()
+    assert report.computed == 1
+
+
+def test_logs_change_nothing_and_are_made_up_for(tmp_path: Path) -> None:
+    sweep("oscillatory", tmp_path, seeds=[1], max_iterations=60)
+    bare = rows_of(tmp_path)
+    report = sweep("oscillatory", tmp_path, seeds=[1], max_iterations=60, keep_logs=True)
+    assert (report.skipped, report.computed) == (0, 1)
+    assert rows_of(tmp_path) == bare
+    again = sweep("oscillatory", tmp_path, seeds=[1], max_iterations=60, keep_logs=True)
+    assert again.skipped == 1
+
+
+def test_a_recording_is_swept_as_the_scene_is(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "log", frames=3000)
+    found = []
+    for source in (tmp_path / "log", "oscillatory"):
+        folder = tmp_path / f"sweep{len(found)}"
+        sweep(source, folder, seeds=[0, 1], max_iterations=30)
+        found.append([row["result"] for row in read_rows(folder)])
+    assert found[0] == found[1]
+
+
+# Going on
+
+
+def test_finished_trials_are_skipped(tmp_path: Path) -> None:
+    calls: list[tuple[int, int, int]] = []
+    sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30)
+    report = sweep(
+        "oscillatory",
+        tmp_path,
+        seeds=range(4),
+        max_iterations=30,
+        progress=lambda *numbers: calls.append(numbers),
+    )
+    assert (report.trials, report.skipped, report.computed) == (4, 2, 2)
+    assert calls == [(3, 0, 4), (4, 0, 4)]
+    assert len((tmp_path / ROWS).read_bytes().splitlines()) == 4
+
+
+def test_failed_trials_are_listed_and_retried_when_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computed: list[int] = []
+    healthy = sweeping.run_trial
+
+    def flaky(trial: sweeping.Trial) -> dict[str, Any]:
+        computed.append(trial.seed)
+        return {"error": "no luck"} if trial.seed == 1 else healthy(trial)
+
+    monkeypatch.setattr(sweeping, "run_trial", flaky)
+    first = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
+    assert [(row["seed"], row["error"]) for row in first.failed] == [(1, "no luck")]
+    second = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
+    assert (second.skipped, len(second.failed)) == (3, 1)
+    monkeypatch.setattr(sweeping, "run_trial", healthy)
+    third = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30, retry_failed=True)
+    assert (third.skipped, third.computed, third.failed) == (2, 1, ())
+    assert computed == [0, 1, 2]
+
+
+def test_a_trial_that_raises_fails_alone(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "log", frames=1000)
+    grid = {"learner.tau": [40, 100]}
+    report = sweep(tmp_path / "log", tmp_path / "s", grid=grid, seeds=[0], max_iterations=20)
+    (failed,) = report.failed
+    assert failed["point"] == {"learner.tau": "100"}
+    assert "frames" in failed["error"]
+    assert report.computed == 1
+
+
+def test_a_row_that_was_cut_short_is_computed_again(tmp_path: Path) -> None:
+    sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
+    whole = (tmp_path / ROWS).read_bytes()
+    (tmp_path / ROWS).write_bytes(whole[:-10])
+    assert len(list(read_rows(tmp_path))) == 2
+    assert sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30).computed == 1
+    assert (tmp_path / ROWS).read_bytes() == whole
+
+
+def test_a_damaged_row_is_named(tmp_path: Path) -> None:
+    (tmp_path / ROWS).write_text('{"id": "a", "status": "done", "point": {}}\n{"id": 3}\n')
+    with pytest.raises(LogDamagedError, match=r"rows\.jsonl line 2"):
+        list(read_rows(tmp_path))
+
+
+def test_a_folder_takes_one_sweep_at_a_time(tmp_path: Path) -> None:
+    inside: list[str] = []
+
+    def progress(*_: int) -> None:
+        with pytest.raises(UsageError, match="in use") as refused:
+            sweep("oscillatory", tmp_path, seeds=[7], max_iterations=5)
+        inside.append(str(refused.value))
+
+    sweep("oscillatory", tmp_path, seeds=[0], max_iterations=5, progress=progress)
+    assert len(inside) == 1
+
+
+def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:40", "-o"]
+    with subprocess.Popen([*words, str(tmp_path)]) as process:
+        try:
+            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2)
+        finally:
+            process.kill()
+    assert process.returncode == -signal.SIGKILL
+    before = rows_of(tmp_path)
+    report = sweep("oscillatory", tmp_path, seeds=range(40))
+    assert report.skipped == len(before) < 40
+    assert report.computed == 40 - len(before)
+    assert rows_of(tmp_path).items() >= before.items()
+
+
+# Engines
+
+
+def wait_for(ready: Callable[[], bool], seconds: float = 200) -> None:
+    """Wait until something has happened."""
+    deadline = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_a_killed_worker_costs_a_retry(tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), n, "once" if n == 2 else "") for n in range(8)]
+    assert dict(run_all(trace, tasks, jobs=2)) == {n: n * n for n in range(8)}
+    attempts = {n: (tmp_path / str(n)).stat().st_size for n in range(8)}
+    assert attempts[2] == 2
+    assert sum(attempts.values()) <= 8 + 3
+
+
+def test_a_task_that_always_kills_its_worker_is_given_up_alone(tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), n, "always" if n == 1 else "") for n in range(6)]
+    found = dict(run_all(trace, tasks, jobs=2))
+    given_up = found.pop(1)
+    assert isinstance(given_up, WorkerDied)
+    assert found == {n: n * n for n in (0, 2, 3, 4, 5)}
+    assert (tmp_path / "1").stat().st_size == engines.DEATHS
+
+
+def busiest_worker() -> int:
+    """Process id of the local worker that has done most."""
+    used: dict[int, float] = {}
+    for process in psutil.Process().children():
+        with contextlib.suppress(psutil.Error):
+            if any("popen_loky" in word for word in process.cmdline()):
+                used[process.pid] = sum(process.cpu_times()[:2])
+    return max(used, key=lambda pid: used[pid])
+
+
+def test_local_processes_give_the_same_rows_though_one_is_killed(
+    tmp_path: Path, local: dict[str, Any]
+) -> None:
+    killed: list[int] = []
+
+    def kill_a_worker(*_: int) -> None:
+        if not killed:
+            victim = busiest_worker()
+            killed.append(victim)
+            os.kill(victim, signal.SIGKILL)
+
+    report = sweep(
+        "oscillatory", tmp_path, grid=GRID, seeds=range(8), jobs=2, progress=kill_a_worker
+    )
+    assert killed
+    assert report.failed == ()
+    assert rows_of(tmp_path) == local
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A dask scheduler and two worker processes on loopback, as a user would start them."""
+    pytest.importorskip("distributed")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    dask = [sys.executable, "-m", "dask"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    port = address.rpartition(":")[2]
+    started = [
+        subprocess.Popen(
+            [*dask, "scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"], **quiet
+        )
+    ]
+    for _ in range(2):
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+        started.append(subprocess.Popen([*dask, "worker", address, *options], **quiet))
+    try:
+        yield address, started[1:]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_dask_gives_the_same_rows_though_a_worker_is_killed(
+    tmp_path: Path,
+    local: dict[str, Any],
+    cluster: tuple[str, list[subprocess.Popen[bytes]]],
+) -> None:
+    address, workers = cluster
+    asked = threading.Event()
+
+    def kill_a_worker(finished: int, *_: int) -> None:
+        if not asked.is_set():
+            asked.set()
+            workers[0].send_signal(signal.SIGKILL)
+
+    report = sweep(
+        "oscillatory",
+        tmp_path / "dask",
+        grid=GRID,
+        seeds=range(8),
+        engine="dask",
+        scheduler=address,
+        progress=kill_a_worker,
+    )
+    assert workers[0].wait() == -signal.SIGKILL
+    assert workers[1].poll() is None
+    assert (report.computed, report.failed) == (16, ())
+    assert rows_of(tmp_path / "dask") == local
+
+
+def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(engines, "CONNECT_SECONDS", 0.5)
+    with pytest.raises(EngineError, match=r"127\.0\.0\.1:9"):
+        list(run_all(trace, [("", 0, "")], engine="dask", scheduler="tcp://127.0.0.1:9"))
+
+
+@pytest.mark.parametrize("engine", ["dask", "ray"])
+def test_a_missing_package_is_named(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> Any:
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(UsageError, match=rf"pip install 'cdmisfa\[{engine}\]'"):
+        list(run_all(trace, [("", 0, "")], engine=engine))
+
+
+def test_engines_are_refused_by_name() -> None:
+    with pytest.raises(UsageError, match="no engine 'slurm'"):
+        list(run_all(trace, [("", 0, "")], engine="slurm"))
+    with pytest.raises(UsageError, match="needs --engine dask"):
+        list(run_all(trace, [("", 0, "")], scheduler="tcp://localhost:8786"))
+
+
+# Results
+
+
+@pytest.fixture
+def known(tmp_path: Path) -> Path:
+    """A sweep over one key: iterations 10, 20, 30 and one failed; then one trial missing."""
+    rows, asked = [], []
+    for k, (nu, iterations) in enumerate([(1, 10), (1, 20), (1, 30), (1, None), (2, 5), (2, 0)]):
+        number, point = f"t{k}", {"learner.nu": str(nu)}
+        asked.append({"id": number, "point": point})
+        module = {"stream": "x1", "iteration": 4, "eta": [0.5 * k]}
+        result = {"iterations": iterations, "modules": [module] * (k < 2)}
+        done = {"id": number, "status": "done", "point": point, "seed": k, "result": result}
+        failed = {"id": number, "status": "failed", "point": point, "seed": k, "error": "x"}
+        if iterations != 0:
+            rows.append(done if iterations else failed)
+    (tmp_path / ROWS).write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (tmp_path / "sweep.json").write_text(json.dumps({"trials": asked}))
+    return tmp_path
+
+
+def test_means_and_deviations_are_over_finished_seeds(known: Path) -> None:
+    one, two = reading.results(known)
+    assert (one.trials, one.done, one.failed, one.missing) == (4, 3, 1, 0)
+    assert (one.measures["iterations"].mean, one.measures["iterations"].sd) == (20.0, 10.0)
+    assert one.measures["eta_1"].n == 2
+    assert one.measures["eta_1"].mean == 0.25
+    assert dict(one.orders) == {"x1": 2, "": 1}
+    assert (two.done, two.missing) == (1, 1)
+    assert "eta_1" not in two.measures
+
+
+def test_results_are_printed_in_every_form(known: Path) -> None:
+    def shown(*options: str) -> str:
+        found = CliRunner().invoke(results_command, [str(known), *options])
+        assert found.exit_code == 0, found.output
+        return found.stdout
+
+    first, second = csv.DictReader(shown("--csv").splitlines())
+    assert (first["learner.nu"], float(first["iterations_sd"])) == ("1", 10.0)
+    assert (second["iterations_sd"], second["eta_1_mean"]) == ("", "")
+    document = json.loads(shown("--json"))
+    assert document["points"][1]["measures"]["iterations"] == {"mean": 5.0, "sd": None, "n": 1}
+    assert r"20 $\pm$ 10 & " in shown("--latex")
+    assert "20 ± 10" in shown()
+
+
+def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="name the folder of a sweep"):
+        reading.results(tmp_path)
+    (tmp_path / "sweep.json").write_text("{}")
+    with pytest.raises(LogDamagedError, match=r"sweep\.json is damaged"):
+        reading.results(tmp_path)
+
+
+# The command
+
+
+def test_the_command_prints_one_document_and_says_what_failed(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "log", frames=1000)
+    words = [str(tmp_path / "log"), "--grid", "learner.tau=40,100", "--seeds", "0:2"]
+    words += ["--max-iterations", "20", "-o", str(tmp_path / "s"), "--json"]
+    found = CliRunner().invoke(sweep_command, words)
+    document = json.loads(found.stdout)
+    assert found.exit_code == 1
+    assert (document["trials"], document["computed"], len(document["failed"])) == (4, 2, 2)
+    assert {row["point"]["learner.tau"] for row in document["failed"]} == {"100"}
+    assert CliRunner().invoke(results_command, [str(tmp_path / "s")]).exit_code == 0
+
+
+def test_grids_and_seeds_are_read_as_written() -> None:
+    assert parse_grid(("learner.sigma=0, .1", "learner.tau=40")) == {
+        "learner.sigma": ["0", ".1"],
+        "learner.tau": ["40"],
+    }
+    assert parse_seeds("0:3,7") == [0, 1, 2, 7]
+    for text in ("", "3:3", "-1", "a", "0:99999999999"):
+        with pytest.raises(click.UsageError, match="--seeds"):
+            parse_seeds(text)
+    for words in (("learner.sigma",), ("=1",), ("a.b=",), ("a.b=1", "a.b=2")):
+        with pytest.raises(click.UsageError, match="--grid"):
+            parse_grid(words)
