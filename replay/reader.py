@@ -74,6 +74,7 @@ class LogReader:
         """Open a log and walk over its structure.
 
         Raises:
+            UsageError: it cannot be opened.
             LogDamagedError: not an MCAP file, or its structure is damaged.
         """
         self.path = Path(path)
@@ -87,6 +88,7 @@ class LogReader:
         self._file = RandomFile(self.path)
         try:
             self._structure = Structure(self._file, self._refuse)
+            self._time_tail()
             self._check_data_crc()
         except MalformedRecord as error:
             self.close()
@@ -323,6 +325,7 @@ class LogReader:
         except MalformedRecord as error:
             raise LogDamagedError(f"{self.path}: {error}") from None
         self._forget()
+        self._time_tail()
         return True
 
     def close(self) -> None:
@@ -357,6 +360,14 @@ class LogReader:
         problem = Problem(where, what)
         if problem not in self.problems:
             self.problems.append(problem)
+
+    def _time_tail(self) -> None:
+        """Find the times of a chunk that was still open, whose header states none."""
+        tail = self._structure.tail
+        if tail is not None and tail in self.segments:
+            table = self.table(tail)
+            if table is not None and len(table):
+                tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
 
     def _check_data_crc(self) -> None:
         structure = self._structure

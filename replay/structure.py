@@ -17,7 +17,7 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-from cdmisfa.errors import LogDamagedError
+from cdmisfa.errors import LogDamagedError, UsageError
 from replay.records import (
     MAGIC,
     MAX_CHUNK,
@@ -135,16 +135,17 @@ class RandomFile:
         """Open the file.
 
         Raises:
-            LogDamagedError: it cannot be read.
+            UsageError: it cannot be opened.
         """
         self.path = path
         try:
             self._fd: int | None = os.open(path, os.O_RDONLY)
             self.size = os.fstat(self._fd).st_size
-            if not path.is_file():
-                raise LogDamagedError(f"{path}: not a file")
         except OSError as error:
-            raise LogDamagedError(f"{path}: {error.strerror}") from None
+            raise UsageError(f"{path}: {error.strerror}") from None
+        if not path.is_file():
+            self.close()
+            raise UsageError(f"{path}: not a file")
         self._window = b""
         self._window_at = 0
 
@@ -384,7 +385,7 @@ class Structure:
             check_size(header.compression, 0)
         except MalformedRecord:
             return
-        if header.length + header.stored > length:
+        if length != _OPEN_LENGTH and header.length + header.stored > length:
             raise MalformedRecord("a chunk's length is not that of its data")
         data = content + header.length
         size = header.size if length != _OPEN_LENGTH else MAX_CHUNK

@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cdmisfa.errors import LogDamagedError
+from cdmisfa.errors import LogDamagedError, UsageError
 from replay.reader import LogReader
 from replay.records import MAX_CHUNK
 
@@ -119,6 +119,31 @@ def test_part_of_a_cut_chunk_is_read_when_asked(tmp_path: Path) -> None:
     path.write_bytes(raw[: last.data_offset + last.stored - 10])
     whole, salvaged = read_all(path), read_all(path, salvage=True)
     assert len(whole) < len(salvaged) < MESSAGES
+
+
+@pytest.mark.parametrize("compression", ["", "lz4", "zstd"])
+def test_a_chunk_still_open_when_the_writer_died_is_read(tmp_path: Path, compression: str) -> None:
+    """Some writers stream into a chunk whose lengths are filled in at its end."""
+    messages = [
+        files.record(files.MESSAGE, files.message(1, i, i, i, os.urandom(5000))) for i in range(90)
+    ]
+    whole = files.chunk(body(*messages[:60]), 0, 59, compression=compression)
+    stored = files.compress(b"".join(messages[60:]), compression)
+    still_open = struct.pack("<BQQQQI", files.CHUNK, 2**64 - 1, 0, 0, 0, 0)
+    still_open += (
+        files.text(compression) + struct.pack("<Q", 2**64 - 1) + stored[: len(stored) - 99]
+    )
+    path = tmp_path / "log.mcap"
+    path.write_bytes(files.MAGIC + files.header() + whole + still_open)
+    times = [time for _, time, _ in read_all(path)]
+    assert times == list(range(len(times)))
+    assert 60 < len(times) < 90
+
+
+def test_a_file_that_is_not_there_is_a_wrong_path(tmp_path: Path) -> None:
+    for path in (tmp_path / "nothing.mcap", tmp_path):
+        with pytest.raises(UsageError, match=str(path)):
+            LogReader(path)
 
 
 def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
