@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -325,6 +326,35 @@ def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "CONNECT_SECONDS", 0.5)
     with pytest.raises(EngineError, match=r"127\.0\.0\.1:9"):
         list(run_all(trace, [("", 0, "")], engine="dask", scheduler="tcp://127.0.0.1:9"))
+
+
+class LostPool:
+    """A scheduler that goes away with everything it was given."""
+
+    died: engines.Died = ()
+    gave_up = True
+    width = 2
+
+    def submit(self, function: Callable[..., Any], task: Any) -> Future[Any]:
+        """A future that is cancelled."""
+        future: Future[Any] = Future()
+        future.cancel()
+        future.set_running_or_notify_cancel()
+        return future
+
+    def renew(self) -> None:
+        """Nothing to do."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+def test_a_scheduler_that_goes_away_ends_the_sweep_in_words(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(engines, "_open", lambda *_: LostPool())
+    with pytest.raises(EngineError, match="went away"):
+        list(run_all(trace, [("", n, "") for n in range(3)], jobs=2))
 
 
 @pytest.mark.parametrize("engine", ["dask", "ray"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
@@ -26,6 +27,8 @@ ENGINES = ("local", "dask", "ray")
 
 DEATHS = 3
 """A task whose worker died so often, the last time with nothing beside it, is given up."""
+
+WENT_AWAY = "the scheduler went away: start it and say the same again, finished trials are kept"
 
 CONNECT_SECONDS = 15
 """How long a scheduler and its first worker may take to answer."""
@@ -113,7 +116,8 @@ def _spread(
     waiting, alone = deque(range(len(tasks))), deque[int]()
     running: dict[Future[Result], int] = {}
     while True:
-        while waiting and len(running) < pool.width:
+        width = pool.width if waiting else 0
+        while waiting and len(running) < width:
             index = waiting.popleft()
             running[pool.submit(function, tasks[index])] = index
         if not running:
@@ -134,13 +138,13 @@ def _spread(
             except pool.died as error:
                 lost[index] = error
             except CancelledError as error:
-                raise EngineError("the scheduler went away; the same command goes on") from error
+                raise EngineError(WENT_AWAY) from error
             else:
                 yield index, result
         for index, death in lost.items():
             deaths[index] += 1
             if pool.gave_up or deaths[index] >= DEATHS:
-                yield index, WorkerDied(f"its worker died {DEATHS} times ({_line(death)})")
+                yield index, WorkerDied(f"every worker that tried it died ({_line(death)})")
             elif deaths[index] == DEATHS - 1:
                 alone.append(index)
             else:
@@ -200,6 +204,8 @@ class DaskPool:
             distributed: Any = importlib.import_module("distributed")
         except ImportError as error:
             raise _missing("dask") from error
+        # It tells of every lost connection with a traceback; what matters is raised.
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
         self.died: Died = (distributed.KilledWorker,)
         try:
             if scheduler is None:
@@ -230,7 +236,10 @@ class DaskPool:
     @property
     def width(self) -> int:
         """Two for each thread of the workers that are there now."""
-        threads: int = sum(self._client.ncores().values())
+        try:
+            threads: int = sum(self._client.ncores().values())
+        except OSError as error:
+            raise EngineError(WENT_AWAY) from error
         return max(2 * threads, 1)
 
     def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
@@ -273,7 +282,8 @@ class RayPool:
 
     def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
         """See `Pool`."""
-        future: Future[Result] = self._ray.remote(function).remote(task).future()
+        remote = self._ray.remote(max_retries=DEATHS - 1)(function)
+        future: Future[Result] = remote.remote(task).future()
         return future
 
     def renew(self) -> None:
