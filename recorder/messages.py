@@ -20,6 +20,15 @@ from numpy.typing import NDArray
 
 from cdmisfa.errors import UsageError
 
+METADATA = "cdmisfa.recording"
+"""Name of the metadata record that says what a recording is."""
+
+SCHEMA_VERSION = 1
+"""Rises whenever a channel, a message or a metadata key changes its meaning."""
+
+TRUTH_TOPIC = "/truth"
+POSE_TOPIC = "/head_pose"
+
 ENCODING = "protobuf"
 """Message and schema encoding of every channel."""
 
@@ -37,6 +46,11 @@ MAX_TRUTH = 1000
 _FIRST_TRUTH_FIELD = 2
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 _FIELD = descriptor_pb2.FieldDescriptorProto
+
+
+def view_topic(view: str) -> str:
+    """Topic of a view's frames."""
+    return f"/view/{view}"
 
 
 @dataclass(frozen=True, slots=True)

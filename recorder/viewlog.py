@@ -21,27 +21,24 @@ from cdmisfa.errors import UsageError
 from recorder.config import RecordConfig
 from recorder.eyes import HeadPose
 from recorder.logfile import LogFile, partial_path
-from recorder.messages import ImageEncoder, PoseEncoder, TruthEncoder, VectorEncoder
+from recorder.messages import (
+    METADATA,
+    POSE_TOPIC,
+    SCHEMA_VERSION,
+    TRUTH_TOPIC,
+    ImageEncoder,
+    PoseEncoder,
+    TruthEncoder,
+    VectorEncoder,
+    view_topic,
+)
 
-METADATA = "cdmisfa.recording"
-"""Name of the metadata record that says what a recording is."""
-
-SCHEMA_VERSION = 1
-"""Rises whenever a channel, a message or a metadata key changes its meaning."""
-
-TRUTH_TOPIC = "/truth"
-POSE_TOPIC = "/head_pose"
 CONFIG_NAME = "config.json"
 ROOT_FRAME = "root"
 
 _PACKAGES = ("cdmisfa", "numpy", "zstandard", "pybullet", "icub-models")
 _DAMAGE = (McapError, ValueError, struct.error, OSError, OverflowError, MemoryError, KeyError)
 _RECORD_LIMIT = 2**30
-
-
-def view_topic(view: str) -> str:
-    """Topic of a view's frames."""
-    return f"/view/{view}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.errors import LogDamagedError
-from recorder.viewlog import METADATA
+from recorder.messages import METADATA
 from replay.files import log_files
 from replay.reader import Crc, LogReader
 from replay.records import MalformedRecord

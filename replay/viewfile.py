@@ -21,15 +21,18 @@ from cdmisfa.errors import LogDamagedError
 from recorder.messages import (
     IMAGE_ENCODING,
     IMAGE_SCHEMA,
+    METADATA,
+    SCHEMA_VERSION,
     TRUTH_SCHEMA,
+    TRUTH_TOPIC,
     VECTOR_SCHEMA,
     Payload,
     image_payload,
     truth_layout,
     truth_tags,
     vector_payload,
+    view_topic,
 )
-from recorder.viewlog import METADATA, SCHEMA_VERSION, TRUTH_TOPIC, view_topic
 from replay.reader import LogReader
 from replay.records import Bytes, Channel, MalformedRecord
 from replay.structure import Segment
