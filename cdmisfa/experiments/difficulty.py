@@ -34,6 +34,9 @@ FRAMES = {"oscillatory": 10_000, "icub": 12_000}
 STEP = 20
 """Frames between two looks at the direction."""
 
+EXTRA, ROUNDS = 8, 20
+"""Directions beyond those wanted, and rounds, of the subspace iteration."""
+
 TRAINING = 4000
 """Frames of a view that batch SFA learns from; as many others test it."""
 
@@ -124,16 +127,21 @@ def slowest(frames: NDArray[Any], components: int) -> NDArray[np.float64]:
     """Weights of the slowest feature within the leading principal components, by batch SFA."""
     x = frames / _unit(frames)
     x = x - x.mean(axis=0)
-    if x.shape[1] > components:
-        moments = x.T @ x if x.shape[1] <= len(x) else x @ x.T
-        _, vectors = np.linalg.eigh(moments)
-        leading = vectors[:, -components:]
-        if x.shape[1] > len(x):
-            leading = x.T @ leading
-            leading /= np.linalg.norm(leading, axis=0)
-    else:
-        leading = np.eye(x.shape[1])
+    leading = leading_directions(x, components)
     return np.asarray(leading @ batch_sfa(x @ leading, 1)[0])
+
+
+def leading_directions(x: NDArray[np.float64], components: int) -> NDArray[np.float64]:
+    """Orthonormal basis (I, K) of the leading principal components, by subspace iteration."""
+    size = x.shape[1]
+    if size <= components:
+        return np.eye(size)
+    rng = np.random.default_rng(0)
+    basis = rng.standard_normal((size, min(size, components + EXTRA)))
+    for _ in range(ROUNDS):
+        basis, _ = np.linalg.qr(x.T @ (x @ basis))
+    _, rotation = np.linalg.eigh((x @ basis).T @ (x @ basis))
+    return np.asarray(basis @ rotation[:, ::-1][:, :components])
 
 
 def _unit(frames: NDArray[Any]) -> float:

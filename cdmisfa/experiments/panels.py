@@ -121,7 +121,8 @@ def per_stream(
         axes.plot(mean[:, s], color=colour, linewidth=1.0, label=names[s])
     settled = stacked[:, 30:] if stacked.shape[1] > 60 else stacked
     low, high = np.nanquantile(settled, 0.001), np.nanquantile(settled, 0.999)
-    axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+    if high > low:
+        axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
     axes.legend(fontsize=6)
     label(axes, letter, "iteration", y)
 

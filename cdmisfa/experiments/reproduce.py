@@ -252,7 +252,7 @@ def read_trial(path: Path) -> Trial:
         UsageError: the file is not one.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
         head = json.loads(str(arrays.pop("head")))
         return Trial(head["settings"], head["row"], arrays)
