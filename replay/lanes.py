@@ -9,6 +9,7 @@ import rerun as rr
 
 from cdmisfa.signals import BlockSignals
 from replay.columns import Clock
+from replay.labels import label, part
 from replay.palette import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Rgb, colour, packed
 
 STAY, SWITCH = "stay", "switch"
@@ -41,7 +42,7 @@ class Lanes:
 
     def add(self, signals: BlockSignals) -> None:
         """Take the state of one iteration in."""
-        stream = self._names[signals.stream]
+        stream = label(self._names[signals.stream])
         self._iteration = signals.iteration
         self._put(signals, "lanes/1_stream", stream, colour(signals.stream))
         learned = f"module {signals.module}"
@@ -53,8 +54,7 @@ class Lanes:
         self._put(signals, "lanes/5_chosen_by", *drawn)
         for s in self._shown:
             planned = (SWITCH, GREY) if signals.policy[s] else (STAY, colour(s))
-            part = rr.escape_entity_path_part(f"{s + 1}_{self._names[s]}")
-            self._put(signals, f"policy/{part}", *planned)
+            self._put(signals, f"policy/{part(self._names, s)}", *planned)
 
     def end(self, frames: int) -> None:
         """Write all lanes; they end with the run.

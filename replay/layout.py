@@ -110,7 +110,7 @@ class RunLayout:
             self._lines("Output y", ["/signals/y"]),
             self._lines("Slowness η [1/frame]", ["/signals/eta"], span("eta", low=0.0)),
             self._convergence("Change of slowness η̇, and δ"),
-            self._lines("Change of weights ⟨ξ⟩", ["/signals/xi"], span("xi", low=0.0)),
+            self._lines("Change of weights ξ", ["/signals/xi"], span("xi", low=0.0)),
             self._lines("Recent variance of the output", ["/signals/variance"]),
         )
         now = rrb.Vertical(

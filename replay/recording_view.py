@@ -11,6 +11,7 @@ import rerun.blueprint as rrb
 
 from replay.columns import Clock, Column, ImageColumn
 from replay.config import ViewConfig
+from replay.labels import label, part
 from replay.layout import blueprint, lines, whole
 from replay.recorded import RecordedSource
 
@@ -33,11 +34,13 @@ def write_recording(recording: rr.RecordingStream, path: Path, config: ViewConfi
     source = RecordedSource(path)
     try:
         first, count, spec = source.t, source.frames, source.spec
-        views = [f"views/{rr.escape_entity_path_part(name)}" for name in spec.streams]
+        views = [f"views/{part(spec.streams, s)}" for s in range(len(spec.streams))]
         clock, images = Clock(spec), len(spec.frame_shape) == 2
         columns = [_column(recording, clock, view, spec.frame_shape, config) for view in views]
         truth = Column(recording, clock, "world/truth", config.rows)
-        recording.log("world/truth", rr.SeriesLines(names=list(spec.truth)), static=True)
+        recording.log(
+            "world/truth", rr.SeriesLines(names=[label(name) for name in spec.truth]), static=True
+        )
         for t in range(first, first + count, BLOCK):
             frames = np.arange(t, min(t + BLOCK, first + count))
             keep = frames % config.every == 0 if images else np.ones(len(frames), dtype=bool)
@@ -51,10 +54,14 @@ def write_recording(recording: rr.RecordingStream, path: Path, config: ViewConfi
             column.flush()
         for warning in source.warnings:
             recording.set_time("frame", sequence=first)
-            recording.log("events", rr.TextLog(warning, level="WARN"))
+            recording.log("events", rr.TextLog(label(warning), level="WARN"))
     finally:
         source.close()
-    properties: dict[str, Any] = {"frames": count, "streams": ", ".join(spec.streams), "fps": spec.fps}
+    properties: dict[str, Any] = {
+        "frames": count,
+        "streams": label(", ".join(spec.streams)),
+        "fps": spec.fps,
+    }
     recording.send_property("recording", rr.AnyValues(**properties))
     recording.send_blueprint(_layout(spec.streams, views, bool(spec.truth), images, first + count))
 
@@ -80,9 +87,9 @@ def _layout(
 ) -> rrb.Blueprint:
     axis = whole(frames)
     shown = [
-        rrb.Spatial2DView(origin=f"/{view}", name=name)
+        rrb.Spatial2DView(origin=f"/{view}", name=label(name))
         if images
-        else lines(name, [f"/{view}"], axis)
+        else lines(label(name), [f"/{view}"], axis)
         for name, view in zip(names, views, strict=True)
     ]
     known = [lines("What the world knows", ["/world/truth"], axis)] if truth else []

@@ -19,6 +19,7 @@ from cdmisfa.modules import Module
 from cdmisfa.signals import SIGNALS, BlockSignals, Signal
 from replay.columns import Clock, Column, ImageColumn, TensorColumn
 from replay.config import ViewConfig
+from replay.labels import label, part
 from replay.lanes import Lanes
 from replay.outline import Outline
 from replay.palette import GREY, VERMILLION, colour, packed, shade
@@ -78,7 +79,7 @@ class RunView:
         for event in read_events(self._path):
             self._set_time(event.t, event.iteration)
             level = "WARN" if event.level == "WARNING" else event.level
-            self._recording.log("events", rr.TextLog(event.text, level=level))
+            self._recording.log("events", rr.TextLog(label(event.text), level=level))
         for column in self._columns.values():
             column.flush()
 
@@ -123,11 +124,11 @@ class RunView:
         frames = np.array([signals.t])
         for s in self._streams:
             name = self._spec.streams[s]
-            part = rr.escape_entity_path_part(name)
+            place = part(self._spec.streams, s)
             if signals.R.size:
-                line = self._line(f"decision/R_stay/{part}", [f"R stay {name}"], s)
+                line = self._line(f"decision/R_stay/{place}", [f"R stay {name}"], s)
                 line.add(frames, signals.iteration, signals.R[s, 0, s].reshape(1, 1))
-            line = self._line(f"decision/advantage/{part}", [f"Q stay - switch {name}"], s)
+            line = self._line(f"decision/advantage/{place}", [f"Q stay - switch {name}"], s)
             advantage = signals.Q[s, 0] - signals.Q[s, 1]
             line.add(frames, signals.iteration, np.array([[advantage]]))
 
@@ -236,7 +237,7 @@ class RunView:
                 if len(set(labels)) == 1:
                     shades = [rgb or colour(number)] * len(labels)
                 style = rr.SeriesLines(
-                    names=list(labels),
+                    names=[label(text) for text in labels],
                     colors=[packed(c) for c in shades],
                     widths=[width] * len(labels),
                 )

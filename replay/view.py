@@ -18,6 +18,7 @@ import rerun as rr
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import partial_path
 from replay.config import ViewConfig
+from replay.labels import label
 from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
 from replay.outline import Outline, read_outline
@@ -77,7 +78,7 @@ def _recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingSt
         recording.save(partial)
         if not partial.exists():
             raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
-        recording.send_recording_name(name)
+        recording.send_recording_name(label(name))
         yield recording
         recording.flush(timeout_sec=FLUSH_SECONDS)
         recording.disconnect()
@@ -93,7 +94,7 @@ def _write_run(recording: rr.RecordingStream, log: Path, config: ViewConfig) -> 
     outline, folder = read_outline(log), log.parent
     modules = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
     _properties(recording, outline, folder)
-    text = summary_text(outline, _name(log))
+    text = label(summary_text(outline, _name(log)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     RunView(recording, log, outline, config).write(modules)
     recording.send_blueprint(RunLayout(outline).blueprint())
@@ -122,7 +123,7 @@ def _properties(recording: rr.RecordingStream, outline: Outline, folder: Path) -
         "iterations": outline.iterations,
         "frames": outline.frames,
         "modules": len(outline.saved),
-        "learned": ", ".join(outline.names()[s.stream] for s in outline.saved),
+        "learned": ", ".join(label(outline.names()[s.stream]) for s in outline.saved),
         **_ending(folder),
     }
     recording.send_property("result", rr.AnyValues(**result))
@@ -144,8 +145,8 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
         name = f"{prefix}{key}".replace(".", "_")
         if isinstance(value, Mapping):
             values += _flat(value, f"{name}_")
-        elif isinstance(value, bool | int | float | str):
+        elif isinstance(value, bool | int | float):
             values.append((name, value))
         else:
-            values.append((name, json.dumps(value)))
+            values.append((name, label(value if isinstance(value, str) else json.dumps(value))))
     return values

@@ -14,9 +14,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import rerun_cli
 
@@ -68,7 +68,8 @@ def open_window(path: Path, *, every: int = 10, memory_limit: str = "2GB") -> No
         CdmisfaError: the viewer ended with an error.
     """
     with _view_of(path, every) as view:
-        _run([str(view), "--memory-limit", memory_limit])
+        port = str(_free_port())
+        _run([str(view), "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit])
 
 
 def serve(
@@ -137,31 +138,72 @@ def screenshot(
 def _draw(view: Path, at: int | None, window: str) -> bytes:
     """A PNG of the whole window, once everything in it is loaded."""
     with headless_viewer(window) as viewer:
-        viewer.open(str(view))
-        end = time.monotonic() + SECONDS
-        while not _painted(viewer):
-            if time.monotonic() > end:
-                raise CdmisfaError(f"{view} was not drawn within {SECONDS:.0f} s")
-            time.sleep(0.2)
+        viewer.ask(lambda client: client.open(str(view)))
+        viewer.ask(lambda client: _painted(client.get_state()))
         if at is not None:
-            viewer.set_time(FRAME, sequence=at, play_state="paused")
+            viewer.go_to(at)
         time.sleep(SETTLE)
-        while viewer.get_state().loading and time.monotonic() < end:
-            time.sleep(0.2)
-        return bytes(viewer.take_screenshot())
+        viewer.ask(lambda client: _painted(client.get_state()))
+        return bytes(viewer.ask(lambda client: client.take_screenshot()))
 
 
-def _painted(viewer: Any) -> bool:
-    try:
-        state = viewer.get_state()
-    except (ConnectionError, RuntimeError):
-        return False
+def _painted(state: Any) -> bool:
     return bool(state.recordings) and bool(state.views) and not state.loading
 
 
+class HeadlessViewer:
+    """A running viewer without a window.
+
+    Args:
+        client: Rerun's `ViewerClient`, connected to it.
+        process: the viewer.
+        words: where its output goes.
+    """
+
+    def __init__(self, client: Any, process: subprocess.Popen[bytes], words: BinaryIO) -> None:
+        self._client = client
+        self._process = process
+        self._words = words
+
+    def ask(self, question: Callable[[Any], Any], seconds: float = SECONDS) -> Any:
+        """Ask the client until it answers: what is not painted yet is an error to it.
+
+        Raises:
+            CdmisfaError: it did not answer in time, or the viewer has ended.
+        """
+        end, refusal = time.monotonic() + seconds, ""
+        while time.monotonic() < end:
+            try:
+                answer = question(self._client)
+                if answer:
+                    return answer
+            except (ConnectionError, RuntimeError) as error:
+                refusal = f": {error}".splitlines()[0]
+            if self._process.poll() is not None:
+                raise CdmisfaError(f"the viewer ended: {last_words(self._words)}")
+            time.sleep(0.1)
+        raise CdmisfaError(f"the viewer did not show it within {seconds:.0f} s{refusal}")
+
+    def go_to(self, frame: int) -> None:
+        """Put the time cursor on a frame."""
+
+        def move(client: Any) -> bool:
+            client.set_time(FRAME, sequence=frame, play_state="paused")
+            return True
+
+        self.ask(move)
+
+
+def last_words(words: BinaryIO) -> str:
+    """What a viewer said about its end, in one line."""
+    words.seek(0)
+    lines = words.read().decode("utf-8", "replace").splitlines()
+    return next((line for line in lines if "panicked" in line), "it does not say why")
+
+
 @contextlib.contextmanager
-def headless_viewer(window: str = WINDOW) -> Iterator[Any]:
-    """A viewer without a window, as Rerun's `ViewerClient`; ended on the way out.
+def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
+    """A viewer without a window; ended on the way out.
 
     Raises:
         CdmisfaError: it does not start.
@@ -175,19 +217,17 @@ def headless_viewer(window: str = WINDOW) -> Iterator[Any]:
         # Output goes to a file: the viewer hangs when nobody empties a pipe.
         process = subprocess.Popen(command, env=environment(), stdout=words, stderr=words)
         try:
-            yield _connected(ViewerClient, port, process, words)
+            client = _connected(ViewerClient, port, process, words)
+            yield HeadlessViewer(client, process, words)
         finally:
             _end(process)
 
 
-def _connected(client: Any, port: int, process: subprocess.Popen[bytes], words: Any) -> Any:
+def _connected(client: Any, port: int, process: subprocess.Popen[bytes], words: BinaryIO) -> Any:
     end = time.monotonic() + SECONDS
     while time.monotonic() < end:
         if process.poll() is not None:
-            words.seek(0)
-            lines = words.read().decode("utf-8", "replace").strip().splitlines()
-            said = next((line for line in lines if "panicked" in line or "rror" in line), "")
-            raise CdmisfaError(f"the viewer did not start: {said or process.returncode}")
+            raise CdmisfaError(f"the viewer did not start: {last_words(words)}")
         try:
             viewer = client.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             viewer.get_state()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
-import time
 from collections import defaultdict
 
 import numpy as np
 import pytest
 import rerun as rr
+import rerun.blueprint as rrb
 from PIL import Image
 from rerun.chunk import RrdReader
 from run_data import DELTA, IMAGE, VECTOR, run_of, write_run
@@ -19,7 +20,7 @@ from cdmisfa.modules import Module
 from cdmisfa.signals import SIGNALS
 from recorder.config import SceneConfig
 from recorder.recording import record
-from replay import viewer
+from replay import layout, viewer
 from replay.columns import tensor_array
 from replay.config import ViewConfig
 from replay.modules import save_modules
@@ -169,7 +170,7 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
     assert rows["/modules/1/weights"]["iteration"] == [8]
     assert rows["/events"]["TextLog:text"] == [["stopped: the test is over"]]
     assert "/summary" in statics_of(folder / "run.rrd")
-    stay = scalars(rows[f"/decision/R_stay/{spec.streams[1]}"])[:, 0]
+    stay = scalars(rows[f"/decision/R_stay/2_{spec.streams[1]}"])[:, 0]
     np.testing.assert_array_equal(stay, [s.R[1, 0, 1] for s in records])
 
 
@@ -237,7 +238,7 @@ def test_a_recording_has_a_view(tmp_path):
     record("oscillatory", folder, SceneConfig(kind="oscillatory"), frames=120)
     build_view(folder, tmp_path / "r.rrd")
     rows = rows_of(tmp_path / "r.rrd")
-    for name in ("x1", "x2", "x3"):
+    for name in ("1_x1", "2_x2", "3_x3"):
         assert rows[f"/views/{name}"]["frame"] == list(range(120))
     assert len(rows["/world/truth"]["frame"]) == 120
 
@@ -251,15 +252,41 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
     write_run(tmp_path / "run.mcap", IMAGE, ITERATIONS)
     build_view(tmp_path, tmp_path / "run.rrd")
     blocks = [block for _, block in run_of(IMAGE, ITERATIONS)]
-    with viewer.headless_viewer() as client:
-        client.open(str(tmp_path / "run.rrd"))
-        views = {view.name: view for view in eventually(lambda: all_views(client))}
+    with viewer.headless_viewer() as opened:
+        opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
+        views = {view.name: view for view in opened.ask(all_views)}
         assert "What happened" in views
         assert [view.reports for view in views.values()] == [[]] * len(views)
         for block in (blocks[3], next(b for b in blocks if b.stream != blocks[3].stream)):
-            client.set_time("frame", sequence=block.t, play_state="paused")
+            opened.go_to(block.t)
             grey = int(block.frames[0].min())
-            eventually(lambda g=grey: shows(client, views["What it sees"].view_id, g))
+            view = views["What it sees"].view_id
+            opened.ask(lambda client, v=view, g=grey: shows(client, v, g))
+
+
+@needs_driver
+def test_every_tab_shows_without_a_complaint_whatever_things_are_called(tmp_path, monkeypatch):
+    """All tabs at once; a name in letters that the viewer's font lacks would end it."""
+    spec = dataclasses.replace(IMAGE, streams=("左", "⟨b⟩/ c", "right"), truth=("x→", "y"))
+    write_run(tmp_path / "run.mcap", spec, ITERATIONS, saves=True)
+    tabs = []
+
+    def side_by_side(*views, name, timeline="frame"):
+        tabs.extend(views)
+        return rrb.Blueprint(rrb.Grid(*views), auto_views=False, auto_layout=False)
+
+    monkeypatch.setattr(layout, "blueprint", side_by_side)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    assert len(tabs) == 6
+    with viewer.headless_viewer("2400x1600") as opened:
+        opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
+        views = opened.ask(all_views)
+        assert len(views) > 25
+        for name in ("Rewards", "Change of weights ξ", "Output of module 1 on what was watched"):
+            (view,) = [v for v in views if v.name == name]
+            opened.ask(lambda client, v=view: client.take_screenshot(v.view_id))
+        state = opened.ask(lambda client: client.get_state())
+        assert [(v.name, v.reports) for v in state.views if v.reports] == []
 
 
 def all_views(client):
@@ -272,19 +299,6 @@ def shows(client, view, grey):
     """Whether most of an image view's pixels of colour are this grey."""
     picture = np.asarray(Image.open(io.BytesIO(client.take_screenshot(view))).convert("L"))
     return np.mean(np.abs(picture.astype(int) - grey) < 6) > 0.2
-
-
-def eventually(ask, seconds=30.0):
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        try:
-            answer = ask()
-            if answer:
-                return answer
-        except ConnectionError:
-            pass
-        time.sleep(0.1)
-    raise AssertionError("it did not happen in time")
 
 
 @needs_driver

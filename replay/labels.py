@@ -1,0 +1,35 @@
+"""Texts as the viewer can draw them.
+
+The viewer ends at once, with everything in it, on a letter its font has not got.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import rerun as rr
+
+_DRAWN = (
+    (0x20, 0x7E),  # ASCII
+    (0xA1, 0x17F),  # Latin
+    (0x300, 0x304),  # accents that are put over letters, as in η̇
+    (0x306, 0x30C),
+    (0x384, 0x3CE),  # Greek
+    (0x400, 0x45F),  # Cyrillic
+)
+_LEFT_OUT = "⟨⟩"
+
+
+def label(text: str) -> str:
+    """A text with what cannot be drawn left out or replaced by a question mark."""
+    kept = (c for c in text if c not in _LEFT_OUT)
+    return "".join(c if c == "\n" or _is_drawn(ord(c)) else "?" for c in kept)
+
+
+def part(names: Sequence[str], index: int) -> str:
+    """A stream's part of an entity's path: its number from 1, so that order holds, and its name."""
+    return str(rr.escape_entity_path_part(f"{index + 1}_{label(names[index])}"))
+
+
+def _is_drawn(code: int) -> bool:
+    return any(low <= code <= high for low, high in _DRAWN)
