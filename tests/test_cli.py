@@ -175,6 +175,23 @@ class TestRuns:
         whole = cdmisfa("learn", "oscillatory", "--max-iterations", 15, "--json").json
         assert resumed["signals_sha256"] == whole["signals_sha256"]
 
+    @pytest.mark.parametrize("form", ["parquet", "npz", "csv", "arrow"])
+    def test_export(
+        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, form: str
+    ) -> None:
+        file = tmp_path / f"signals.{form}"
+        document = cdmisfa("export", oscillatory_run, "-o", file, "--json").json
+        assert (document["file"], document["rows"]) == (str(file), 15)
+        assert file.stat().st_size > 0
+        assert_one_line(cdmisfa("export", oscillatory_run, "-o", file), 2, "--force")
+
+    def test_plot_names_its_files(
+        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
+    ) -> None:
+        figures = cdmisfa("plot", oscillatory_run, "-o", tmp_path / "f", "--json").json["figures"]
+        assert sorted(figures) == sorted(str(file) for file in (tmp_path / "f").iterdir())
+        assert {Path(file).suffix for file in figures} == {".png", ".svg"}
+
     def test_end_of_a_recording_is_an_error_that_keeps_the_run(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
     ) -> None:
@@ -194,6 +211,7 @@ class TestErrors:
             (["learn", "oscilatory"], 2, ["oscilatory", "icub, oscillatory"]),
             (["record", "icubs", "-o", "x"], 2, ["icubs", "did you mean icub?"]),
             (["record", "icub"], 2, ["-o"]),
+            (["record", "oscillatory", "--scene-picture", "x.png"], 2, ["icub"]),
             (["record", "oscillatory", "-o", "x", "--view", "x9"], 2, ["x9", "x1, x2, x3"]),
             (["info", "no/such.mcap"], 2, ["no/such.mcap"]),
             (["verify", "no/such"], 2, ["no/such"]),

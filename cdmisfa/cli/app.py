@@ -29,11 +29,17 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
     "compare": ("runs", "Check that two runs' signals are the same, bit for bit."),
     "plot": ("runs", "Draw the figures of a run."),
-    "export": ("runs", "Write a run's signals as Parquet, NumPy, CSV or Arrow."),
-    "sweep": ("sweep", "Learn many times, over a grid of settings and seeds."),
-    "results": ("results", "Print what a sweep found, mean and SD over seeds."),
+    "export": ("runs", "Write a run's signals as a table or arrays, a recording as images."),
+    "sweep": ("sweep", "Learn from a source many times, over a grid of settings and seeds."),
+    "results": (
+        "results",
+        "Print mean and standard deviation over seeds at each point of a sweep.",
+    ),
     "signals": ("signals", "List every signal that a run records."),
-    "reproduce": ("reproduce", "Reproduce an experiment of the paper, or all of them."),
+    "reproduce": (
+        "reproduce",
+        "Reproduce an experiment of the paper: numbers, tables and figures.",
+    ),
     "demo": ("demo", "Record, learn, check and show: the whole story in minutes."),
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }

@@ -56,6 +56,8 @@ def record_command(
 
     configuration = configure_scene(scene, preset, settings, seed)
     if scene_picture is not None:
+        if scene != "icub":
+            raise click.UsageError(f"the scene {scene} has no picture: --scene-picture is for icub")
         from recorder.picture import scene_picture as draw
 
         draw(configuration.scene, scene_picture, force=force)

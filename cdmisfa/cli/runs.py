@@ -57,24 +57,27 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 
 
 @click.command("export")
-@options.path_argument("run")
+@options.path_argument("path")
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["parquet", "npz", "csv", "arrow"]),
+    type=click.Choice(["parquet", "npz", "csv", "arrow", "images"]),
     help="Form; by default what the file's name ends in.",
 )
-@options.out("The file to write.", required=True)
+@options.out("The file to write, for images the folder.", required=True)
 @options.force
 @options.as_json
-def export_command(run: Path, form: str | None, out: Path, force: bool, as_json: bool) -> None:
-    """Write a run's signals as Parquet, NumPy, CSV or Arrow."""
+def export_command(path: Path, form: str | None, out: Path, force: bool, as_json: bool) -> None:
+    """Write a run's signals as a table or arrays, a recording as images.
+
+    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz, images to a folder.
+    """
     from replay.export import export
 
-    rows = export(run, out, form or out.suffix.removeprefix("."), force=force)
+    rows = export(path, out, form or out.suffix.removeprefix("."), force=force)
     if as_json:
         options.print_json(
-            {"schema": options.SCHEMA, "run": str(run), "file": str(out), "rows": rows}
+            {"schema": options.SCHEMA, "path": str(path), "file": str(out), "rows": rows}
         )
     else:
-        click.echo(f"{rows} iterations written to {out}")
+        click.echo(f"{rows} {'images' if form == 'images' else 'iterations'} written to {out}")
