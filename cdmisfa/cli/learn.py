@@ -25,6 +25,11 @@ TICK = 0.1
 @options.seed
 @options.preset
 @options.settings
+@click.option(
+    "--algorithm",
+    type=click.Choice(["1.0", "2.0"]),
+    help="CD-MISFA version, short for --set learner.algorithm=.",
+)
 @click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
 @click.option(
     "--max-modules",
@@ -45,6 +50,7 @@ def learn_command(
     seed: int,
     preset: str | None,
     settings: tuple[str, ...],
+    algorithm: str | None,
     max_iterations: int | None,
     max_modules: int | None,
     loop: bool,
@@ -66,6 +72,8 @@ def learn_command(
     from cdmisfa.experiments.run import learn
     from cdmisfa.experiments.sources import open_source
 
+    if algorithm is not None:
+        settings = (*settings, f"learner.algorithm={algorithm}")
     frames, configuration = open_source(
         source, preset=preset, settings=settings, seed=seed, loop=loop, salvage=salvage
     )
