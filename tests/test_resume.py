@@ -25,7 +25,7 @@ from cdmisfa.experiments.checkpoint import (
     load_checkpoint,
     newest_covered,
 )
-from cdmisfa.experiments.run import RunResult, learn
+from cdmisfa.experiments.run import Progress, RunResult, learn
 from cdmisfa.learner import CuriousLearner, LearnerState
 from cdmisfa.streams import OscillatorySource
 from recorder.config import RecordConfig, SceneConfig
@@ -219,6 +219,21 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
         go(OscillatorySource(), tmp_path, 10, resume=True)
     with pytest.raises(UsageError, match="name its folder"):
         go(OscillatorySource(), None, 10, resume=True)
+
+
+def test_a_run_that_is_still_going_is_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    refused: list[str] = []
+
+    def meddle(_: Progress) -> None:
+        for how in ({"resume": True}, {"force": True}):
+            with pytest.raises(UsageError, match="in use by another process") as error:
+                go(OscillatorySource(), out, 30, **how)
+            refused.append(str(error.value))
+
+    result = go(OscillatorySource(), out, 2, progress=meddle)
+    assert len(refused) == 4
+    assert result.signals_sha256 == go(OscillatorySource(), None, 2).signals_sha256
 
 
 def test_a_forced_run_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:

@@ -32,6 +32,7 @@ from cdmisfa.experiments.checkpoint import (
     save_checkpoint,
     set_aside,
 )
+from cdmisfa.experiments.folder import held
 from cdmisfa.incsfa import strict
 from cdmisfa.learner import CuriousLearner
 from cdmisfa.modules import Module
@@ -245,27 +246,36 @@ def _run_log(
     from replay.runlog import RunWriter
 
     manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
-    if resume:
-        set_aside(out, source.spec, manifest)
-    elif out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
-    stale = [out / name for name in ("run.json", "modules.npz", "run.rrd")]
     if not resume:
-        stale += [out / "run.mcap", out / SET_ASIDE, *checkpoints(out)]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for path in stale:
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UsageError(f"{out} cannot be a run's folder ({reason}): choose another") from error
-    log = RunWriter(out / "run.mcap", source.spec, manifest, force=force or resume)
-    try:
-        yield log
-    except BaseException:
-        log.abandon()
-        raise
-    log.finish()
+        if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
+            raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _no_folder(out, error) from error
+    with held(out):
+        stale = [out / name for name in ("run.json", "modules.npz", "run.rrd")]
+        if resume:
+            set_aside(out, source.spec, manifest)
+        else:
+            stale += [out / "run.mcap", out / SET_ASIDE, *checkpoints(out)]
+        try:
+            for path in stale:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise _no_folder(out, error) from error
+        log = RunWriter(out / "run.mcap", source.spec, manifest, force=force or resume)
+        try:
+            yield log
+        except BaseException:
+            log.abandon()
+            raise
+        log.finish()
+
+
+def _no_folder(out: Path, error: OSError) -> UsageError:
+    reason = error.strerror or error
+    return UsageError(f"{out} cannot be a run's folder ({reason}): choose another")
 
 
 def _go_on(log: Any, learner: CuriousLearner, source: FrameSource, digest: SignalsHash) -> None:

@@ -8,7 +8,6 @@ with more seeds or a larger grid, computes what is missing.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import itertools
 import json
@@ -22,8 +21,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from cdmisfa.config import as_table
-from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.errors import CdmisfaError, LogDamagedError
 from cdmisfa.experiments.engines import WorkerDied, run_all
+from cdmisfa.experiments.folder import held
 from cdmisfa.experiments.run import learn, module_table, write_json
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
 
@@ -395,11 +395,7 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
 def _rows_file(folder: Path) -> Iterator[BinaryIO]:
     """The rows, to append to; held by one sweep at a time, a torn last line cut off."""
     path = folder / ROWS
-    with open(path, "a+b") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise UsageError(f"{folder} is in use by another sweep") from error
+    with held(folder), open(path, "a+b") as file:
         file.seek(0)
         file.truncate(file.read().rfind(b"\n") + 1)
         yield file
