@@ -139,7 +139,12 @@ class RunLayout:
     def _decision(self) -> rrb.Container:
         rewards = ["curiosity", "expert", "reward"]
         curves = rrb.Vertical(
-            self._lanes("Policy in each stream, and what was done", "/policy/**", "/lanes/**"),
+            self._lanes(
+                "Policy in each stream, and what was done",
+                "/policy/**",
+                "/lanes/4_action",
+                "/lanes/5_chosen_by",
+            ),
             self._lines("Reward R for staying", ["/decision/R_stay/**"]),
             self._lines("Value Q of staying minus switching", ["/decision/advantage/**"]),
             self._lines(

@@ -31,6 +31,9 @@ AXES = {"S": "stream", "A": "action", "J": "output"}
 TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 """Signals that are not lines but the timelines themselves."""
 
+BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2}
+"""Colours of signals that are drawn beside another one."""
+
 SPARSE = 10
 """With more streams than are shown one by one, tensors are kept every so many iterations."""
 
@@ -102,7 +105,8 @@ class RunView:
             else:
                 at = every if signal.dims.startswith("T") else frames
                 labels = _labels(signal, 0, self._outline.outputs)
-                column = self._line(path, labels if signal.dims != "S" else None, 0)
+                number = BESIDE.get(signal.name, 0)
+                column = self._line(path, labels if signal.dims != "S" else None, number)
                 column.add(at, k, value.reshape(len(at), -1))
 
     def _tensor(
