@@ -42,7 +42,8 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
     )
     click.echo()
     for figure in report.figures:
-        click.echo(f"figure     {figure}")
+        if figure.suffix == ".png":
+            click.echo(f"figure     {figure}")
     click.echo(f"look at it {sys.argv[0]} view {report.run}")
 
 

@@ -44,7 +44,7 @@ def view_command(
         raise click.UsageError("choose one of --save, --web and --screenshot")
     if at is not None and screenshot is None:
         raise click.UsageError("--at goes with --screenshot")
-    from replay import viewer
+    import replay.viewer as viewer
 
     if save is not None:
         viewer.save(run, save, every=every, force=force)
