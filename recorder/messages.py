@@ -72,14 +72,14 @@ def image_payload(height: int, width: int, frame_id: str) -> Payload:
     """Where a `foxglove.RawImage` of grey pixels holds them."""
     name = frame_id.encode()
     size = height * width
-    tail = 1 + len(_varint(len(name))) + len(name) if name else 0
-    return Payload(tail, size, b"\x32" + _varint(size))
+    tail = 1 + len(varint(len(name))) + len(name) if name else 0
+    return Payload(tail, size, b"\x32" + varint(size))
 
 
 def vector_payload(length: int) -> Payload:
     """Where a `cdmisfa.Vector` holds its little-endian float64 values."""
     size = 8 * length
-    return Payload(0, size, b"\x12" + _varint(size) if size else b"")
+    return Payload(0, size, b"\x12" + varint(size) if size else b"")
 
 
 def truth_layout(names: Sequence[str]) -> np.dtype[Any]:
@@ -96,7 +96,7 @@ def truth_layout(names: Sequence[str]) -> np.dtype[Any]:
 
 def truth_tags(names: Sequence[str]) -> list[bytes]:
     """The tag bytes of each ground truth field (wire type 1, 64 bits)."""
-    return [_varint((_FIRST_TRUTH_FIELD + i) << 3 | 1) for i in range(len(names))]
+    return [varint((_FIRST_TRUTH_FIELD + i) << 3 | 1) for i in range(len(names))]
 
 
 class ImageEncoder:
@@ -266,7 +266,8 @@ def _message_class(name: str, fields: Sequence[Any]) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"cdmisfa.{name}"))
 
 
-def _varint(number: int) -> bytes:
+def varint(number: int) -> bytes:
+    """A whole number as protobuf's variable-length integer."""
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
 from cdmisfa.signals import SIGNALS, BlockSignals, Signal
+from recorder.messages import varint
 
 MESSAGE = "cdmisfa.BlockSignals"
 """Full name of the message in the log's schema."""
@@ -82,7 +83,7 @@ def encode(signals: BlockSignals) -> bytes:
             parts.append(value.tobytes())
     key = tuple(shapes)
     if key not in _SHAPE_BYTES:
-        sizes = b"".join(_varint(size) for shape in key for size in shape)
+        sizes = b"".join(varint(size) for shape in key for size in shape)
         _SHAPE_BYTES[key] = _length_prefix(_tag(SHAPES, _LENGTH_DELIMITED), len(sizes)) + sizes
     parts.append(_SHAPE_BYTES[key])
     return b"".join(parts)
@@ -135,21 +136,12 @@ def _sentence(signal: Signal) -> str:
     return "; ".join([*parts, f"unit {signal.unit}"]) + "."
 
 
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
-
-
 def _tag(name: str, wire_type: int) -> bytes:
-    return _varint(_NUMBER[name] << 3 | wire_type)
+    return varint(_NUMBER[name] << 3 | wire_type)
 
 
 def _length_prefix(tag: bytes, length: int) -> bytes:
-    return tag + (bytes((length,)) if length < 0x80 else _varint(length))
+    return tag + (bytes((length,)) if length < 0x80 else varint(length))
 
 
 def _message_class() -> Any:
