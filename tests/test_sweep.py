@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
 import importlib
 import json
 import os
@@ -73,6 +74,22 @@ def test_a_trial_is_named_by_what_it_depends_on(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(sweeping, "code", lambda: "0.0.0+another")
     others.add(number())
     assert len(others | {number(max_modules=1)}) == 7
+
+
+def test_the_world_has_the_seed_of_the_trial_unless_it_was_given_one() -> None:
+    free = plan("oscillatory", grid={}, seeds=[0, 4])
+    assert [trial.configuration.scene.seed for trial in free] == [0, 4]
+    fixed = plan("oscillatory", grid={}, seeds=[0, 4], settings=["scene.seed=0"])
+    assert [trial.configuration.scene.seed for trial in fixed] == [0, 0]
+    assert free[0].id == fixed[0].id
+    assert free[1].id != fixed[1].id
+
+
+def test_a_worker_with_other_code_refuses() -> None:
+    (trial,) = plan("oscillatory", grid={}, seeds=[0], max_iterations=5)
+    assert "error" not in sweeping.run_trial(trial)
+    refused = sweeping.run_trial(dataclasses.replace(trial, code="0.0.0+another"))
+    assert "not 0.0.0+another" in refused["error"]
 
 
 def test_a_recording_is_named_by_its_bytes(tmp_path: Path) -> None:

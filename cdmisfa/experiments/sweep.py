@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -26,6 +26,7 @@ from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.folder import held
 from cdmisfa.experiments.run import learn, module_table, write_json
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
+from recorder.scenes import SCENES, open_scene
 
 ROWS = "rows.jsonl"
 """A line for each trial that ended; the last line of a trial counts."""
@@ -43,26 +44,26 @@ class Trial:
     Attributes:
         id: hash of configuration, seed, source and code.
         source: a scene's name, or the paths of a recording.
-        preset: instead of the source's own.
-        settings: `section.key=value` words, the grid's point last.
+        configuration: preset, settings, the grid's point and the seed, all together.
         point: the grid's keys with this trial's values.
         seed: of the learner, and of a live scene.
         loop: start a recording again at its end.
         max_iterations: end after so many.
         max_modules: end after so many.
         log: folder in which to keep its log, or None.
+        code: version of the code that the hash is about; workers must have the same.
     """
 
     id: str
     source: tuple[str, ...]
-    preset: str | None
-    settings: tuple[str, ...]
+    configuration: Configuration
     point: Mapping[str, str]
     seed: int
     loop: bool
     max_iterations: int | None
     max_modules: int | None
     log: Path | None
+    code: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,35 +194,44 @@ def plan(
     ]
     # Workers may have another working directory.
     paths = tuple(str(w) if w == kind else str(Path(w).resolve()) for w in words)
+    each = tuple(dict.fromkeys(seeds))
+    limits = [max_iterations, max_modules]
     trials: dict[str, Trial] = {}
-    for point, seed in itertools.product(points, dict.fromkeys(seeds)):
+    for point in points:
         chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
-        configuration = configure(kind, preset, chosen, seed)
-        limits = [max_iterations, max_modules]
-        number = _hash([_configuration(configuration, identity), seed, identity, limits, code()])
-        trials.setdefault(
-            number,
-            Trial(
-                id=number,
+        seeded = _seeded(kind, preset, chosen)
+        for seed in each:
+            configuration = seeded(seed)
+            depends = [_configuration(configuration, identity), seed, identity, limits, code()]
+            trial = Trial(
+                id=_hash(depends),
                 source=paths,
-                preset=preset,
-                settings=chosen,
+                configuration=configuration,
                 point=point,
                 seed=seed,
                 loop=loop,
                 max_iterations=max_iterations,
                 max_modules=max_modules,
-                log=logs / number if logs is not None else None,
-            ),
-        )
+                log=logs / _hash(depends) if logs is not None else None,
+                code=code(),
+            )
+            trials.setdefault(trial.id, trial)
     return list(trials.values())
+
+
+def _seeded(
+    kind: str, preset: str | None, settings: Sequence[str]
+) -> Callable[[int], Configuration]:
+    """`configure` for many seeds at once: a seed only ever becomes `scene.seed`."""
+    base, other = (configure(kind, preset, settings, seed) for seed in (0, 1))
+    if base == other:
+        return lambda seed: base
+    return lambda seed: replace(base, scene=replace(base.scene, seed=seed))
 
 
 def _identify(words: tuple[str | Path, ...], loop: bool) -> tuple[str, Any]:
     """The scene's name, and what tells a recording's bytes from another's (None where live)."""
-    from recorder.scenes import SCENES
-
-    if len(words) == 1 and words[0] in SCENES:
+    if _is_live(words):
         return str(words[0]), None
     source, _ = open_source(words, loop=loop)
     try:
@@ -229,6 +239,10 @@ def _identify(words: tuple[str | Path, ...], loop: bool) -> tuple[str, Any]:
         return preset_for(source.spec, described), described
     finally:
         source.close()
+
+
+def _is_live(words: Sequence[str | Path]) -> bool:
+    return len(words) == 1 and words[0] in SCENES
 
 
 def _configuration(configuration: Configuration, identity: Any) -> Any:
@@ -262,6 +276,8 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     Returns:
         The result, or under "error" why there is none.
     """
+    if trial.code != code():
+        return {"error": f"the worker has cdmisfa {code()}, not {trial.code}: install the same"}
     try:
         if trial.source == ("oscillatory",) and trial.log is None:
             return _compiled_trial(trial)
@@ -276,10 +292,9 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 def _compiled_trial(trial: Trial) -> dict[str, Any]:
     from cdmisfa.trial import run_trial as run_oscillatory
 
-    configuration = configure("oscillatory", trial.preset, trial.settings, trial.seed)
-    streams = configuration.scene.streams
+    streams = trial.configuration.scene.streams
     result = run_oscillatory(
-        configuration.learner,
+        trial.configuration.learner,
         streams,
         seed=trial.seed,
         max_iterations=trial.max_iterations,
@@ -289,13 +304,11 @@ def _compiled_trial(trial: Trial) -> dict[str, Any]:
 
 
 def _logged_trial(trial: Trial) -> dict[str, Any]:
-    source, configuration = open_source(
-        trial.source,
-        preset=trial.preset,
-        settings=trial.settings,
-        seed=trial.seed,
-        loop=trial.loop,
-    )
+    configuration = trial.configuration
+    if _is_live(trial.source):
+        source = open_scene(trial.source[0], configuration.scene, configuration.record)
+    else:
+        source, _ = open_source(trial.source, loop=trial.loop)
     unfinished = None
     if trial.log is not None:
         unfinished = trial.log.with_name(trial.log.name + ".partial")
@@ -340,7 +353,7 @@ def _row(trial: Trial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]
         "status": FAILED if failed else DONE,
         "point": dict(trial.point),
         "seed": trial.seed,
-        "code": code(),
+        "code": trial.code,
         "run": str(trial.log) if trial.log is not None and not failed else None,
         **({"error": result["error"]} if failed else {"result": result}),
     }
