@@ -197,4 +197,5 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
         if degree > 0:
             axes[i, 1].plot(x, np.polynomial.Polynomial.fit(truth, y, degree)(x), color="red")
         panels.label(axes[i, 1], "f", f"{name}, m", f"y, module {i + 1}")
+        axes[i, 1].locator_params(axis="x", nbins=5)
     return paths + panels.save(outputs, folder, "icub-outputs")
