@@ -26,6 +26,13 @@ LARGEST = 2**63 - 1
 """Largest whole number a key takes."""
 
 
+MAX_COMPONENTS = 1000
+"""More whitening components than this would take minutes a frame."""
+
+MAX_TAU = 100_000
+"""A block of more frames than this does not fit into memory beside its images."""
+
+
 @dataclass(frozen=True, slots=True)
 class LearnerConfig:
     """Everything the learner can be told (keys `learner.*`).
@@ -70,11 +77,11 @@ class LearnerConfig:
         within(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
         within(self, "learner", 1e-6, 1.0, "alpha")
         within(self, "learner", 0.0, math.inf, "epsilon_knee")
+        within(self, "learner", 1, MAX_COMPONENTS, "components")
+        within(self, "learner", 3, MAX_TAU, "tau")
         within(self, "learner", 0.0, 0.999999, "gamma")
         if self.beta is not None:
             within(self, "learner", 0.0, math.inf, "beta")
-        if self.tau < 3:
-            raise UsageError(f"learner.tau is {self.tau}: a block needs at least 3 frames")
         if self.outputs > self.components:
             raise UsageError(
                 f"learner.outputs is {self.outputs}, more than learner.components {self.components}"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cdmisfa.agent import OUTCOME, begin_abstraction, has_gap, mean_change, new_agent, rules, think
 from cdmisfa.blocks import Block, SourceSpec
 from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import CdmisfaError
+from cdmisfa.errors import CdmisfaError, UsageError
 from cdmisfa.expansion import expanded_size, quadratic
 from cdmisfa.gate import Frozen, mean_output, recognise
 from cdmisfa.incsfa import IncSFA, project
@@ -42,6 +42,10 @@ class LearnerState:
     arrays: Mapping[str, NDArray[Any]]
     modules: tuple[Module, ...]
     policy_rng: Mapping[str, Any]
+
+
+MAX_INPUTS = 2_000_000
+"""An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused."""
 
 
 class CuriousLearner:
@@ -74,7 +78,7 @@ class CuriousLearner:
         self.spec = spec
         self.seed = seed
         self.modules: list[Module] = []
-        self._n_inputs = expanded_size(config.expansion, int(np.prod(spec.frame_shape)))
+        self._n_inputs = self._count_inputs()
         self.scale = 1.0 / 255.0 if spec.dtype == "uint8" else 1.0
         self.policy_rng = np.random.Generator(
             np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
@@ -195,6 +199,25 @@ class CuriousLearner:
         if self.out["saved"][0]:
             self.save_abstraction()
         return signals
+
+    def _count_inputs(self) -> int:
+        """Number of inputs after expansion.
+
+        Raises:
+            UsageError: too many to hold, or fewer than components.
+        """
+        values = int(np.prod(self.spec.frame_shape))
+        inputs = expanded_size(self.config.expansion, values)
+        if inputs > MAX_INPUTS:
+            raise UsageError(
+                f"learner.expansion {self.config.expansion} makes {inputs:,} inputs of {values:,}, "
+                f"more than {MAX_INPUTS:,}: set learner.expansion=none or take smaller frames"
+            )
+        if self.config.components > inputs:
+            raise UsageError(
+                f"learner.components is {self.config.components}, more than the {inputs} inputs"
+            )
+        return inputs
 
     def _check(self, block: Block) -> None:
         """Refuse a block that was not asked for, or that would spoil every estimate."""

@@ -13,7 +13,7 @@ import pytest
 
 from cdmisfa.blocks import Block, SourceSpec, freeze
 from cdmisfa.config import LearnerConfig, build, load_preset
-from cdmisfa.errors import CdmisfaError
+from cdmisfa.errors import CdmisfaError, UsageError
 from cdmisfa.gate import BAND, CONSTANT
 from cdmisfa.learner import CuriousLearner
 from cdmisfa.signals import BlockSignals, SignalsHash, values
@@ -377,3 +377,17 @@ def test_ten_thousand_streams() -> None:
     assert record.Q.shape == (n, 2)
     assert np.isfinite(record.Q).all()
     assert record.Q.any()
+
+
+@pytest.mark.parametrize(
+    ("config", "shape", "words"),
+    [
+        (LearnerConfig(expansion="quadratic"), (48, 128), "learner.expansion quadratic makes 18,"),
+        (LearnerConfig(components=6), (2,), "learner.components is 6, more than the 5 inputs"),
+    ],
+)
+def test_inputs_that_cannot_be_learned_are_refused(
+    config: LearnerConfig, shape: tuple[int, ...], words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        CuriousLearner(config, SourceSpec(("a", "b"), shape, "float64"), seed=0)
