@@ -12,15 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.blocks import NANOSECONDS, Block, SourceSpec, check_request, freeze
-from cdmisfa.errors import LogDamagedError, LogExhaustedError, UsageError
-from replay.files import log_files, sha256
-from replay.images import RECIPE, SCHEMAS, Decoder, image_decoder, shrink, step_of
-from replay.reader import LogReader
-from replay.records import Bytes, Channel, MalformedRecord
-from replay.structure import Segment
+from cdmisfa.errors import LogExhaustedError, UsageError
+from replay.camera_logs import ImageStream, even_times, fingerprint, image_logs, open_images
+from replay.images import RECIPE, step_of
 
 Align = Literal["index", "time"]
-CACHE_BYTES: Final = 1024 * 1024
 MAX_FRAMES: Final = 2**31
 
 
@@ -39,121 +35,17 @@ class Aligned:
     dropped: int
 
 
-class ForeignStream:
-    """The images on one topic of one log, in the order of log time.
-
-    Args:
-        path: the log.
-        topic: the topic; may be left out where the log has one topic of images.
-        size: (height, width) of a frame.
-        salvage: leave out what is damaged.
-
-    Raises:
-        UsageError: no such topic, or no images on it.
-        LogDamagedError: the log is damaged.
-    """
-
-    def __init__(
-        self, path: Path, topic: str | None, size: tuple[int, int], *, salvage: bool = False
-    ) -> None:
-        self.path = path
-        self.size = size
-        self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
-        self._last: tuple[int, Bytes] | None = None
-        try:
-            self.channel, self._decode = self._find(topic)
-            self._index()
-        except BaseException:
-            self.reader.close()
-            raise
-
-    @property
-    def topic(self) -> str:
-        """The topic."""
-        return self.channel.topic
-
-    def frame(self, row: int) -> Bytes:
-        """Decode a message into a frame, (height, width) uint8.
-
-        Raises:
-            LogDamagedError: the message is no image that is read.
-        """
-        if self._last is not None and self._last[0] == row:
-            return self._last[1]
-        segment = self._segments[int(self._segment_of[row])]
-        table = self.reader.table(segment)
-        try:
-            if table is None:
-                raise MalformedRecord("it is damaged")
-            image = shrink(self._decode(table.payload(int(self._row_in[row]))), *self.size)
-        except MalformedRecord as error:
-            raise LogDamagedError(
-                f"{self.path}: {self.topic} at {self.times[row]} ns: {error}"
-            ) from None
-        self._last = (row, image)
-        return image
-
-    def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
-        self.reader.close()
-
-    def _find(self, topic: str | None) -> tuple[Channel, Decoder]:
-        readable: list[tuple[Channel, Decoder]] = []
-        others: dict[str, str] = {}
-        for channel in self.reader.channels.values():
-            schema = self.reader.schemas.get(channel.schema_id)
-            name = schema.name if schema else "no schema"
-            decoder = image_decoder(name, channel.encoding)
-            if decoder is None:
-                others[channel.topic] = f"{name} in {channel.encoding or 'no encoding'}"
-            else:
-                readable.append((channel, decoder))
-        found = [r for r in readable if topic in (None, r[0].topic)]
-        if len(found) == 1:
-            return found[0]
-        known = ", ".join(sorted(c.topic for c, _ in readable)) or "none"
-        if topic is None:
-            raise UsageError(f"{self.path}: name one --topic; it has images on: {known}")
-        if len(found) > 1:
-            raise UsageError(f"{self.path}: {len(found)} channels share the topic {topic}")
-        if topic in others:
-            raise UsageError(
-                f"{self.path}: {topic} holds {others[topic]}, images are {', '.join(SCHEMAS)}"
-            )
-        raise UsageError(f"{self.path}: no topic {topic}; it has images on: {known}")
-
-    def _index(self) -> None:
-        """Find every message of the topic; one pass over the log checks all of it."""
-        self._segments: list[Segment] = []
-        times, members, rows = [], [], []
-        for segment, table in self.reader.tables(ordered=False):
-            own = np.flatnonzero(table.channel == self.channel.id)
-            if len(own):
-                times.append(table.log_time[own])
-                members.append(np.full(len(own), len(self._segments), np.int32))
-                rows.append(own.astype(np.int32))
-                self._segments.append(segment)
-        if not times:
-            raise UsageError(f"{self.path}: there is no message on {self.channel.topic}")
-        order = np.argsort(np.concatenate(times), kind="stable")
-        self.times = np.concatenate(times)[order]
-        if int(self.times[-1]) >= 2**62:
-            raise LogDamagedError(f"{self.path}: {self.channel.topic} has times beyond any clock")
-        self._segment_of = np.concatenate(members)[order]
-        self._row_in = np.concatenate(rows)[order]
-
-
 class ForeignSource:
-    """Camera topics of any MCAP logs, made gray and small, on a common clock.
+    """Cameras in MCAP logs, ROS bags and folders of pictures, gray and small, on one clock.
 
     Args:
-        paths: one log, or one log a topic.
+        paths: one log, or one log or folder of pictures a stream.
         topics: the topics, a stream each; none where each log has one topic of images.
         size: (height, width) of a frame.
         align: how streams of unequal length, start or rate are put on one clock: "index"
             takes the i-th image of each, "time" the last image at or before each tick.
             None refuses such streams.
-        rate: ticks a second; the first stream's where not given.
+        rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged.
 
@@ -184,16 +76,21 @@ class ForeignSource:
             raise UsageError(f"--rate is {rate}: it must be in [0.001, 1000000]")
         if min(size) < 1:
             raise UsageError(f"--size is {size[1]}x{size[0]}: it must be above 0")
-        self._files = log_files(paths)
+        named = [paths] if isinstance(paths, str | Path) else paths
+        self._files = image_logs([Path(path) for path in named])
         self._loop = loop
         self._t = 0
-        self._hashes: dict[str, str] | None = None
-        self._streams: list[ForeignStream] = []
+        self._hashes: list[dict[str, str]] | None = None
+        self._size = size
+        self._streams: list[ImageStream] = []
         try:
             for path, topic in _pairs(self._files, topics):
-                self._streams.append(ForeignStream(path, topic, size, salvage=salvage))
+                self._streams.append(open_images(path, topic, size, salvage=salvage))
             self._align_by = align
-            self._fps = rate or _rate(self._streams[0])
+            self._fps = rate or _rate(self._streams)
+            self._times = [
+                s.times if len(s.times) else even_times(s.count, self._fps) for s in self._streams
+            ]
             self._aligned = self._put_on_clock(align)
         except BaseException:
             self.close()
@@ -210,7 +107,7 @@ class ForeignSource:
         )
         self.alignment = {
             name: {
-                "messages": len(stream.times),
+                "messages": stream.count,
                 "repeated": aligned.repeated,
                 "dropped": aligned.dropped,
             }
@@ -218,14 +115,7 @@ class ForeignSource:
                 self._spec.streams, self._streams, self._aligned, strict=True
             )
         }
-        self.warnings = tuple(
-            dict.fromkeys(
-                f"{s.path}: {text}"
-                for s in self._streams
-                for text in [s.reader.missing, *(f"{p.where}: {p.what}" for p in s.reader.problems)]
-                if text
-            )
-        )
+        self.warnings = tuple(dict.fromkeys(w for s in self._streams for w in s.warnings))
 
     @property
     def spec(self) -> SourceSpec:
@@ -275,7 +165,9 @@ class ForeignSource:
     def describe(self) -> Mapping[str, Any]:
         """The logs with their SHA-256, the topics, and how they became frames."""
         if self._hashes is None:
-            self._hashes = {path.name: sha256(path) for path in self._files}
+            self._hashes = [
+                {"file": path.name, "sha256": fingerprint(path)} for path in self._files
+            ]
         return {
             "kind": "foreign",
             "files": self._hashes,
@@ -295,55 +187,81 @@ class ForeignSource:
             stream.close()
 
     def _put_on_clock(self, align: Align | None) -> list[Aligned]:
-        streams = self._streams
-        self._start = int(streams[0].times[0])
         if align == "time":
             return self._by_time()
         if align is None:
             self._refuse_unequal()
-        count = min(len(s.times) for s in streams)
-        return [Aligned(np.arange(count), 0, len(s.times) - count) for s in streams]
+            self._refuse_rate()
+        self._start = int(self._times[0][0])
+        count = min(len(times) for times in self._times)
+        return [Aligned(np.arange(count), 0, len(times) - count) for times in self._times]
+
+    def _refuse_rate(self) -> None:
+        """Refuse to take images at another rate than theirs without being told how.
+
+        Raises:
+            UsageError: their rate differs by more than a hundredth from the one asked for.
+        """
+        for stream in self._streams:
+            step = step_of(stream.times)
+            if step > 0 and abs(step * self._fps - 1) > 0.01:
+                raise UsageError(
+                    f"{stream.topic} has {1 / step:g} images a second, not {self._fps:g}: choose "
+                    f"images by their times, as with: {self._command()}"
+                )
+
+    def _overlap(self) -> tuple[int, int]:
+        """From when to when every stream has images, in nanoseconds."""
+        starts, stops = zip(*((int(t[0]), int(t[-1])) for t in self._times), strict=True)
+        return max(starts), min(stops)
 
     def _by_time(self) -> list[Aligned]:
-        start = max(int(s.times[0]) for s in self._streams)
-        stop = min(int(s.times[-1]) for s in self._streams)
-        if stop < start:
+        self._start, stop = self._overlap()
+        if stop < self._start:
             raise UsageError(
                 f"{self._files[0]}: its streams have no time in common; use --align index"
             )
-        ticks = (stop - start) * self._fps / NANOSECONDS + 1
+        ticks = (stop - self._start) * self._fps / NANOSECONDS + 1
         if ticks > MAX_FRAMES:
             raise UsageError(f"--rate {self._fps:g} makes {ticks:.0f} frames: choose a lower one")
-        self._start = start
         offsets = np.rint(np.arange(int(ticks)) * NANOSECONDS / self._fps).astype(np.uint64)
-        clock = np.uint64(start) + offsets
+        clock = np.uint64(self._start) + offsets
         aligned = []
-        for stream in self._streams:
-            rows = np.searchsorted(stream.times, clock, side="right").astype(np.int64) - 1
+        for times in self._times:
+            rows = np.searchsorted(times, clock, side="right").astype(np.int64) - 1
             shown = len(np.unique(rows))
-            aligned.append(Aligned(rows, len(rows) - shown, len(stream.times) - shown))
+            aligned.append(Aligned(rows, len(rows) - shown, len(times) - shown))
         return aligned
 
     def _refuse_unequal(self) -> None:
-        first = self._streams[0].times
-        half = step_of(first) / 2 * 1e9
-        reason = ""
-        for stream in self._streams[1:]:
-            times = stream.times
+        """Refuse streams whose i-th images were not taken together, with what would work.
+
+        Raises:
+            UsageError: they differ in number, or by more than half a step.
+        """
+        first = self._times[0]
+        half = NANOSECONDS * step_of(first) / 2
+        for stream, times in zip(self._streams[1:], self._times[1:], strict=True):
             if len(times) != len(first):
                 reason = f"{len(first)} and {len(times)} images"
             elif np.abs(times.astype(np.int64) - first.astype(np.int64)).max() > half:
                 reason = "images at different times"
-            if reason:
-                break
-        if reason:
-            words = ["cdmisfa", "learn", *map(str, self._files)]
-            for stream in self._streams:
-                words += ["--topic", stream.topic]
+            else:
+                continue
             raise UsageError(
                 f"{self._streams[0].topic} and {stream.topic} have {reason}: put them on one "
-                f"clock, as with: {shlex.join(words)} --align time --rate {self._fps:g} -o RUN"
+                f"clock, as with: {self._command()}"
             )
+
+    def _command(self) -> str:
+        """Give a command that takes these streams."""
+        words = ["cdmisfa", "learn", *map(str, self._files)]
+        for stream in self._streams:
+            words += ["--topic", stream.topic]
+        start, stop = self._overlap()
+        words += ["--size", f"{self._size[1]}x{self._size[0]}"]
+        words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
+        return shlex.join([*words, "-o", "RUN"])
 
 
 def _pairs(files: Sequence[Path], topics: Sequence[str]) -> list[tuple[Path, str | None]]:
@@ -360,14 +278,18 @@ def _pairs(files: Sequence[Path], topics: Sequence[str]) -> list[tuple[Path, str
     return list(zip(files, topics, strict=True))
 
 
-def _rate(stream: ForeignStream) -> float:
-    step = step_of(stream.times)
+def _rate(streams: Sequence[ImageStream]) -> float:
+    """Images a second of the first stream that has times."""
+    timed = next((s for s in streams if len(s.times)), None)
+    if timed is None:
+        raise UsageError(f"{streams[0].path}: pictures tell no rate; set one with --rate")
+    step = step_of(timed.times)
     if not step > 0:
-        raise UsageError(f"{stream.path}: {stream.topic} tells no rate; set one with --rate")
+        raise UsageError(f"{timed.path}: {timed.topic} tells no rate; set one with --rate")
     return float(f"{1 / step:.6g}")
 
 
-def _names(streams: Sequence[ForeignStream]) -> tuple[str, ...]:
+def _names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
     """Topics as names of streams, with the file's where topics are shared."""
     topics = [s.topic for s in streams]
     if len(set(topics)) == len(topics):

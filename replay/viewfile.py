@@ -45,6 +45,10 @@ _DECODED: Final = 4
 _BATCH: Final = 64
 
 
+class NoRecordingError(LogDamagedError):
+    """A log that is no recording of ours; it may be whole, and somebody else's."""
+
+
 @dataclass(frozen=True, slots=True)
 class ViewFacts:
     """What a view's file states about itself, checked.
@@ -362,7 +366,7 @@ class ViewFile:
     def _open(self, salvage: bool) -> None:
         records = [m for m in self.reader.metadata if m.name == METADATA]
         if len(records) != 1:
-            raise LogDamagedError(
+            raise NoRecordingError(
                 f"{self.path}: no recording of cdmisfa ({len(records)} {METADATA} records); "
                 "for logs of others name their --topic"
             )

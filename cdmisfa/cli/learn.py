@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.cameras import camera_options, say_about
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import Bar, bar
 
 if TYPE_CHECKING:
     from cdmisfa.experiments.run import Progress, RunResult
+    from replay.foreign import Align
 
 TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
@@ -40,6 +42,7 @@ TICK = 0.1
 @click.option("--resume", is_flag=True, help="Go on with the run in -o where it was stopped.")
 @click.option("--salvage", is_flag=True, help="Go on over damaged parts of a recording.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@camera_options
 @options.force
 @options.as_json
 @click.pass_context
@@ -57,6 +60,10 @@ def learn_command(
     resume: bool,
     salvage: bool,
     no_rerun: bool,
+    topics: tuple[str, ...],
+    size: tuple[int, int] | None,
+    align: Align | None,
+    rate: float | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -64,21 +71,28 @@ def learn_command(
 
     SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
     files of its views. The same seed gives the same signals, bit for bit, from each.
+    It may also be other people's logs of cameras: MCAP files, ROS bags, or a folder of
+    pictures for each stream.
     """
     if resume and out is None:
         raise click.UsageError("--resume needs -o RUN, the run to go on with")
     if resume and force:
         raise click.UsageError("--force starts anew and --resume goes on: use one of them")
     from cdmisfa.experiments.run import learn
-    from cdmisfa.experiments.sources import open_source
+    from cdmisfa.experiments.sources import CameraOptions, open_source
 
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
     frames, configuration = open_source(
-        source, preset=preset, settings=settings, seed=seed, loop=loop, salvage=salvage
+        source,
+        preset=preset,
+        settings=settings,
+        seed=seed,
+        loop=loop,
+        salvage=salvage,
+        cameras=CameraOptions(topics, size, align, rate),
     )
-    for warning in getattr(frames, "warnings", ()):
-        click.echo(f"warning: {warning}", err=True)
+    say_about(frames)
     try:
         with bar("learning", "blocks") as shown, stoppable() as stop:
             result = learn(

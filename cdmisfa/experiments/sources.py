@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.blocks import FrameSource, SourceSpec
 from cdmisfa.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.errors import UsageError
 from recorder.config import RecordConfig, SceneConfig
 
+if TYPE_CHECKING:
+    from replay.foreign import Align, ForeignSource
+
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
+
+FRAME_SIZE = (48, 128)
+"""Height and width of the paper's frames, which images of others are shrunk to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +41,24 @@ class Configuration:
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
         return {"scene": as_table(self.scene), "record": as_table(self.record)}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOptions:
+    """How images of other people's logs become streams of frames.
+
+    Attributes:
+        topics: the topics, a stream each.
+        size: (height, width) of a frame, or None for that of the paper, (48, 128).
+        align: how streams of unequal length, start or rate are put on one clock: "index",
+            "time", or None to refuse them.
+        rate: frames a second; None for the rate of the first stream.
+    """
+
+    topics: tuple[str, ...] = ()
+    size: tuple[int, int] | None = None
+    align: Align | None = None
+    rate: float | None = None
 
 
 def configure(
@@ -106,16 +131,19 @@ def open_source(
     seed: int = 0,
     loop: bool = False,
     salvage: bool = False,
+    cameras: CameraOptions | None = None,
 ) -> tuple[FrameSource, Configuration]:
-    """Open a live scene by its name, or a recording by its folder or its views' files.
+    """Open a live scene by its name, a recording, or other people's camera logs.
 
     Args:
-        words: the name of a scene, or paths.
+        words: the name of a scene, or paths: the folder of a recording or its views' files,
+            or MCAP logs, ROS bags or folders of pictures of others.
         preset: instead of the source's own.
         settings: `section.key=value` words.
         seed: of the scene, where `scene.seed` is not set.
         loop: start a recording again at its end.
         salvage: go on over the damaged parts of a recording.
+        cameras: how images of others become frames; given, the paths are taken as such logs.
 
     Raises:
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
@@ -123,12 +151,15 @@ def open_source(
     """
     from recorder.scenes import SCENES, open_scene
 
+    cameras = cameras or CameraOptions()
     if len(words) == 1 and words[0] in SCENES:
+        if cameras != CameraOptions():
+            raise UsageError(
+                f"{words[0]} is a scene: --topic, --size, --align and --rate are for camera logs"
+            )
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
         return open_scene(kind, configuration.scene, configuration.record), configuration
-    from replay.recorded import RecordedSource
-
     paths = [Path(word) for word in words]
     for path in paths:
         if not path.exists():
@@ -136,10 +167,62 @@ def open_source(
                 f"{path}: no such file or folder, and no scene either: "
                 f"the scenes are {', '.join(SCENES)}"
             )
-    source = RecordedSource(paths[0] if len(paths) == 1 else paths, loop=loop, salvage=salvage)
+    source = open_log(paths, loop=loop, salvage=salvage, cameras=cameras)
     try:
         kind = preset_for(source.spec, source.describe())
         return source, configure(kind, preset, settings, seed)
     except BaseException:
         source.close()
         raise
+
+
+def open_log(
+    paths: Sequence[Path],
+    *,
+    loop: bool = False,
+    salvage: bool = False,
+    cameras: CameraOptions | None = None,
+) -> FrameSource:
+    """Open a recording of ours, or what else holds images.
+
+    Args:
+        paths: of one recording, or of the logs of others.
+        loop: start again at the end.
+        salvage: go on over damaged parts.
+        cameras: how images of others become frames; given, the paths are taken as such logs.
+
+    Raises:
+        UsageError: no such log, or streams that need to be aligned.
+        LogDamagedError: it is damaged.
+    """
+    from replay.camera_logs import only_foreign
+    from replay.recorded import RecordedSource
+    from replay.viewfile import NoRecordingError
+
+    cameras = cameras or CameraOptions()
+    if cameras == CameraOptions() and not any(map(only_foreign, paths)):
+        with contextlib.suppress(NoRecordingError):
+            return RecordedSource(paths, loop=loop, salvage=salvage)
+    return open_cameras(paths, cameras, loop=loop, salvage=salvage)
+
+
+def open_cameras(
+    paths: Sequence[Path], cameras: CameraOptions, *, loop: bool = False, salvage: bool = False
+) -> ForeignSource:
+    """Open the camera logs of others as streams on one clock.
+
+    Raises:
+        UsageError: no such log, or streams that need to be aligned.
+        LogDamagedError: it is damaged.
+    """
+    from replay.foreign import ForeignSource
+
+    return ForeignSource(
+        paths,
+        cameras.topics,
+        size=cameras.size or FRAME_SIZE,
+        align=cameras.align,
+        rate=cameras.rate,
+        loop=loop,
+        salvage=salvage,
+    )

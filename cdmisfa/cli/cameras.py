@@ -1,0 +1,69 @@
+"""Options for other people's camera logs, and what is said of a source that was opened."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import click
+
+from cdmisfa.cli.options import Command
+
+if TYPE_CHECKING:
+    from cdmisfa.blocks import FrameSource
+
+
+def _height_and_width(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", value)
+    if found is None:
+        raise click.BadParameter(f"{value!r} is no size: write WIDTHxHEIGHT, as 128x48", ctx, param)
+    return int(found[2]), int(found[1])
+
+
+def camera_options(command: Command) -> Command:
+    """`--topic`, `--size`, `--align` and `--rate`."""
+    for option in (
+        click.option(
+            "--rate",
+            type=click.FloatRange(1e-3, 1e6),
+            metavar="HZ",
+            help="Frames a second of camera logs; by default the first stream's.",
+        ),
+        click.option(
+            "--align",
+            type=click.Choice(["index", "time"]),
+            help="Put camera streams that differ on one clock: the i-th image of each, or the "
+            "last image at each time. By default they are refused.",
+        ),
+        click.option(
+            "--size",
+            callback=_height_and_width,
+            metavar="WxH",
+            help="Shrink camera images to this size; by default 128x48.",
+        ),
+        click.option(
+            "--topic",
+            "topics",
+            multiple=True,
+            metavar="TOPIC",
+            help="A topic of images in a log, one stream each; repeatable.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def say_about(source: FrameSource) -> None:
+    """Say on stderr what the user should know of a source, and how images became frames."""
+    for warning in getattr(source, "warnings", ()):
+        click.echo(f"warning: {warning}", err=True)
+    for name, counts in getattr(source, "alignment", {}).items():
+        click.echo(
+            f"{name}: {counts['messages']} images, "
+            f"{counts['repeated']} frames repeated, {counts['dropped']} images dropped",
+            err=True,
+        )
