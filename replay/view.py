@@ -61,16 +61,25 @@ def build_view(
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     if is_run(path):
         log = run_log(path)
-        with _recording_to(out, _name(log), log) as recording:
+        with recording_to(out, _name(log), log) as recording:
             _write_run(recording, log, config)
     else:
-        with _recording_to(out, path.resolve().stem, path) as recording:
+        with recording_to(out, path.resolve().stem, path) as recording:
             write_recording(recording, path, config)
 
 
 @contextlib.contextmanager
-def _recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStream]:
-    """A Rerun recording that becomes the file `out` once it is complete."""
+def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStream]:
+    """A Rerun recording that becomes the file `out` once it is complete.
+
+    Args:
+        out: the file; replaced.
+        name: what the viewer calls the recording.
+        source: what it is made from, so that others of the same name are not taken for it.
+
+    Raises:
+        CdmisfaError: the file cannot be written.
+    """
     partial = partial_path(out)
     recording = rr.RecordingStream(APPLICATION, recording_id=_identity(name, source))
     recording.set_log_time_enabled(False)

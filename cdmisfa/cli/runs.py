@@ -11,29 +11,49 @@ from cdmisfa.errors import NotReproducedError
 
 
 @click.command("compare")
-@options.path_argument("first")
-@options.path_argument("second")
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--save",
+    type=click.Path(path_type=Path),
+    metavar="F.rrd",
+    help="Also write their curves, one over the other, as a view.",
+)
+@options.force
 @options.as_json
 @click.pass_context
-def compare_command(ctx: click.Context, first: Path, second: Path, as_json: bool) -> None:
-    """Check that two runs' signals are the same, bit for bit.
+def compare_command(
+    ctx: click.Context, runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool
+) -> None:
+    """Check that runs' signals are the same, bit for bit, and show their curves.
 
-    Exits with 4 where they differ, and says where they first do.
+    Of two runs it says where they first differ, and exits with 4 if they do. Of more it
+    prints a table, each run compared with the first, and exits with 0.
     """
-    from replay.compare import compare
+    if len(runs) < 2:
+        raise click.UsageError("name two runs, or more")
+    from replay.comparison import HEAD, build_overlay, survey
 
-    difference = compare(first, second)
+    rows = survey(runs)
+    if save is not None:
+        build_overlay(runs, rows, save, force=force)
+    different = [row.difference for row in rows if row.difference is not None]
     if as_json:
         options.print_json(
             {
                 "schema": options.SCHEMA,
-                "identical": difference is None,
-                "first_difference": None if difference is None else difference.as_json(),
+                "identical": not different,
+                "first_difference": different[0].as_json() if different else None,
+                "runs": [row.as_json() for row in rows],
+                "view": save,
             }
         )
+    elif len(runs) == 2:
+        click.echo(str(different[0]) if different else "identical, bit for bit")
     else:
-        click.echo("identical, bit for bit" if difference is None else str(difference))
-    if difference is not None:
+        options.print_table(HEAD, [row.cells() for row in rows])
+    if save is not None and not as_json:
+        click.echo(f"view {save}    look at it: cdmisfa view {save}", err=True)
+    if different and len(runs) == 2:
         ctx.exit(NotReproducedError.exit_code)
 
 

@@ -1,0 +1,199 @@
+"""Many runs side by side: a table of what they came to, and their curves in one view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from cdmisfa.errors import UsageError
+from cdmisfa.signals import SIGNALS, BlockSignals
+from replay.columns import ITERATION, Clock, Column
+from replay.compare import Difference, compare
+from replay.config import ViewConfig
+from replay.labels import label, part
+from replay.layout import blueprint, lines, whole
+from replay.outline import Outline, read_outline
+from replay.palette import colour, packed
+from replay.runlog import read_signals, run_log
+from replay.view import recording_to
+
+CURVES = {
+    "eta_dot": "Change of slowness η̇: a module is saved when it falls below δ",
+    "eta": "Slowness η [1/frame]",
+    "xi": "Change of weights ξ",
+    "reward": "Reward",
+    "share": "Share of novel blocks",
+    "epsilon": "Exploration ε",
+}
+"""Signals that are overlaid, with the titles of their panels."""
+
+FIRST_TAB = ("eta_dot", "epsilon")
+
+R_STAY = "R_stay"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A run in a table of runs.
+
+    Attributes:
+        name: of the run's folder.
+        outline: the run in short.
+        difference: where its signals first differ from the first run's; None where every
+            bit is the same, as for the first run itself.
+    """
+
+    name: str
+    outline: Outline
+    difference: Difference | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The row as JSON values."""
+        streams = self.outline.names()
+        return {
+            "run": self.name,
+            "seed": self.outline.header.manifest.get("seed"),
+            "iterations": self.outline.iterations,
+            "modules": [streams[saved.stream] for saved in self.outline.saved],
+            "first_difference": None if self.difference is None else self.difference.as_json(),
+        }
+
+    def cells(self) -> tuple[str, ...]:
+        """The row as words, in the order of `HEAD`."""
+        found = self.as_json()
+        same = "identical, bit for bit" if self.difference is None else str(self.difference)
+        learned = ", ".join(found["modules"]) or "none"
+        return self.name, str(found["seed"]), str(found["iterations"]), learned, same
+
+
+HEAD = ("run", "seed", "iterations", "modules", "against the first run")
+
+
+def survey(runs: Sequence[Path]) -> tuple[Row, ...]:
+    """What each run came to, and where it first differs from the first one.
+
+    Raises:
+        UsageError: one of them is no run.
+        LogDamagedError: one of them cannot be read.
+    """
+    return tuple(
+        Row(_name(run), read_outline(run), compare(runs[0], run) if i else None)
+        for i, run in enumerate(runs)
+    )
+
+
+def build_overlay(
+    runs: Sequence[Path],
+    rows: Sequence[Row],
+    out: Path,
+    *,
+    force: bool = False,
+    config: ViewConfig | None = None,
+) -> None:
+    """Write the curves of several runs, one colour a run, into one .rrd file.
+
+    The entity `/compare/<number>_<run>/<signal>` holds a run's signal at every iteration.
+
+    Args:
+        runs: the runs.
+        rows: what `survey` says of them.
+        out: the file.
+        force: replace an existing file.
+        config: how many rows are handed over at once, and how many streams are shown.
+
+    Raises:
+        UsageError: `out` exists and `force` is not set.
+        LogDamagedError: a run cannot be read.
+        CdmisfaError: the file cannot be written.
+    """
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    config = config or ViewConfig()
+    names = [row.name for row in rows]
+    with recording_to(out, out.stem, out) as recording:
+        text = rr.TextDocument(label(table_text(rows)), media_type=rr.MediaType.MARKDOWN)
+        recording.log("summary", text, static=True)
+        for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
+            _write(recording, run, row, f"compare/{part(names, i)}", i, config)
+        recording.send_blueprint(_layout(rows, config))
+
+
+def table_text(rows: Sequence[Row]) -> str:
+    """The rows as a Markdown table."""
+    ruler = tuple("---" for _ in HEAD)
+    short = [(*row.cells()[:-1], _shortly(row.difference)) for row in rows]
+    cells = [[cell.replace("|", "/") for cell in line] for line in (HEAD, ruler, *short)]
+    return "\n".join(["## Runs compared", "", *(f"| {' | '.join(line)} |" for line in cells)])
+
+
+def _shortly(difference: Difference | None) -> str:
+    if difference is None:
+        return "identical"
+    return f"differs from {difference.signal} in iteration {difference.iteration} on"
+
+
+def _name(run: Path) -> str:
+    return run_log(run).resolve().parent.name
+
+
+def _write(
+    recording: rr.RecordingStream, run: Path, row: Row, root: str, number: int, config: ViewConfig
+) -> None:
+    spec = row.outline.header.spec
+    clock = Clock(spec)
+    columns: dict[str, Column] = {}
+    shown = row.outline.streams(config.streams)
+    for signals in read_signals(run):
+        at = np.array([signals.t])
+        for entity, values in _curves(signals, spec.streams, shown):
+            path = f"{root}/{entity}"
+            if path not in columns:
+                names = [label(row.name)] * values.size
+                colours = [packed(colour(number))] * values.size
+                recording.log(path, rr.SeriesLines(names=names, colors=colours), static=True)
+                columns[path] = Column(recording, clock, path, config.rows)
+            columns[path].add(at, signals.iteration, values.reshape(1, -1))
+    for column in columns.values():
+        column.flush()
+
+
+def _curves(
+    signals: BlockSignals, names: Sequence[str], shown: Sequence[int]
+) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Entity and value of every curve in one iteration."""
+    for name in CURVES:
+        yield name, np.asarray(getattr(signals, SIGNALS[name].name), dtype=np.float64)
+    if signals.R.size:
+        for s in shown:
+            yield f"{R_STAY}/{part(names, s)}", signals.R[s, 0, s]
+
+
+def _layout(rows: Sequence[Row], config: ViewConfig) -> rrb.Blueprint:
+    axis = whole(max(row.outline.iterations for row in rows))
+    outline, names = rows[0].outline, [row.name for row in rows]
+    roots = [f"/compare/{part(names, i)}" for i in range(len(names))]
+
+    def panel(title: str, entity: str) -> rrb.View:
+        return lines(title, [f"{root}/{entity}" for root in roots], axis)
+
+    streams = outline.names()
+    rewards = [
+        panel(f"R for staying on {label(streams[s])}", f"{R_STAY}/{part(streams, s)}")
+        for s in outline.streams(config.streams)
+    ]
+    first = [panel(CURVES[name], name) for name in FIRST_TAB]
+    table = rrb.TextDocumentView(origin="/summary", name="Runs")
+    return blueprint(
+        rrb.Horizontal(table, rrb.Vertical(*first), column_shares=[2, 4], name="Overview"),
+        rrb.Vertical(*rewards, name="Rewards"),
+        rrb.Grid(*(panel(title, name) for name, title in CURVES.items()), name="All curves"),
+        name="Comparison",
+        timeline=ITERATION,
+    )

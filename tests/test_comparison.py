@@ -1,0 +1,66 @@
+"""Several runs become one table, and one view that holds each one's curves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from run_data import VECTOR, write_run
+
+from cdmisfa.errors import UsageError
+from replay.comparison import build_overlay, survey
+
+
+@pytest.fixture
+def three(tmp_path, monkeypatch):
+    """Two equal runs of the same name in other places, and another one."""
+    monkeypatch.setenv("RERUN_STRICT", "1")
+    runs = [tmp_path / "a" / "run", tmp_path / "b" / "run", tmp_path / "c"]
+    records = []
+    for run, seed in zip(runs, (3, 3, 4), strict=True):
+        run.mkdir(parents=True)
+        records.append(write_run(run / "run.mcap", VECTOR, 12, seed=seed, saves=True))
+    return runs, records
+
+
+def test_the_table_says_which_runs_are_the_first_ones_equals(three):
+    runs, _ = three
+    first, equal, other = survey(runs)
+    assert first.difference is None
+    assert equal.difference is None
+    assert other.difference.iteration == 0
+    row = other.as_json()
+    assert (row["run"], row["iterations"], len(row["modules"])) == ("c", 12, 3)
+
+
+def test_the_view_holds_each_runs_values(three, tmp_path):
+    runs, records = three
+    out = tmp_path / "all.rrd"
+    build_overlay(runs, survey(runs), out)
+    found = {}
+    reader = RrdReader(str(out))
+    for chunk in reader.stream():
+        if not chunk.is_static and chunk.entity_path.endswith(("/epsilon", "/1_x1")):
+            batch = chunk.to_record_batch()
+            assert batch.column("iteration").to_pylist() == list(range(12))
+            found[chunk.entity_path] = batch.column("Scalars:scalars").flatten().to_numpy()
+    assert len(reader.blueprints()) == 1
+    for name, signals in zip(("1_run", "2_run", "3_c"), records, strict=True):
+        expected = [s.epsilon for s in signals]
+        np.testing.assert_array_equal(found[f"/compare/{name}/epsilon"], expected)
+        stay = [s.R[0, 0, 0] for s in signals]
+        np.testing.assert_array_equal(found[f"/compare/{name}/R_stay/1_x1"], stay)
+    with pytest.raises(UsageError, match="--force"):
+        build_overlay(runs, survey(runs), out)
+
+
+def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):
+    (a, b, c), _ = three
+    assert cdmisfa("compare", a, b).code == 0
+    assert cdmisfa("compare", a, c).code == 4
+    done = cdmisfa("compare", a, b, c, "--save", tmp_path / "v.rrd")
+    assert done.code == 0
+    assert done.out.count("identical, bit for bit") == 2
+    assert "iteration 0" in done.out
+    assert (tmp_path / "v.rrd").is_file()
+    assert cdmisfa("compare", a).code == 2
