@@ -1,0 +1,101 @@
+"""What was learned can be used without the learner, and in scikit-learn."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import UsageError
+from cdmisfa.experiments.run import learn
+from cdmisfa.modules import Module
+from cdmisfa.streams import OscillatorySource
+from replay.modules import save_modules
+from replay.runlog import read_signals, read_watched
+from replay.transformer import SlowFeatures
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run that saved a module of expanded frames, and went on."""
+    out = tmp_path_factory.mktemp("run")
+    learn(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
+    return out
+
+
+def test_outputs_are_those_the_run_recorded(run):
+    features = SlowFeatures.load(run)
+    assert len(features) >= 1
+    recorded = [s.y_frozen[0] for s in read_signals(run) if len(s.y_frozen)]
+    frames = [block for _, block in read_watched(run)][-len(recorded) :]
+    assert len(recorded) > 5
+    for y, block in zip(recorded, frames, strict=True):
+        np.testing.assert_allclose(features[0].transform(block), y, rtol=1e-9, atol=1e-9)
+
+
+def image_module(**changes):
+    rng = np.random.default_rng(0)
+    values = {
+        "index": 1,
+        "stream": 0,
+        "iteration": 5,
+        "phi": rng.standard_normal((2, 12)),
+        "mean": rng.random(12),
+        "band_mean": np.zeros(2),
+        "band_sd": np.zeros(2),
+        "eta": np.zeros(2),
+        "policy": np.zeros(3, dtype=np.int64),
+    }
+    return Module(**{**values, **changes})
+
+
+def test_pixels_count_one_255th(tmp_path):
+    module = image_module()
+    save_modules(tmp_path / "modules.npz", [module])
+    (features,) = SlowFeatures.load(tmp_path / "modules.npz")
+    images = np.random.default_rng(1).integers(0, 256, (2000, 3, 4), dtype=np.uint8)
+    expected = (images.reshape(-1, 12) / 255.0 - module.mean) @ module.phi.T
+    np.testing.assert_allclose(features.transform(images), expected, atol=1e-12)
+    np.testing.assert_allclose(features.transform(images / 255.0), expected, atol=1e-12)
+    assert features.transform(images[:0]).shape == (0, 2)
+
+
+@pytest.mark.parametrize("frames", [np.zeros((5, 11)), np.zeros(12), np.full((2, 12), "x")])
+def test_other_frames_are_refused(frames):
+    with pytest.raises(UsageError, match="given"):
+        SlowFeatures(image_module()).transform(frames)
+
+
+def test_it_cannot_be_fitted():
+    with pytest.raises(UsageError, match="cdmisfa learn"):
+        SlowFeatures(image_module()).fit(np.zeros((3, 12)))
+
+
+def test_it_is_a_step_of_a_pipeline():
+    pytest.importorskip("sklearn.frozen")
+    from sklearn.base import clone
+    from sklearn.frozen import FrozenEstimator
+    from sklearn.linear_model import LinearRegression
+    from sklearn.pipeline import make_pipeline
+
+    features = SlowFeatures(image_module())
+    x = np.random.default_rng(2).random((100, 12))
+    target = features.transform(x) @ [2.0, -1.0] + 3.0
+    pipeline = make_pipeline(FrozenEstimator(features), LinearRegression()).fit(x, target)
+    np.testing.assert_allclose(pipeline.predict(x), target, atol=1e-9)
+    np.testing.assert_array_equal(make_pipeline(features).transform(x), features.transform(x))
+    assert clone(FrozenEstimator(features)).estimator is features
+
+
+def test_neither_learner_nor_sklearn_is_loaded():
+    code = (
+        "import sys, replay.transformer; "
+        "print([m for m in sys.modules if m in ('cdmisfa.learner', 'sklearn', 'rerun')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.strip() == "[]"
