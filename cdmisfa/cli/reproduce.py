@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.progress import Bar, bar
 
 
 @click.command("reproduce")
@@ -61,18 +61,21 @@ def reproduce_command(
     documents: list[dict[str, Any]] = []
     for each in names:
         request = Request(trials, quick, recording, root / each, jobs)
-        started = time.monotonic()
+        if each == "icub" and recording is None:
+            click.echo(f"icub: records the scene into {root}/icub-recording first", err=True)
+        started, finished = time.monotonic(), [0]
         with bar(each, "trials") as shown:
-            document = reproduce(
-                each,
-                request,
-                engine=engine,
-                scheduler=scheduler,
-                progress=shown.update,
-            )
+
+            def told(done: int, total: int, shown: Bar = shown, seen: list[int] = finished) -> None:
+                seen.append(done)
+                shown.update(done, total)
+
+            document = reproduce(each, request, engine=engine, scheduler=scheduler, progress=told)
         seconds = time.monotonic() - started
+        ran = finished[-1] - finished[1]
         click.echo(
-            f"{each}: {document['trials']} trials, {seconds:.1f} s, "
+            f"{each}: {document['trials']} trials, {ran} of them now, {seconds:.1f} s, "
+            f"{ran / seconds:.1f} trials/s, "
             f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}",
             err=True,
         )
