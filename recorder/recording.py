@@ -107,10 +107,8 @@ def record(
         raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
     if force and resume:
         raise UsageError("--force starts anew and --resume goes on: use one of them")
-    if folder.exists() and not (force or resume) and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(
-            f"{folder} exists: choose another folder, go on with --resume or overwrite with --force"
-        )
+    if not resume:
+        refuse_existing(folder, force=force, remedy="go on with --resume or overwrite with --force")
     with contextlib.closing(open_scene(kind, scene, settings)) as source:
         names = _chosen(source.spec, views)
         identity = Identity(
@@ -119,7 +117,7 @@ def record(
             source.spec,
             {"scene": as_table(scene), "record": as_table(settings)},
         )
-        _prepare(folder, source.spec, force=force)
+        make_folder(folder, source.spec, force=force)
         with _stoppable() as stopped, ExitStack() as open_logs:
             poses = _poses(source)
             earlier = {v: _to_continue(folder, v, identity) for v in names} if resume else {}
@@ -148,10 +146,12 @@ def record(
                 log.finish()
     for log in logs:
         kept_path(log.path).unlink(missing_ok=True)
-    return [
-        ViewRecording(log.view, log.path, log.t, log.path.stat().st_size, sha256(log.path))
-        for log in logs
-    ]
+    return [written(log) for log in logs]
+
+
+def written(log: ViewLog) -> ViewRecording:
+    """What a finished log came to."""
+    return ViewRecording(log.view, log.path, log.t, log.path.stat().st_size, sha256(log.path))
 
 
 class _StoppedError(CdmisfaError):
@@ -172,8 +172,22 @@ def _poses(source: FrameSource) -> dict[str, HeadPose]:
     return dict(zip(source.spec.streams, poses, strict=False))
 
 
-def _prepare(folder: Path, spec: SourceSpec, *, force: bool) -> None:
-    """Make the folder; where it may be overwritten, remove the recording in it."""
+def refuse_existing(folder: Path, *, force: bool, remedy: str = "overwrite with --force") -> None:
+    """Refuse to write a recording where there is something.
+
+    Raises:
+        UsageError: the folder is not empty, or no folder, and `force` is not set.
+    """
+    if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder} exists: choose another folder, {remedy}")
+
+
+def make_folder(folder: Path, spec: SourceSpec, *, force: bool) -> None:
+    """Make a recording's folder; where it may be overwritten, remove the recording in it.
+
+    Raises:
+        LogWriteError: it cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if force:

@@ -106,3 +106,29 @@ def test_a_scene_takes_no_camera_options(cdmisfa: Cdmisfa) -> None:
     assert (done.code, "is a scene" in done.err) == (2, True)
     done = cdmisfa("learn", "oscillatory", "--size", "12")
     assert (done.code, "128x48" in done.err) == (2, True)
+
+
+def test_a_converted_log_is_a_recording_with_the_same_signals(cdmisfa: Cdmisfa, logs: Path) -> None:
+    words = (logs / "uneven.mcap", *BOTH, *SMALL, "--align", "time")
+    done = cdmisfa("convert", *words, "-o", logs / "rec", "--json")
+    assert done.code == 0, done.err
+    assert "/cam_right: 45 images, 44 frames repeated, 0 images dropped" in done.err
+    assert [(v["name"], v["frames"]) for v in done.json["views"]] == [
+        ("cam_left", 89),
+        ("cam_right", 89),
+    ]
+    assert cdmisfa("verify", logs / "rec").code == 0
+    assert cdmisfa("info", logs / "rec", "--json").json["kind"] == "recording"
+    direct = cdmisfa("learn", *words, *QUICK, "--json")
+    converted = cdmisfa("learn", logs / "rec", *QUICK, "--json")
+    assert converted.json["signals_sha256"] == direct.json["signals_sha256"]
+    again = cdmisfa("convert", *words, "-o", logs / "rec")
+    assert (again.code, "--force" in again.err) == (2, True)
+    assert cdmisfa("convert", *words, "-o", logs / "rec", "--force").code == 0
+
+
+def test_topics_become_names_of_files() -> None:
+    from replay.convert import view_names
+
+    topics = ("/a/image", "/a,image", "../../etc", "/")
+    assert view_names(topics) == ("a_image", "a_image-2", "etc", "stream")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.progress import bar
+
+if TYPE_CHECKING:
+    from recorder.recording import ViewRecording
 
 
 @click.command("record")
@@ -81,10 +86,17 @@ def record_command(
             resume=resume,
             progress=lambda done: shown.update(done, frames),
         )
+    print_recording(out, frames, files, as_json=as_json)
+
+
+def print_recording(
+    folder: Path, frames: int, files: Sequence[ViewRecording], *, as_json: bool
+) -> None:
+    """Say what was written: each view's file."""
     if as_json:
         rows = [file.as_json() for file in files]
         options.print_json(
-            {"schema": options.SCHEMA, "recording": str(out), "frames": frames, "views": rows}
+            {"schema": options.SCHEMA, "recording": str(folder), "frames": frames, "views": rows}
         )
         return
     options.print_table(
