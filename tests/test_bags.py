@@ -1,0 +1,139 @@
+"""ROS bags, written by rosbags, become the frames that are in them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH, pictures
+from conftest import Cdmisfa
+from source_contract import SourceContract
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.foreign import ForeignSource
+
+pytest.importorskip("rosbags")
+from rosbags import rosbag1, rosbag2  # noqa: E402
+from rosbags.typesys import Stores, get_typestore  # noqa: E402
+
+COUNT = 60
+TOPICS = ("/cam_left", "/cam_right")
+
+
+def fill(writer: Any, store: Any, serialize: Callable[..., Any], ros1: bool) -> None:
+    """Two cameras and one topic of text, 20 ms apart; the second image has the first's time."""
+    image_type, header_type = "sensor_msgs/msg/Image", store.types["std_msgs/msg/Header"]
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = header_type(*([0] if ros1 else []), stamp=stamp, frame_id="cam")
+    channels = [writer.add_connection(topic, image_type, typestore=store) for topic in TOPICS]
+    text = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+    for i, images in enumerate(zip(pictures(COUNT, 0), pictures(COUNT, 1), strict=True)):
+        time = 10**18 + (0 if i == 1 else i) * 20_000_000
+        word = store.types["std_msgs/msg/String"](data=f"word {i}")
+        writer.write(text, time, bytes(serialize(word, "std_msgs/msg/String")))
+        for channel, image in zip(channels, images, strict=True):
+            message = store.types[image_type](
+                header=header,
+                height=HEIGHT,
+                width=WIDTH,
+                encoding="mono8",
+                is_bigendian=0,
+                step=WIDTH,
+                data=image.reshape(-1),
+            )
+            writer.write(channel, time, bytes(serialize(message, image_type)))
+
+
+def ros1_bag(folder: Path) -> Path:
+    path = folder / "cameras.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with rosbag1.Writer(path) as writer:
+        fill(writer, store, store.serialize_ros1, True)
+    return path
+
+
+def ros2_bag(folder: Path, plugin: str = "SQLITE3") -> Path:
+    path = folder / "cameras"
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    storage = rosbag2.StoragePlugin[plugin]
+    with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
+        fill(writer, store, store.serialize_cdr, False)
+    return path
+
+
+def ros2_database(folder: Path) -> Path:
+    return next(ros2_bag(folder).glob("*.db3"))
+
+
+def ros2_mcap(folder: Path) -> Path:
+    return ros2_bag(folder, "MCAP")
+
+
+BAGS = [ros1_bag, ros2_bag, ros2_database, ros2_mcap]
+
+
+class TestBag(SourceContract):
+    ends = True
+
+    @pytest.fixture(autouse=True)
+    def _bag(self, tmp_path: Path) -> None:
+        self.path = ros1_bag(tmp_path)
+
+    def open(self) -> FrameSource:
+        return ForeignSource(self.path, TOPICS, size=(HEIGHT, WIDTH))
+
+
+@pytest.mark.parametrize("make", BAGS)
+def test_every_image_is_there_in_its_place(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    source = ForeignSource(make(tmp_path), TOPICS, size=(HEIGHT, WIDTH))
+    assert source.spec.streams == TOPICS
+    assert (source.spec.fps, source.spec.start_ns) == (50.0, 10**18)
+    expected = np.stack(list(pictures(COUNT, 1)))
+    np.testing.assert_array_equal(source.take(1, COUNT).frames, expected)
+    for at in (30, 1, 0, 59):
+        source.seek(at)
+        np.testing.assert_array_equal(source.take(1, 1).frames[0], expected[at])
+    source.close()
+
+
+@pytest.mark.parametrize("make", BAGS)
+def test_what_is_no_image_is_named(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    path = make(tmp_path)
+    with pytest.raises(UsageError, match="/cam_left, /cam_right"):
+        ForeignSource(path)
+    with pytest.raises(UsageError, match="/chatter holds std_msgs"):
+        ForeignSource(path, ["/chatter"])
+
+
+@pytest.mark.parametrize("make", [ros1_bag, ros2_database])
+def test_a_torn_bag_is_one_line(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    path = make(tmp_path)
+    raw = path.read_bytes()
+    path.write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(LogDamagedError, match=r"cameras\.(bag|db3): rosbags cannot read it"):
+        ForeignSource(path, TOPICS).take(0, COUNT)
+
+
+def test_without_rosbags_the_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = ros1_bag(tmp_path)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    with pytest.raises(CdmisfaError, match=r"cdmisfa\[ros\]"):
+        ForeignSource(path, TOPICS)
+
+
+def test_a_bag_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = (ros2_bag(tmp_path), "--topic", TOPICS[0], "--topic", TOPICS[1], "--size", "16x12")
+    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
+    learned = cdmisfa("learn", *words, *quick)
+    assert learned.code == 0, learned.err
+    assert len(learned.json["source"]["files"][0]["sha256"]) == 64
+    assert cdmisfa("convert", *words, "-o", tmp_path / "rec").code == 0
+    again = cdmisfa("learn", tmp_path / "rec", *quick)
+    assert again.json["signals_sha256"] == learned.json["signals_sha256"]
