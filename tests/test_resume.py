@@ -17,7 +17,7 @@ import pytest
 
 from cdmisfa.blocks import FrameSource
 from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.experiments.checkpoint import (
     SET_ASIDE,
     checkpoints,
@@ -32,7 +32,7 @@ from recorder.config import RecordConfig, SceneConfig
 from recorder.recording import record
 from replay.compare import compare
 from replay.recorded import RecordedSource
-from replay.runlog import read_events
+from replay.runlog import read_events, read_signals
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
@@ -84,12 +84,24 @@ def test_the_first_algorithm_goes_on_too(tmp_path: Path) -> None:
     assert resumed.signals_sha256 == go(OscillatorySource(), None, LENGTH, config).signals_sha256
 
 
-def test_a_recording_goes_on(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "log", frames=LENGTH * CONFIG.tau)
-    with_stop = RecordedSource(tmp_path / "log")
-    go(with_stop, tmp_path / "run", 33)
-    resumed = go(RecordedSource(tmp_path / "log"), tmp_path / "run", LENGTH, resume=True)
-    assert resumed.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
+@pytest.mark.parametrize(("frames", "loop"), [(LENGTH * CONFIG.tau, False), (1500, True)])
+def test_a_recording_goes_on(tmp_path: Path, frames: int, loop: bool) -> None:
+    record("oscillatory", tmp_path / "log", frames=frames)
+    for iterations, resume in ((43, False), (LENGTH, True)):
+        source = RecordedSource(tmp_path / "log", loop=loop)
+        result = go(source, tmp_path / "run", iterations, resume=resume)
+        source.close()
+    assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
+
+
+def test_a_recording_that_ended_goes_on_to_the_same_end(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "log", frames=30 * CONFIG.tau)
+    source = RecordedSource(tmp_path / "log")
+    for resume in (False, True):
+        with pytest.raises(LogExhaustedError, match="30 iterations"):
+            go(source, tmp_path / "run", LENGTH, resume=resume)
+    assert len(list(read_signals(tmp_path / "run"))) == 30
+    source.close()
 
 
 def test_a_simulator_goes_on(tmp_path: Path) -> None:
