@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
 from replay.records import (
+    INDEX_HEADER,
     MAX_CHUNK,
     Channel,
     MalformedRecord,
@@ -306,6 +307,19 @@ class LogReader:
             )
             for part in segment.indexes
         ]
+
+    def stored(self, segment: Segment) -> tuple[memoryview, memoryview]:
+        """Read a chunk's records as they stand in the file, and its message index records.
+
+        Raises:
+            MalformedRecord: together they are larger than any chunk.
+        """
+        first, last = segment.indexes[0].offset - INDEX_HEADER, segment.indexes[-1]
+        stop = last.offset + 16 * last.count
+        if stop - segment.data_offset > 2 * MAX_CHUNK:
+            raise MalformedRecord("its message index is larger than any chunk")
+        raw = memoryview(self._file.read(segment.data_offset, stop - segment.data_offset))
+        return raw[: segment.stored], raw[first - segment.data_offset :]
 
     def check(self) -> None:
         """Decode every chunk, so that every checksum and length is checked."""

@@ -13,7 +13,8 @@ import numpy as np
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
 from cdmisfa.errors import LogDamagedError, LogExhaustedError
 from replay.files import log_files, sha256
-from replay.viewfile import ViewFacts, ViewFile, intersection
+from replay.viewfacts import ViewFacts
+from replay.viewfile import ViewFile, intersection
 
 CACHE_BYTES: Final = 1024 * 1024
 """Decoded chunks that are kept of each view; one always is.
@@ -107,8 +108,7 @@ class RecordedSource:
         at = 0
         while at < n:
             view, frame, count = self._place(stream, (played + at) % self._count, n - at)
-            view.frames(frame, frames[at : at + count])
-            view.truth(frame, truth[at : at + count])
+            view.take(frame, frames[at : at + count], truth[at : at + count])
             at += count
         block = Block(stream, self._t, freeze(frames), freeze(truth))
         self._t += n

@@ -40,6 +40,8 @@ MESSAGE_HEADER: Final = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
+INDEX_HEADER: Final = RECORD_HEADER.size + 6
+"""Bytes before the pairs of a message index."""
 MESSAGE_FIELDS: Final = MESSAGE_HEADER.itemsize - RECORD_HEADER.size
 
 Bytes = NDArray[np.uint8]
@@ -218,7 +220,7 @@ def decompress(stored: bytes, compression: str, size: int) -> bytes:
     return data
 
 
-def crc32(data: bytes, value: int = 0) -> int:
+def crc32(data: bytes | memoryview, value: int = 0) -> int:
     """CRC-32 of bytes, going on from the `value` of those before."""
     return int(_crc32(data, value))
 

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import bisect
-import itertools
-import math
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import operator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from cdmisfa.blocks import NANOSECONDS
 from cdmisfa.errors import LogDamagedError
 from recorder.messages import (
     IMAGE_ENCODING,
     IMAGE_SCHEMA,
     METADATA,
-    SCHEMA_VERSION,
     TRUTH_SCHEMA,
     TRUTH_TOPIC,
     VECTOR_SCHEMA,
@@ -33,308 +28,16 @@ from recorder.messages import (
     vector_payload,
     view_topic,
 )
+from replay.chunks import ChunkScanner, RowLayout
 from replay.reader import LogReader
-from replay.records import Bytes, Channel, MalformedRecord
-from replay.structure import Segment
+from replay.records import MalformedRecord
+from replay.rows import ChannelRows, PixelRows, Rows, Run, TruthRows
 from replay.tables import MessageTable, windows
-
-MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
-MAX_STREAMS: Final = 100_000
-MAX_FRAMES: Final = 2**33
-_DECODED: Final = 4
-_BATCH: Final = 64
+from replay.viewfacts import view_facts
 
 
 class NoRecordingError(LogDamagedError):
     """A log that is no recording of ours; it may be whole, and somebody else's."""
-
-
-@dataclass(frozen=True, slots=True)
-class ViewFacts:
-    """What a view's file states about itself, checked.
-
-    Attributes:
-        view: name of the stream.
-        stream_index: its place among the streams of the recording, from 0.
-        frame_shape: (height, width) or (I,).
-        dtype: "uint8" or "float64".
-        truth: a name for each column of ground truth.
-        fps: frames a second.
-        start_ns: log time of frame 0.
-        first_frame: number of the file's first frame.
-        values: the metadata record as it stands there.
-    """
-
-    view: str
-    stream_index: int
-    frame_shape: tuple[int, ...]
-    dtype: str
-    truth: tuple[str, ...]
-    fps: float
-    start_ns: int
-    first_frame: int
-    values: Mapping[str, str]
-
-    def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Log times of frames, as `SourceSpec.time_ns` gives them."""
-        offsets = np.rint(frames * NANOSECONDS / self.fps).astype(np.int64)
-        return (self.start_ns + offsets).astype(np.uint64)
-
-    def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Frames at log times; one that is not exactly a frame's gets a frame near it."""
-        offsets = times.astype(np.int64) - self.start_ns
-        frames = np.rint(offsets * (self.fps / NANOSECONDS))
-        return np.asarray(np.clip(frames, -1, MAX_FRAMES), dtype=np.int64)
-
-
-def view_facts(path: Path, values: Mapping[str, str]) -> ViewFacts:
-    """Check a file's statement about itself.
-
-    Raises:
-        LogDamagedError: a key is missing or makes no sense.
-    """
-
-    def refuse(key: str, remedy: str) -> LogDamagedError:
-        value = values.get(key)
-        said = "misses" if value is None else f"says {value[:60]!r} for"
-        return LogDamagedError(f"{path}: its recording metadata {said} {key}: {remedy}")
-
-    def number(key: str, low: int, high: int, default: str | None = None) -> int:
-        text = values.get(key, default)
-        if text is None or not text.isascii() or not text.isdigit() or len(text) > 19:
-            raise refuse(key, "record it again")
-        if not low <= int(text) <= high:
-            raise refuse(key, f"it must be in [{low}, {high}]")
-        return int(text)
-
-    if values.get("schema") != str(SCHEMA_VERSION):
-        raise refuse("schema", f"this version reads schema {SCHEMA_VERSION}")
-    view = values.get("view", "")
-    if not view:
-        raise refuse("view", "record it again")
-    shape = values.get("frame_shape", "").split("x")
-    if not 1 <= len(shape) <= 2 or not all(
-        s.isascii() and s.isdigit() and len(s) < 10 for s in shape
-    ):
-        raise refuse("frame_shape", "it must be as 48x128 or 2")
-    frame_shape = tuple(int(s) for s in shape)
-    dtype = values.get("dtype", "")
-    if (dtype, len(frame_shape)) not in (("uint8", 2), ("float64", 1)):
-        raise refuse("dtype", "it must be uint8 for images, float64 for vectors")
-    if not 0 < math.prod(frame_shape) <= MAX_FRAME_VALUES:
-        raise refuse("frame_shape", "no frame has that size")
-    try:
-        fps = float(values.get("fps", ""))
-    except ValueError:
-        fps = math.nan
-    if not 1e-3 <= fps <= 1e6:
-        raise refuse("fps", "it must be in [0.001, 1000000]")
-    names = values.get("truth", "")
-    truth = tuple(names.split(",")) if names else ()
-    if len(set(truth)) != len(truth) or not all(n.isidentifier() for n in truth):
-        raise refuse("truth", "they must be different names")
-    return ViewFacts(
-        view,
-        number("stream_index", 0, MAX_STREAMS),
-        frame_shape,
-        dtype,
-        truth,
-        fps,
-        number("start_ns", 0, 2**62),
-        number("first_frame", 0, MAX_FRAMES, "0"),
-        dict(values),
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """Frames `start` to before `stop`, as the messages of a channel from `row` on."""
-
-    start: int
-    stop: int
-    row: int
-
-    def row_of(self, frame: int) -> int:
-        """Number of the message with a frame of the run."""
-        return self.row + frame - self.start
-
-
-class Rows(Protocol):
-    """Decoded messages of one chunk."""
-
-    def rows(self, low: int, high: int) -> NDArray[Any]:
-        """Give rows `low` to before `high`, or to the last one."""
-
-
-@dataclass(frozen=True, slots=True)
-class PixelRows:
-    """Values that stand as bytes in a chunk: (B - size + 1, size) windows, (n,) places."""
-
-    windows: Bytes
-    at: NDArray[np.int64]
-
-    def rows(self, low: int, high: int) -> Bytes:
-        """Copy the values of some messages, (high - low, size)."""
-        return self.windows[self.at[low:high]]
-
-
-@dataclass(frozen=True, slots=True)
-class TruthRows:
-    """Ground truth of a chunk, (n, D)."""
-
-    values: NDArray[np.float64]
-
-    def rows(self, low: int, high: int) -> NDArray[np.float64]:
-        """Give the ground truth of some messages, (high - low, D)."""
-        return self.values[low:high]
-
-
-class ChannelRows:
-    """The messages of one channel, numbered through all chunks of a file.
-
-    Args:
-        reader: the file.
-        channel: the channel.
-        decode: gives for the channel's messages of one chunk an array with a row each.
-    """
-
-    def __init__(
-        self, reader: LogReader, channel: Channel, decode: Callable[[MessageTable], Rows]
-    ) -> None:
-        self.channel = channel
-        self._reader = reader
-        self._decode = decode
-        self._decoded: OrderedDict[int, Rows] = OrderedDict()
-        self._segments: list[Segment] = []
-        counts: list[int] = []
-        for segment in reader.segments:
-            count = self._count(segment)
-            if count:
-                self._segments.append(segment)
-                counts.append(count)
-        self._starts = list(itertools.accumulate(counts, initial=0))
-
-    def runs(self, facts: ViewFacts, *, salvage: bool) -> list[Run]:
-        """Number the messages by their log time.
-
-        Args:
-            facts: the clock of the recording.
-            salvage: take gaps and damaged chunks as several runs.
-
-        Raises:
-            LogDamagedError: a log time that is no frame's, a frame twice or out of order,
-                and without `salvage` a frame that is missing.
-        """
-        found: list[Run] = []
-        row = 0
-        batch: list[NDArray[np.uint64]] = []
-        for number in range(len(self._segments)):
-            damaged = salvage and self._reader.table(self._segments[number]) is None
-            if damaged or len(batch) >= _BATCH:
-                self._number(batch, row, facts, found, salvage)
-                row, batch = self._starts[number + damaged], []
-            if not damaged:
-                try:
-                    batch.append(self._times(number))
-                except MalformedRecord as error:
-                    raise LogDamagedError(f"{self._reader.path}: {error}") from None
-        self._number(batch, row, facts, found, salvage)
-        return found
-
-    def _number(
-        self,
-        batch: list[NDArray[np.uint64]],
-        row: int,
-        facts: ViewFacts,
-        found: list[Run],
-        salvage: bool,
-    ) -> None:
-        """Add the frames of messages from `row` on to the runs found."""
-        if not batch:
-            return
-        times = np.concatenate(batch)
-        frames = facts.frames_at(times)
-        exact = facts.times(frames) == times
-        before = found[-1].stop if found else facts.first_frame
-        steps = np.diff(frames, prepend=before - 1)
-        wrong = np.flatnonzero(~exact | (steps < 1 if salvage else steps != 1))
-        if len(wrong):
-            at = int(wrong[0])
-            raise LogDamagedError(
-                f"{self._reader.path}: {self.channel.topic}: after frame "
-                f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
-                f"{frames[at]}: frames are missing or doubled; run cdmisfa verify, or leave "
-                "out what is missing with --salvage"
-            )
-        edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
-        for low, high in itertools.pairwise(edges):
-            start = int(frames[low])
-            if found and found[-1].stop == start and found[-1].row_of(start) == row + low:
-                found[-1] = Run(found[-1].start, start + high - low, found[-1].row)
-            else:
-                found.append(Run(start, start + high - low, row + low))
-
-    def _times(self, number: int) -> NDArray[np.uint64]:
-        """Log times of the messages in the `number`th chunk that holds any."""
-        segment = self._segments[number]
-        if segment.indexes:
-            own = [p[:, 0] for c, p in self._reader.index(segment) if c == self.channel.id]
-            return own[0] if len(own) == 1 else np.concatenate(own)
-        return self._table(number).log_time
-
-    def first(self, row: int) -> bytes:
-        """Copy the payload of one message."""
-        number = bisect.bisect_right(self._starts, row) - 1
-        return self._table(number).payload(row - self._starts[number])
-
-    def fill(self, row: int, out: NDArray[Any]) -> None:
-        """Fill `out` with the decoded messages from `row` on.
-
-        Raises:
-            LogDamagedError: a chunk or a message in it is damaged.
-        """
-        at, count = 0, len(out)
-        number = bisect.bisect_right(self._starts, row) - 1
-        while at < count:
-            low = row + at - self._starts[number]
-            part = self._rows(number).rows(low, low + count - at)
-            out[at : at + len(part)] = part
-            at, number = at + len(part), number + 1
-
-    def _count(self, segment: Segment) -> int:
-        counts = segment.channel_counts()
-        if counts is not None:
-            return counts.get(self.channel.id, 0)
-        table = self._reader.table(segment)
-        return 0 if table is None else int((table.channel == self.channel.id).sum())
-
-    def _rows(self, number: int) -> Rows:
-        if number in self._decoded:
-            return self._decoded[number]
-        try:
-            rows = self._decode(self._table(number))
-        except MalformedRecord as error:
-            raise LogDamagedError(
-                f"{self._reader.path}: {self._segments[number].name}: {error}"
-            ) from None
-        if len(self._decoded) >= _DECODED:
-            self._decoded.popitem(last=False)
-        self._decoded[number] = rows
-        return rows
-
-    def _table(self, number: int) -> MessageTable:
-        segment = self._segments[number]
-        table = self._reader.table(segment)
-        if table is None:
-            raise LogDamagedError(f"{self._reader.path}: {segment.name} is damaged")
-        rows = table.select(np.flatnonzero(table.channel == self.channel.id))
-        stated = self._starts[number + 1] - self._starts[number]
-        if len(rows) != stated:
-            raise LogDamagedError(
-                f"{self._reader.path}: {segment.name} holds {len(rows)} messages of "
-                f"{self.channel.topic!r}, its index says {stated}; run cdmisfa recover"
-            )
-        return rows
 
 
 class ViewFile:
@@ -356,6 +59,7 @@ class ViewFile:
             LogDamagedError: it is damaged, or no view of a recording.
         """
         self.path = path
+        self._scanner: ChunkScanner | None = None
         self.reader = LogReader(path, salvage=salvage, cache_bytes=cache_bytes)
         try:
             self._open(salvage)
@@ -418,9 +122,59 @@ class ViewFile:
         if self._truth is not None:
             self._truth.fill(_row(self._truth_runs, start), out)
 
+    def take(self, start: int, frames: NDArray[Any], truth: NDArray[np.float64]) -> None:
+        """Fill frames and ground truth as `frames` and `truth` do, as fast as it goes.
+
+        Args:
+            start: the first frame.
+            frames: (n, *frame_shape), written.
+            truth: (n, D), written.
+
+        Raises:
+            LogDamagedError: a chunk or a message in it is damaged.
+        """
+        if self._scanner is None:
+            self._scanner = ChunkScanner(self.reader, self._layouts())
+        outs = [frames.reshape(len(frames), -1).view(np.uint8)]
+        pieces = self._frames.pieces(_row(self._frame_runs, start), len(frames), 0)
+        if self._truth is not None:
+            outs.append(truth.view(np.uint8))
+            pieces += self._truth.pieces(_row(self._truth_runs, start), len(truth), 1)
+            # In the order of the file, so that each chunk is decoded once.
+            pieces.sort(key=operator.itemgetter(0))
+        for piece in pieces:
+            out = outs[piece.which][piece.at : piece.at + piece.n]
+            chunk = self._scanner.chunk(piece.segment)
+            if chunk is not None:
+                self._scanner.copy(chunk, piece.which, piece.low, out)
+            elif piece.which:
+                self.truth(start + piece.at, truth[piece.at : piece.at + piece.n])
+            else:
+                self.frames(start + piece.at, frames[piece.at : piece.at + piece.n])
+
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
         self.reader.close()
+
+    def _layouts(self) -> list[RowLayout]:
+        """Where the frames and the ground truth stand in their messages."""
+        payload = self._payload
+        place = payload.tail + payload.size
+        least = place + len(payload.before)
+        marks = [(least - k, byte) for k, byte in enumerate(payload.before)]
+        layouts = [
+            RowLayout(self._frames.channel.id, least, marks, np.array([place]), payload.size)
+        ]
+        if self._truth is not None:
+            layout = self._truth_layout
+            size = layout.itemsize
+            marks = [
+                (size - at, int(byte))
+                for at, byte in zip(self._tag_places, self._tag_bytes, strict=True)
+            ]
+            places = [size - int(layout.fields[name][1]) for name in self.facts.truth]  # type: ignore[index]
+            layouts.append(RowLayout(self._truth.channel.id, size, marks, np.array(places), 8))
+        return layouts
 
     def _channel(
         self, topic: str, schema: str, decode: Callable[[MessageTable], Rows]

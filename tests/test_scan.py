@@ -1,0 +1,199 @@
+"""The compiled reading of a chunk against the tables, on sound and on broken chunks."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdmisfa.blocks import Block, SourceSpec
+from recorder.config import RecordConfig
+from recorder.recording import record
+from recorder.viewlog import Identity, ViewLog
+from replay.chunks import ChunkScanner
+from replay.reader import LogReader
+from replay.records import MalformedRecord, decompress
+from replay.scan import scan
+from replay.tables import indexed_table
+from replay.viewfile import ViewFile
+
+FRAMES = 200
+PICTURES = SourceSpec(("left",), (6, 8), "uint8", ("x", "y"), 50.0, 10**18)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same pictures with each compression."""
+    paths = {}
+    random = np.random.default_rng(7)
+    frames = random.integers(0, 256, (FRAMES, 6, 8), np.uint8)
+    block = Block(0, 0, frames, random.normal(size=(FRAMES, 2)))
+    for compression in ("zstd", "lz4", "none"):
+        folder = tmp_path_factory.mktemp(compression)
+        settings = RecordConfig(compression=compression)
+        log = ViewLog(folder, "left", Identity("icub", 3, PICTURES, {}), settings)
+        log.write(block)
+        log.finish()
+        paths[compression] = log.path
+    return paths
+
+
+def plain(view: ViewFile, start: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    frames = np.empty((n, *view.facts.frame_shape), view.facts.dtype)
+    truth = np.empty((n, len(view.facts.truth)))
+    view.frames(start, frames)
+    view.truth(start, truth)
+    return frames, truth
+
+
+def fast(view: ViewFile, start: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    frames = np.zeros((n, *view.facts.frame_shape), view.facts.dtype)
+    truth = np.zeros((n, len(view.facts.truth)))
+    view.take(start, frames, truth)
+    return frames, truth
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_blocks_are_those_of_the_tables(pictures: dict[str, Path], compression: str) -> None:
+    view = ViewFile(pictures[compression])
+    for start, n in [(0, FRAMES), (0, 1), (49, 2), (150, 50), (13, 120), (0, 40), (199, 1)]:
+        for ours, theirs in zip(fast(view, start, n), plain(view, start, n), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    view.close()
+
+
+def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path, frames=FRAMES)
+    for path in sorted(tmp_path.glob("*.mcap")):
+        view = ViewFile(path)
+        for ours, theirs in zip(fast(view, 3, 190), plain(view, 3, 190), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        view.close()
+
+
+def test_the_compiled_way_is_the_one_taken(pictures: dict[str, Path]) -> None:
+    view = ViewFile(pictures["zstd"])
+    scanner = ChunkScanner(view.reader, view._layouts())
+    taken = [scanner.chunk(segment) is not None for segment in view.reader.segments]
+    # The first chunk also defines the channels, and is left to the tables.
+    assert taken == [False, True, True, True]
+    view.close()
+
+
+@pytest.fixture(scope="module")
+def chunk(pictures: dict[str, Path]) -> tuple[ViewFile, bytes, bytes]:
+    view = ViewFile(pictures["zstd"])
+    segment = view.reader.segments[1]
+    stored, index = view.reader.stored(segment)
+    return view, decompress(bytes(stored), segment.compression, segment.size), bytes(index)
+
+
+def scanned(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
+    """The places that `scan` finds, or None where it refuses."""
+    scanner = ChunkScanner(view.reader, view._layouts())
+    segment = view.reader.segments[1]
+    counts = segment.channel_counts()
+    assert counts is not None
+    wanted = np.array([counts[int(c)] for c in scanner._channels], np.int64)
+    ends = np.zeros((2, int(wanted.max())), np.int64)
+    sound = scan(
+        np.frombuffer(data, np.uint8).copy(),
+        np.frombuffer(index, np.uint8),
+        segment.start,
+        segment.end,
+        scanner._channels,
+        scanner._least,
+        scanner._places,
+        scanner._marks,
+        ends,
+        wanted,
+    )
+    return ends if sound else None
+
+
+def tabled(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
+    """The places that the tables find, or None where they refuse."""
+    segment = view.reader.segments[1]
+    found = []
+    try:
+        parts = []
+        at = 0
+        while at < len(index):
+            pairs = int.from_bytes(index[at + 11 : at + 15], "little")
+            count, rest = divmod(pairs, 16)
+            if rest or index[at] != 7 or at + 15 + pairs > len(index):
+                return None
+            pairs_at = np.frombuffer(index, "<u8", 2 * count, at + 15).reshape(-1, 2)
+            parts.append((int.from_bytes(index[at + 9 : at + 11], "little"), pairs_at))
+            at += 15 + pairs
+        table, _ = indexed_table(data, parts)
+        if not (segment.start <= table.log_time.min() <= table.log_time.max() <= segment.end):
+            return None
+        for rows, check in ((view._frames, view._pixels), (view._truth, view._truths)):
+            assert rows is not None
+            own = table.select(np.flatnonzero(table.channel == rows.channel.id))
+            check(own)
+            found.append(own.at + own.size)
+        return np.array(found)
+    except MalformedRecord:
+        return None
+
+
+def test_a_sound_chunk_passes(chunk: tuple[ViewFile, bytes, bytes]) -> None:
+    ours, theirs = scanned(*chunk), tabled(*chunk)
+    assert ours is not None
+    assert theirs is not None
+    np.testing.assert_array_equal(ours, theirs)
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data())
+def test_what_passes_broken_is_what_the_tables_pass(
+    chunk: tuple[ViewFile, bytes, bytes], data: st.DataObject
+) -> None:
+    view, raw, index = chunk
+    parts = [bytearray(raw), bytearray(index)]
+    for _ in range(data.draw(st.integers(1, 3))):
+        which = data.draw(st.integers(0, 1))
+        # Mostly where headers, tags and lengths stand.
+        at = data.draw(st.integers(0, min(400, len(parts[which]) - 1)))
+        parts[which][at] = data.draw(st.sampled_from([0, 1, 5, 7, 9, 16, 31, 128, 255]))
+    ours = scanned(view, bytes(parts[0]), bytes(parts[1]))
+    if ours is not None:
+        theirs = tabled(view, bytes(parts[0]), bytes(parts[1]))
+        assert theirs is not None
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("cut", [1, 5, 16, 40, 300])
+def test_a_cut_chunk_or_index_is_refused(chunk: tuple[ViewFile, bytes, bytes], cut: int) -> None:
+    view, raw, index = chunk
+    assert scanned(view, raw[:-cut], index) is None
+    assert scanned(view, raw, index[:-cut]) is None
+
+
+def test_a_flipped_bit_is_found(pictures: dict[str, Path], tmp_path: Path) -> None:
+    with LogReader(pictures["none"]) as reader:
+        place = reader.segments[2].data_offset + 700
+    broken = bytearray(pictures["none"].read_bytes())
+    broken[place] ^= 1
+    path = tmp_path / "left.mcap"
+    path.write_bytes(broken)
+    view = ViewFile(path, salvage=True)
+    scanner = ChunkScanner(view.reader, view._layouts())
+    assert scanner.chunk(view.reader.segments[2]) is None
+    assert scanner.chunk(view.reader.segments[1]) is not None
+    view.close()
+
+
+def test_looking_at_a_log_compiles_nothing(pictures: dict[str, Path]) -> None:
+    code = (
+        "import sys; from pathlib import Path; from replay.info import describe; "
+        f"describe(Path({str(pictures['zstd'])!r})); sys.exit('numba' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
