@@ -152,14 +152,43 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
         Claim(
             "epsilon^d falls as sigma falls",
             all(a >= b - 0.02 for a, b in itertools.pairwise(order)) and order[0] > order[-1],
-            " ".join(f"{v:.3f}" if v < 2 else "above 1" for v in order),
+            _in_words(order),
         ),
     ]
+    if "tau" in points:
+        tau = {value: _rank(point) for value, point in points["tau"].items()}
+        short = min(tau)
+        others = [v for value, v in tau.items() if value != short]
+        claims.append(
+            Claim(
+                f"epsilon^d is higher at tau = {short:g} than at the others",
+                all(tau[short] > v for v in others),
+                _in_words([tau[value] for value in sorted(tau)]),
+            )
+        )
     notes = [
-        "No value and no upper bound: at no epsilon^c did most trials reach the new optimum, so "
-        "epsilon^d lies above 1."
+        "A line without value: at no epsilon^c did most trials reach the new optimum, so "
+        "epsilon^d lies above 1.",
+        *_differences(points),
     ]
     return Findings(lines, claims, notes)
+
+
+def _differences(points: Mapping[str, Mapping[float, Midpoint]]) -> list[str]:
+    """Where our interval does not hold the paper's value, in words."""
+    found = [
+        f"{key} = {value:g} ({_in_words([_rank(point)])} against {COLUMNS[key][value]:g})"
+        for key, column in points.items()
+        for value, point in column.items()
+        if not point.low <= COLUMNS[key][value] <= point.high
+    ]
+    if not found:
+        return []
+    return [f"Differs from the paper's value beyond the 95 % interval: {', '.join(found)}."]
+
+
+def _in_words(values: Sequence[float]) -> str:
+    return ", ".join("above 1" if v == 2.0 else f"{v:.3f}" for v in values)
 
 
 def _rank(point: Midpoint) -> float:
