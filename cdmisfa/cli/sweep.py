@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.interrupts import interruptible
 from cdmisfa.cli.progress import bar
 
 MOST_SEEDS = 1_000_000
@@ -72,7 +71,7 @@ def sweep_command(
     """
     from cdmisfa.experiments.sweep import sweep
 
-    with bar("sweep", "trials") as shown, interruptible():
+    with bar("sweep", "trials") as shown:
 
         def progress(finished: int, failed: int, total: int) -> None:
             shown.update(finished, total, f"{failed} failed" if failed else "")
