@@ -232,6 +232,7 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
         point = point_of_no_return(group)
         if math.isfinite(point.value):
             panel.axvline(point.value, color="grey", linestyle=":", linewidth=1)
+        panel.set_ylim(-0.05, 1.05)
         panel.legend(fontsize=6)
         panels.label(
             panel, letter, rf"$\epsilon^c$   ($\sigma$ = {sigma:g})", "policy (0 stay), mean"

@@ -21,7 +21,9 @@ def write_page(root: Path, page: Path) -> None:
     Raises:
         UsageError: there are no results.
     """
-    documents = [read_results(root / name) for name in NAMES if (root / name).is_dir()]
+    documents = [
+        read_results(root / name) for name in NAMES if (root / name / "results.json").exists()
+    ]
     if not documents:
         raise UsageError(f"{root} has no results: run cdmisfa reproduce all -o {root} first")
     figures = page.with_suffix("")
