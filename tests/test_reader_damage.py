@@ -298,7 +298,8 @@ try:
 except LogDamagedError as error:
     print(error)
 # Not ru_maxrss: that one still counts the process this one was forked from.
-status = dict(line.split(":", 1) for line in pathlib.Path("/proc/self/status").open() if ":" in line)
+lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+status = dict(line.split(":", 1) for line in lines if ":" in line)
 print(int(status["VmHWM"].split()[0]) // 1024)
 """
 
