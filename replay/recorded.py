@@ -143,15 +143,19 @@ class RecordedSource:
                 for parts in self._views
                 for view in parts
             ]
-        values = self._views[0][0].facts.values
         return {
             "kind": "recording",
-            **{k: values[k] for k in ("scene", "seed", "config_sha256") if k in values},
+            **self.scene(),
             "frames": self._count,
             "first_frame": self._first,
             "loop": self._loop,
             "views": self._hashes,
         }
+
+    def scene(self) -> Mapping[str, str]:
+        """What was recorded: the scene, its seed and the checksum of its configuration."""
+        values = self._views[0][0].facts.values
+        return {k: values[k] for k in _SAME_VALUES if k in values}
 
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""

@@ -18,8 +18,8 @@ from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.foreign import ForeignSource
 
 pytest.importorskip("rosbags")
-from rosbags import rosbag1, rosbag2  # noqa: E402
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
 
 COUNT = 60
 TOPICS = ("/cam_left", "/cam_right")

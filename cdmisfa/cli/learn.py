@@ -41,7 +41,17 @@ TICK = 0.1
 @click.option("--loop", is_flag=True, help="Start a recording again at its end.")
 @click.option("--resume", is_flag=True, help="Go on with the run in -o where it was stopped.")
 @click.option("--salvage", is_flag=True, help="Go on over damaged parts of a recording.")
+@click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
+@click.option(
+    "--follow-timeout",
+    type=click.FloatRange(0.1, 1e6),
+    default=60.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="With --follow, give up when no frame came for so long.",
+)
 @camera_options
 @options.force
 @options.as_json
@@ -59,7 +69,10 @@ def learn_command(
     loop: bool,
     resume: bool,
     salvage: bool,
+    live_view: bool,
     no_rerun: bool,
+    follow: bool,
+    follow_timeout: float,
     topics: tuple[str, ...],
     size: tuple[int, int] | None,
     align: Align | None,
@@ -91,10 +104,13 @@ def learn_command(
         loop=loop,
         salvage=salvage,
         cameras=CameraOptions(topics, size, align, rate),
+        follow=follow_timeout if follow else None,
     )
     say_about(frames)
     try:
         with bar("learning", "blocks") as shown, stoppable() as stop:
+            if hasattr(frames, "stop"):
+                frames.stop = stop  # waiting for frames ends with a signal, too
             result = learn(
                 frames,
                 configuration.learner,
@@ -108,6 +124,8 @@ def learn_command(
                 progress=Reporter(shown),
                 stop=stop,
                 resume=resume,
+                live=live_view,
+                announce=announce,
             )
     finally:
         frames.close()
@@ -117,6 +135,15 @@ def learn_command(
         click.echo(summary(result))
     if stop():
         ctx.exit(stop.exit_code)
+
+
+def announce(address: str) -> None:
+    """Say where a live view is, and open it where there is a display."""
+    from replay.live import has_display, open_live
+
+    click.echo(f"live view {address}    look at it: rerun --connect {address}", err=True)
+    if has_display():
+        open_live(address)
 
 
 class Reporter:

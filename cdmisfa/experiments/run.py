@@ -122,6 +122,8 @@ def learn(
     stop: Callable[[], bool] = lambda: False,
     resume: bool = False,
     checkpoint_every: int = 200,
+    live: bool = False,
+    announce: Callable[[str], None] | None = None,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
 
@@ -140,6 +142,8 @@ def learn(
         resume: go on with the run in `out` where it was stopped, in whatever way; its
             signals become those of a run that was never stopped.
         checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
+        live: also show the run in Rerun while it learns, to viewers on this machine.
+        announce: called with the address of the live view.
 
     Raises:
         UsageError: `out` exists and `force` is not set; or `resume` is, and `out` holds no
@@ -151,7 +155,10 @@ def learn(
     digest = SignalsHash()
     tables = {**(sections or {}), "learner": as_table(config)}
     exhausted: LogExhaustedError | None = None
-    with _run_log(out, source, tables, seed, force, resume) as log:
+    with (
+        _run_log(out, source, tables, seed, force, resume) as log,
+        _live_view(live, announce, config, source, tables, seed) as shown,
+    ):
         if log is not None and resume:
             _go_on(log, learner, source, digest)
         _say_if_compiling()
@@ -162,17 +169,24 @@ def learn(
             try:
                 block = source.take(learner.stream, learner.tau)
             except LogExhaustedError as error:
-                ended, exhausted = "log_exhausted", error
+                if stop():  # while it waited for frames to be recorded
+                    ended = "interrupted"
+                else:
+                    ended, exhausted = "log_exhausted", error
                 break
             learned = len(learner.modules)
             signals = learner.step(block)
             digest.add(signals)
-            if log is not None:
-                log.block(signals, block, learner.modules[-1].phi if signals.saved else learner.phi)
+            for sink in (log, shown):
+                if sink is None:
+                    continue
+                sink.block(
+                    signals, block, learner.modules[-1].phi if signals.saved else learner.phi
+                )
                 if len(learner.modules) > learned:
-                    log.event(block.t, signals.iteration, _saved_text(learner, source))
-                if checkpoint_every and learner.iteration % checkpoint_every == 0:
-                    _save_checkpoint(log, learner, source)
+                    sink.event(block.t, signals.iteration, _saved_text(learner, source))
+            if log is not None and checkpoint_every and learner.iteration % checkpoint_every == 0:
+                _save_checkpoint(log, learner, source)
             if progress is not None:
                 progress(
                     Progress(
@@ -183,8 +197,10 @@ def learn(
                         max_iterations,
                     )
                 )
+        for sink in (log, shown):
+            if sink is not None:
+                sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
         if log is not None:
-            log.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
             _save_checkpoint(log, learner, source)
     result = RunResult(
         run=str(out) if out is not None else None,
@@ -271,6 +287,28 @@ def _run_log(
             log.abandon()
             raise
         log.finish()
+
+
+@contextlib.contextmanager
+def _live_view(
+    live: bool,
+    announce: Callable[[str], None] | None,
+    config: LearnerConfig,
+    source: FrameSource,
+    tables: Mapping[str, Any],
+    seed: int,
+) -> Iterator[Any]:
+    """The view that shows the run while it learns, or None."""
+    if not live:
+        yield None
+        return
+    from replay.live import LiveView
+
+    manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
+    with LiveView(source.spec, manifest, config.tau, config.outputs) as shown:
+        if announce is not None:
+            announce(shown.address)
+        yield shown
 
 
 def _no_folder(out: Path, error: OSError) -> UsageError:

@@ -132,6 +132,7 @@ def open_source(
     loop: bool = False,
     salvage: bool = False,
     cameras: CameraOptions | None = None,
+    follow: float | None = None,
 ) -> tuple[FrameSource, Configuration]:
     """Open a live scene by its name, a recording, or other people's camera logs.
 
@@ -144,6 +145,7 @@ def open_source(
         loop: start a recording again at its end.
         salvage: go on over the damaged parts of a recording.
         cameras: how images of others become frames; given, the paths are taken as such logs.
+        follow: wait so many seconds for more frames of a recording that is being written.
 
     Raises:
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
@@ -152,6 +154,10 @@ def open_source(
     from recorder.scenes import SCENES, open_scene
 
     cameras = cameras or CameraOptions()
+    if follow is not None and (
+        len(words) > 1 or words[0] in SCENES or loop or salvage or cameras != CameraOptions()
+    ):
+        raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
     if len(words) == 1 and words[0] in SCENES:
         if cameras != CameraOptions():
             raise UsageError(
@@ -162,12 +168,18 @@ def open_source(
         return open_scene(kind, configuration.scene, configuration.record), configuration
     paths = [Path(word) for word in words]
     for path in paths:
-        if not path.exists():
+        if not path.exists() and follow is None:
             raise UsageError(
                 f"{path}: no such file or folder, and no scene either: "
                 f"the scenes are {', '.join(SCENES)}"
             )
-    source = open_log(paths, loop=loop, salvage=salvage, cameras=cameras)
+    source: FrameSource
+    if follow is not None:
+        from replay.follow import FollowedSource
+
+        source = FollowedSource(paths[0], timeout=follow)
+    else:
+        source = open_log(paths, loop=loop, salvage=salvage, cameras=cameras)
     try:
         kind = preset_for(source.spec, source.describe())
         return source, configure(kind, preset, settings, seed)

@@ -1,0 +1,141 @@
+"""A recording is learned from while a recorder, in another process, writes it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+from source_contract import SourceContract, same
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.errors import LogExhaustedError, UsageError
+from cdmisfa.streams import OscillatorySource
+from recorder.recording import record
+from replay.follow import FollowedSource
+
+FRAMES = 600
+RECORDER = """
+import sys, time
+from pathlib import Path
+from recorder.recording import record
+record("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]),
+       progress=lambda done: time.sleep(float(sys.argv[3])))
+"""
+
+
+@contextlib.contextmanager
+def recorder(folder: Path, *, wait: float = 0.02) -> Iterator[subprocess.Popen[bytes]]:
+    """A recorder that takes its time."""
+    words = [sys.executable, "-c", RECORDER, str(folder), str(FRAMES), str(wait)]
+    process = subprocess.Popen(words)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished") / "rec"
+    record("oscillatory", folder, frames=200)
+    return folder
+
+
+class TestFollowed(SourceContract):
+    ends = False  # how long it will be is not known
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, finished: Path) -> None:
+        self.folder = finished
+
+    def open(self) -> FrameSource:
+        return FollowedSource(self.folder)
+
+
+def test_frames_are_waited_for_until_the_recorder_is_done(tmp_path: Path) -> None:
+    live, unfinished = OscillatorySource(), 0
+    with recorder(tmp_path / "rec"):
+        source = FollowedSource(tmp_path / "rec", timeout=30)
+        assert source.spec.length is None
+        for i in range(FRAMES // 40):
+            same(source.take(i % 3, 40), live.take(i % 3, 40))
+            unfinished += not source.finished
+        assert unfinished > 0
+        with pytest.raises(LogExhaustedError, match="0 frames are left at frame 600"):
+            source.take(0, 40)
+        assert source.t == FRAMES
+    source.close()
+
+
+def test_a_recorder_that_died_is_told_from_one_that_is_slow(tmp_path: Path) -> None:
+    with recorder(tmp_path / "rec", wait=0.1) as process:
+        source = FollowedSource(tmp_path / "rec", timeout=30)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    source._timeout = 0.5
+    with pytest.raises(LogExhaustedError, match=r"within 0\.5 s .*--follow-timeout"):
+        source.take(0, FRAMES)
+    assert source.t == 0
+    same(source.take(1, 20), OscillatorySource().take(1, 20))
+
+
+def test_a_recording_that_never_comes_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such file or folder"):
+        FollowedSource(tmp_path / "rec", timeout=0.3)
+
+
+def test_learning_while_it_is_recorded_gives_the_live_signals(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    quick = ("--set", "learner.tau=20", "--max-iterations", "25", "--json")
+    with recorder(tmp_path / "rec"):
+        followed = cdmisfa("learn", tmp_path / "rec", "--follow", "--follow-timeout", "30", *quick)
+    assert followed.code == 0, followed.err
+    live = cdmisfa("learn", "oscillatory", *quick)
+    assert followed.json["signals_sha256"] == live.json["signals_sha256"]
+    assert followed.json["source"]["followed"] is True
+
+
+def test_a_stopped_run_goes_on_following(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ("learn", tmp_path / "rec", "--follow", "-o", tmp_path / "run", "--no-rerun", "--json")
+    words += ("--set", "learner.tau=20")
+    with recorder(tmp_path / "rec"):
+        assert cdmisfa(*words, "--max-iterations", "3").code == 0
+        resumed = cdmisfa(*words, "--max-iterations", "20", "--resume")
+    assert resumed.code == 0, resumed.err
+    live = cdmisfa(
+        "learn", "oscillatory", "--set", "learner.tau=20", "--max-iterations", "20", "--json"
+    )
+    assert resumed.json["signals_sha256"] == live.json["signals_sha256"]
+
+
+def test_a_signal_ends_the_waiting(tmp_path: Path) -> None:
+    with recorder(tmp_path / "rec", wait=0.5):
+        words = ["learn", str(tmp_path / "rec"), "--follow", "-o", str(tmp_path / "run")]
+        learner = subprocess.Popen(
+            [sys.executable, "-m", "cdmisfa", *words, "--no-rerun", "--set", "learner.tau=600"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            deadline = time.monotonic() + 60
+            while not (tmp_path / "run" / "run.mcap.partial").exists():
+                assert time.monotonic() < deadline
+                assert learner.poll() is None
+                time.sleep(0.05)
+            time.sleep(0.3)
+            learner.send_signal(signal.SIGINT)
+            assert learner.wait(30) == 130
+        finally:
+            learner.kill()
+            learner.wait()
+    assert (tmp_path / "run" / "run.json").exists()
