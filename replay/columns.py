@@ -75,11 +75,16 @@ class Column:
         self._waiting = 0
         self._bytes = 0
 
-    def add(self, frames: NDArray[np.int64], iteration: int | None, values: NDArray[Any]) -> None:
-        """Take (n, ...) values at n frames of an iteration."""
+    def add(
+        self,
+        frames: NDArray[np.int64],
+        iterations: NDArray[np.int64] | int | None,
+        values: NDArray[Any],
+    ) -> None:
+        """Take values of n rows, at n frames of one iteration or of n."""
         self._frames.append(frames)
-        if iteration is not None:
-            self._iterations.append(np.full(len(frames), iteration))
+        if iterations is not None:
+            self._iterations.append(np.broadcast_to(iterations, (len(frames),)))
         self._values.append(values)
         self._waiting += len(frames)
         self._bytes += values.nbytes

@@ -136,7 +136,7 @@ def table_text(rows: Sequence[Row]) -> str:
 def _shortly(difference: Difference | None) -> str:
     if difference is None:
         return "identical"
-    return f"differs from {difference.signal} in iteration {difference.iteration} on"
+    return f"differs from iteration {difference.iteration}, first in {difference.signal}"
 
 
 def _name(run: Path) -> str:

@@ -6,6 +6,7 @@ The viewer ends at once, with everything in it, on a letter its font has not got
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import rerun as rr
 
@@ -20,6 +21,7 @@ _DRAWN = (
 _LEFT_OUT = "⟨⟩"
 
 
+@lru_cache(maxsize=4096)
 def label(text: str) -> str:
     """A text with what cannot be drawn left out or replaced by a question mark."""
     kept = (c for c in text if c not in _LEFT_OUT)

@@ -35,9 +35,11 @@ class Lanes:
         self._recording = recording
         self._clock = clock
         self._names = names
-        self._shown = shown
+        self._policies = {s: f"policy/{part(names, s)}" for s in shown}
         self._changes: dict[str, list[tuple[int, int, str]]] = {}
         self._colours: dict[str, dict[str, Rgb]] = {}
+        self._sent: dict[str, int] = {}
+        self._declared: dict[str, int] = {}
         self._iteration = 0
 
     def add(self, signals: BlockSignals) -> None:
@@ -52,33 +54,49 @@ class Lanes:
         self._put(signals, "lanes/4_action", *action)
         drawn = ("explored", ORANGE) if signals.explored else ("greedy", BLUE)
         self._put(signals, "lanes/5_chosen_by", *drawn)
-        for s in self._shown:
+        for s, path in self._policies.items():
             planned = (SWITCH, GREY) if signals.policy[s] else (STAY, colour(s))
-            self._put(signals, f"policy/{part(self._names, s)}", *planned)
+            self._put(signals, path, *planned)
 
     def end(self, frames: int) -> None:
-        """Write all lanes; they end with the run.
+        """Write what is left; all lanes end with the run.
 
         Args:
             frames: where the run ended.
         """
+        for changes in self._changes.values():
+            changes.append((frames, self._iteration, ""))
+        self.flush()
+
+    def flush(self) -> None:
+        """Hand over the changes since the last time."""
         for path, changes in self._changes.items():
-            chosen = self._colours[path]
-            self._recording.log(
-                path,
-                rr.StateConfiguration(
-                    values=list(chosen),
-                    labels=list(chosen),
-                    colors=np.array([packed(c) for c in chosen.values()], dtype=np.uint32),
-                ),
-                static=True,
-            )
-            rows = [*changes, (frames, self._iteration, "")]
+            rows = changes[self._sent.get(path, 0) :]
+            if not rows:
+                continue
+            self._declare(path)
+            self._sent[path] = len(changes)
             times = self._clock.columns(
                 np.array([t for t, _, _ in rows]), np.array([k for _, k, _ in rows])
             )
             states = rr.StateChange.columns(state=[state for _, _, state in rows])
             self._recording.send_columns(path, times, states)
+
+    def _declare(self, path: str) -> None:
+        """Say which states there are, where there are new ones."""
+        chosen = self._colours[path]
+        if self._declared.get(path) == len(chosen):
+            return
+        self._declared[path] = len(chosen)
+        self._recording.log(
+            path,
+            rr.StateConfiguration(
+                values=list(chosen),
+                labels=list(chosen),
+                colors=np.array([packed(c) for c in chosen.values()], dtype=np.uint32),
+            ),
+            static=True,
+        )
 
     def _put(self, signals: BlockSignals, path: str, state: str, rgb: Rgb) -> None:
         changes = self._changes.setdefault(path, [])

@@ -43,9 +43,9 @@ def whole(frames: int) -> rrb.archetypes.TimeAxis:
 
 
 def lines(
-    name: str, contents: list[str], axis: rrb.archetypes.TimeAxis, span: Span | None = None
+    name: str, contents: list[str], axis: rrb.archetypes.TimeAxis | None, span: Span | None = None
 ) -> rrb.TimeSeriesView:
-    """Curves over time, all in view from the start."""
+    """Curves over time, all in view from the start; without an axis, as they come."""
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,
@@ -66,7 +66,7 @@ class RunLayout:
     def __init__(self, outline: Outline) -> None:
         self._outline = outline
         self._spec = outline.header.spec
-        self._axis = whole(outline.frames)
+        self._axis = whole(outline.frames) if outline.frames else None
         self._images = len(self._spec.frame_shape) == 2
 
     def blueprint(self) -> rrb.Blueprint:

@@ -8,6 +8,7 @@ those of run.mcap. `/world`, `/lanes`, `/decision`, `/gate`, `/abstraction` and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,9 +35,13 @@ TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2}
 """Colours of signals that are drawn beside another one."""
 
+BATCH = 100
+"""Records that are turned into rows together."""
+
 SPARSE = 10
 """With more streams than are shown one by one, tensors are kept every so many iterations."""
 
+Frames = TypeVar("Frames", int, NDArray[np.int64])
 AnyColumn = TypeVar("AnyColumn", bound=Column)
 
 
@@ -48,6 +53,9 @@ class RunView:
         path: the run.
         outline: the run in short.
         config: how it is shown.
+
+    Attributes:
+        spec: what the learner's source delivered.
     """
 
     def __init__(
@@ -57,63 +65,115 @@ class RunView:
         self._path = path
         self._outline = outline
         self._config = config
-        self._spec = outline.header.spec
-        self._clock = Clock(self._spec)
+        self.spec = outline.header.spec
+        self._clock = Clock(self.spec)
         self._columns: dict[str, Column] = {}
         self._streams = outline.streams(config.streams)
-        self._lanes = Lanes(recording, self._clock, self._spec.streams, self._streams)
+        self._lanes = Lanes(recording, self._clock, self.spec.streams, self._streams)
 
     def write(self, modules: Sequence[Module]) -> None:
-        """Write everything.
+        """Write everything that the log holds.
 
         Args:
             modules: the frozen modules, for their weights.
         """
-        for signals in read_signals(self._path):
-            self._signals(signals)
-            self._decision(signals)
-            self._gate(signals)
-            self._lanes.add(signals)
-        self._lanes.end(self._outline.frames)
-        self._threshold()
-        self._watched()
-        self._truth()
-        self._weights(modules)
+        records = read_signals(self._path)
+        while batch := list(islice(records, BATCH)):
+            self.add(batch)
+        for t, frames in read_watched(self._path):
+            self.watched(t + np.arange(len(frames)), frames)
+        for t, values in read_truth(self._path):
+            self.truth(t + np.arange(len(values)), values)
+        for t, phi in read_phi(self._path):
+            self.weights("abstraction/phi", t, phi)
+        for module in modules:
+            t = module.iteration * self._outline.tau
+            self.weights(f"modules/{module.index}/weights", t, module.phi)
         for event in read_events(self._path):
-            self._set_time(event.t, event.iteration)
-            level = "WARN" if event.level == "WARNING" else event.level
-            self._recording.log("events", rr.TextLog(label(event.text), level=level))
+            self.event(event.t, event.iteration, event.text, event.level)
+        if self._outline.iterations:
+            end = max(self._outline.frames - self._outline.tau, 1)
+            self.threshold(np.array([0, end]), np.array([0, self._outline.iterations - 1]))
+        self._lanes.end(self._outline.frames)
+        self.flush()
+
+    def add(self, records: Sequence[BlockSignals]) -> None:
+        """Take records of consecutive iterations."""
+        for _, group in groupby(records, key=_shapes):
+            batch = _Batch(list(group))
+            self._signals(batch)
+            self._decision(batch)
+            self._gate(batch)
+            self._saved(batch)
+        for signals in records:
+            self._lanes.add(signals)
+
+    def watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
+        """Take (n, *frame_shape) of what the learner saw at n frames."""
+        shape, path = self.spec.frame_shape, "world/watched"
+        if len(shape) == 2:
+            kept = at % self._config.every == 0
+            if kept.any():
+                screen = self._column(path, self._screen)
+                screen.add(at[kept], self._iteration(at[kept]), frames[kept])
+        else:
+            names = [f"x{i + 1}" for i in range(int(np.prod(shape)))]
+            line = self._line(path, names, 0)
+            line.add(at, self._iteration(at), frames.reshape(len(frames), -1))
+
+    def truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+        """Take (n, D) of what the world knows at n frames, and the learner does not."""
+        line = self._line("world/truth", list(self.spec.truth), 0)
+        line.add(at, self._iteration(at), values)
+
+    def weights(self, path: str, t: int, phi: NDArray[np.float64]) -> None:
+        """Show (J, I) weights at an entity."""
+        self._set_time(t, self._iteration(t))
+        self._recording.log(path, self._picture(phi))
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """Say in words what happened."""
+        self._set_time(t, iteration)
+        level = "WARN" if level == "WARNING" else level
+        self._recording.log("events", rr.TextLog(label(text), level=level))
+
+    def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
+        """Draw the line that eta-dot must fall below, through these frames."""
+        if self._outline.delta is not None:
+            line = self._line("abstraction/delta", ["δ threshold"], 0, rgb=GREY)
+            line.add(frames, iterations, np.full((len(frames), 1), self._outline.delta))
+
+    def flush(self) -> None:
+        """Hand over everything that waits."""
         for column in self._columns.values():
             column.flush()
+        self._lanes.flush()
 
-    def _signals(self, signals: BlockSignals) -> None:
+    def _signals(self, batch: _Batch) -> None:
         """Every signal's values as they are."""
-        k, frames = signals.iteration, np.array([signals.t])
-        every = frames + np.arange(len(signals.y))
         for signal in SIGNALS.values():
             if signal.name in TIMELINE_SIGNALS:
                 continue
-            value = np.asarray(getattr(signals, signal.name))
-            path = f"signals/{signal.name}"
+            value, path = batch.values(signal.name), f"signals/{signal.name}"
             if signal.show == "heat":
-                self._tensor(signal, path, k, frames, value)
+                self._tensor(signal, path, batch, value)
             elif signal.dims.startswith("M"):
-                for i, part in enumerate(value, start=1):
-                    at = every if "T" in signal.dims else frames
-                    column = self._line(f"{path}/{i}", _labels(signal, i, self._outline.outputs), i)
-                    column.add(at, k, part.reshape(len(at), -1))
+                for i in range(value.shape[1]):
+                    labels = _labels(signal, i + 1, self._outline.outputs)
+                    line = self._line(f"{path}/{i + 1}", labels, i + 1)
+                    frames, iterations = batch.times("T" in signal.dims)
+                    line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
             else:
-                at = every if signal.dims.startswith("T") else frames
                 labels = _labels(signal, 0, self._outline.outputs)
                 number = BESIDE.get(signal.name, 0)
-                column = self._line(path, labels if signal.dims != "S" else None, number)
-                column.add(at, k, value.reshape(len(at), -1))
+                line = self._line(path, labels if signal.dims != "S" else None, number)
+                frames, iterations = batch.times(signal.dims.startswith("T"))
+                line.add(frames, iterations, value.reshape(len(frames), -1))
 
-    def _tensor(
-        self, signal: Signal, path: str, k: int, frames: NDArray[np.int64], value: NDArray[Any]
-    ) -> None:
-        crowded = len(self._spec.streams) > self._config.streams
-        if value.size and not (crowded and k % SPARSE):
+    def _tensor(self, signal: Signal, path: str, batch: _Batch, value: NDArray[Any]) -> None:
+        crowded = len(self.spec.streams) > self._config.streams
+        kept = batch.iterations % SPARSE == 0 if crowded else np.ones(len(value), dtype=bool)
+        if value.size and kept.any():
             names = [AXES[d] for d in signal.dims]
             if names.count("stream") > 1:
                 names[-1] = "next stream"
@@ -121,107 +181,69 @@ class RunView:
                 path,
                 lambda: TensorColumn(self._recording, self._clock, path, self._config.rows, names),
             )
-            column.add(frames, k, value[None])
+            column.add(batch.frames[kept], batch.iterations[kept], value[kept])
 
-    def _decision(self, signals: BlockSignals) -> None:
+    def _decision(self, batch: _Batch) -> None:
         """Reward and value of each shown stream, as lines in the streams' colours."""
-        frames = np.array([signals.t])
+        reward, value = batch.values("R"), batch.values("Q")
         for s in self._streams:
-            name = self._spec.streams[s]
-            place = part(self._spec.streams, s)
-            if signals.R.size:
+            name = self.spec.streams[s]
+            place = part(self.spec.streams, s)
+            if reward.size:
                 line = self._line(f"decision/R_stay/{place}", [f"R stay {name}"], s)
-                line.add(frames, signals.iteration, signals.R[s, 0, s].reshape(1, 1))
+                line.add(*batch.times(), reward[:, s, 0, s])
             line = self._line(f"decision/advantage/{place}", [f"Q stay - switch {name}"], s)
-            advantage = signals.Q[s, 0] - signals.Q[s, 1]
-            line.add(frames, signals.iteration, np.array([[advantage]]))
+            line.add(*batch.times(), value[:, s, 0] - value[:, s, 1])
 
-    def _gate(self, signals: BlockSignals) -> None:
+    def _gate(self, batch: _Batch) -> None:
         """Each frozen module's band of 2 SD, whose blocks it knows."""
-        frames = np.array([signals.t])
-        for i, (mean, sd) in enumerate(
-            zip(signals.band_mean, signals.band_sd, strict=True), start=1
-        ):
-            edges = np.concatenate([mean - 2 * sd, mean + 2 * sd])
-            labels = [f"band of module {i}"] * len(edges)
-            band = self._line(f"gate/band/{i}", labels, i - 1, width=1.0)
-            band.add(frames, signals.iteration, edges[None])
+        mean, width = batch.values("band_mean"), 2 * batch.values("band_sd")
+        edges = np.concatenate([mean - width, mean + width], axis=2)
+        for i in range(edges.shape[1]):
+            labels = [f"band of module {i + 1}"] * edges.shape[2]
+            self._line(f"gate/band/{i + 1}", labels, i, width=1.0).add(*batch.times(), edges[:, i])
 
-    def _threshold(self) -> None:
-        """The line eta-dot must fall below, and where it did."""
-        outline = self._outline
-        if outline.delta is not None and outline.iterations:
-            line = self._line("abstraction/delta", ["δ threshold"], 0, rgb=GREY)
-            ends = np.array([0, max(outline.frames - outline.tau, 1)])
-            for t, k in zip(ends, (0, outline.iterations - 1), strict=True):
-                line.add(np.array([t]), k, np.array([[outline.delta]]))
-        if outline.saved:
-            style = rr.SeriesPoints(
-                colors=[packed(VERMILLION)],
-                markers="diamond",
-                marker_sizes=[7.0],
-                names=["module saved"],
-            )
-            self._recording.log("abstraction/saved", style, static=True)
-            marks = self._column(
-                "abstraction/saved",
-                lambda: Column(
-                    self._recording, self._clock, "abstraction/saved", self._config.rows
-                ),
-            )
-            for save in outline.saved:
-                marks.add(np.array([save.t]), save.iteration, np.array([save.eta_dot[:1]]))
+    def _saved(self, batch: _Batch) -> None:
+        """Where eta-dot stood when a module was saved."""
+        saved = batch.values("saved")
+        if saved.any():
+            marks = self._column("abstraction/saved", self._marks)
+            eta_dot = batch.values("eta_dot")[saved, :1]
+            marks.add(batch.frames[saved], batch.iterations[saved], eta_dot)
 
-    def _watched(self) -> None:
-        """What the learner saw."""
-        shape, path = self._spec.frame_shape, "world/watched"
-        if len(shape) == 2:
-            column = ImageColumn(self._recording, self._clock, path, self._config.rows)
-            column.declare(*shape)
-            self._columns[path] = column
-            for t, images in read_watched(self._path):
-                if t % self._config.every == 0:
-                    column.add(np.array([t]), self._iteration(t), images)
-            return
-        labels = [f"x{i + 1}" for i in range(int(np.prod(shape)))]
-        for t, values in read_watched(self._path):
-            line = self._line(path, labels, 0)
-            line.add(
-                t + np.arange(len(values)), self._iteration(t), values.reshape(len(values), -1)
-            )
+    def _marks(self) -> Column:
+        path = "abstraction/saved"
+        style = rr.SeriesPoints(
+            colors=[packed(VERMILLION)],
+            markers="diamond",
+            marker_sizes=[7.0],
+            names=["module saved"],
+        )
+        self._recording.log(path, style, static=True)
+        return Column(self._recording, self._clock, path, self._config.rows)
 
-    def _truth(self) -> None:
-        """What the world knows and the learner did not."""
-        for t, values in read_truth(self._path):
-            line = self._line("world/truth", list(self._spec.truth), 0)
-            line.add(t + np.arange(len(values)), self._iteration(t), values)
-
-    def _weights(self, modules: Sequence[Module]) -> None:
-        """The abstraction's weights over time, and each frozen module's."""
-        for t, phi in read_phi(self._path):
-            self._set_time(t, self._iteration(t))
-            self._recording.log("abstraction/phi", self._picture(phi))
-        for module in modules:
-            t = module.iteration * self._outline.tau
-            self._set_time(t, module.iteration)
-            self._recording.log(f"modules/{module.index}/weights", self._picture(module.phi))
+    def _screen(self) -> Column:
+        path = "world/watched"
+        column = ImageColumn(self._recording, self._clock, path, self._config.rows)
+        column.declare(*self.spec.frame_shape)
+        return column
 
     def _picture(self, phi: NDArray[np.float64]) -> Any:
         """(J, I) weights as images below one another, as bars, or as a tensor."""
-        shape = self._spec.frame_shape
+        shape = self.spec.frame_shape
         if len(shape) == 2 and phi.shape[1] == shape[0] * shape[1]:
             return rr.Image(shade(phi.reshape(-1, shape[1])))
         if phi.size <= 256:
             return rr.BarChart(phi.reshape(-1).copy())
         return rr.Tensor(phi.copy(), dim_names=("output", "input"))
 
-    def _iteration(self, t: int) -> int:
+    def _iteration(self, t: Frames) -> Frames:
         return t // max(self._outline.tau, 1)
 
     def _set_time(self, t: int, iteration: int) -> None:
         self._recording.set_time("frame", sequence=t)
         self._recording.set_time("iteration", sequence=max(iteration, 0))
-        time = np.datetime64(self._spec.time_ns(t), "ns")
+        time = np.datetime64(self.spec.time_ns(t), "ns")
         self._recording.set_time("message_log_time", timestamp=time)
 
     def _line(
@@ -254,6 +276,31 @@ class RunView:
         if path not in self._columns:
             self._columns[path] = make()
         return self._columns[path]
+
+
+class _Batch:
+    """Records of consecutive iterations whose values have the same shapes."""
+
+    def __init__(self, records: Sequence[BlockSignals]) -> None:
+        self._records = records
+        self.frames = np.array([s.t for s in records])
+        self.iterations = np.array([s.iteration for s in records])
+
+    def values(self, name: str) -> NDArray[Any]:
+        """A signal's values, (n, *dims)."""
+        return np.array([getattr(s, name) for s in self._records])
+
+    def times(self, per_frame: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Frames and iterations of the rows: one a record, or one a frame of it."""
+        if not per_frame:
+            return self.frames, self.iterations
+        tau = len(self._records[0].y)
+        frames = (self.frames[:, None] + np.arange(tau)).reshape(-1)
+        return frames, np.repeat(self.iterations, tau)
+
+
+def _shapes(signals: BlockSignals) -> tuple[tuple[int, ...], ...]:
+    return signals.y.shape, signals.y_frozen.shape, signals.R.shape
 
 
 def _labels(signal: Signal, module: int, outputs: int) -> list[str]:

@@ -68,7 +68,7 @@ def open_window(path: Path, *, every: int = 10, memory_limit: str = "2GB") -> No
         CdmisfaError: the viewer ended with an error.
     """
     with _view_of(path, every) as view:
-        port = str(_free_port())
+        port = str(free_port())
         _run([str(view), "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit])
 
 
@@ -82,7 +82,7 @@ def serve(
     Raises:
         CdmisfaError: the server ended with an error.
     """
-    data_port, page_port = _free_port(), port or _free_port()
+    data_port, page_port = free_port(), port or free_port()
     with _view_of(path, every) as view:
         proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
         print(f"http://127.0.0.1:{page_port}/?url={proxy}", file=sys.stderr, flush=True)
@@ -210,7 +210,7 @@ def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
     """
     from rerun.experimental import ViewerClient
 
-    port = _free_port()
+    port = free_port()
     command = [str(program()), "--headless", "--hide-welcome-screen"]
     command += ["--port", str(port), "--bind", "127.0.0.1", "--window-size", window]
     with tempfile.TemporaryFile() as words:
@@ -275,7 +275,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nothing listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,0 +1,124 @@
+"""A run can be watched while it learns, and is none the worse for it."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from PIL import Image
+from run_data import IMAGE, VECTOR, run_of
+
+from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import CdmisfaError
+from cdmisfa.experiments.run import learn
+from cdmisfa.streams import OscillatorySource
+from replay import live, viewer
+from replay.live import LiveView
+
+MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
+
+
+@pytest.fixture(autouse=True)
+def _strict(monkeypatch):
+    monkeypatch.setenv("RERUN_STRICT", "1")
+
+
+def feed(view, spec, iterations=30, tau=40):
+    for signals, block in run_of(spec, iterations, saves=True):
+        view.block(signals, block, np.ones((1, int(np.prod(spec.frame_shape)))))
+    view.event(iterations * tau, iterations - 1, "the end")
+
+
+@pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
+def test_every_record_is_handed_over(spec, monkeypatch):
+    """What the server is given equals what a finished run's view is given."""
+    sent = {}
+
+    def keep(self, times, values):
+        sent.setdefault(self.path, []).append(np.array(values))
+
+    monkeypatch.setattr("replay.columns.Column.send", keep)
+    monkeypatch.setattr(live, "MOST_BLOCKS", 7)
+    with LiveView(spec, MANIFEST, 40, 1) as view:
+        feed(view, spec)
+    records = [signals for signals, _ in run_of(spec, 30, saves=True)]
+    for name in ("epsilon", "y", "xi"):
+        found = np.concatenate([part.reshape(-1) for part in sent[f"signals/{name}"]])
+        expected = np.concatenate([np.ravel(getattr(s, name)) for s in records])
+        np.testing.assert_array_equal(found, expected)
+    assert len(sent["signals/epsilon"]) == 5
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
+def test_it_listens_on_this_machine_only():
+    with LiveView(VECTOR, MANIFEST, 40, 1) as view:
+        assert "127.0.0.1" in view.address
+        port = int(view.address.split(":")[2].split("/")[0])
+        with socket.create_connection(("127.0.0.1", port), timeout=5):
+            pass
+        listening = Path("/proc/net/tcp").read_text("utf-8")
+        rows = [row.split() for row in listening.splitlines()[1:]]
+        places = {row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{port:04X}")}
+        assert places == {f"0100007F:{port:04X}"}
+
+
+def test_a_run_gives_the_same_with_and_without(tmp_path):
+    said = []
+    config = LearnerConfig()
+    quiet = learn(OscillatorySource(), config, None, max_iterations=60)
+    shown = learn(
+        OscillatorySource(),
+        config,
+        tmp_path / "run",
+        max_iterations=60,
+        live=True,
+        announce=said.append,
+    )
+    assert shown.signals_sha256 == quiet.signals_sha256
+    assert (tmp_path / "run" / "run.rrd").is_file()
+    assert len(said) == 1
+
+
+def test_rerun_switched_off_is_said(monkeypatch):
+    monkeypatch.setattr(rr, "is_enabled", lambda recording: False)
+    with pytest.raises(CdmisfaError, match="RERUN"):
+        LiveView(VECTOR, MANIFEST, 40, 1)
+
+
+def test_the_learner_hardly_waits():
+    """CPU time of this thread for a block, against the 2 ms that the learner takes for one."""
+    spec = dataclasses.replace(IMAGE, frame_shape=(48, 128))
+    fed = list(run_of(spec, 1000))
+    phi = np.ones((1, 48 * 128))
+    with LiveView(spec, MANIFEST, 40, 1) as view:
+        begin = time.thread_time()
+        for signals, block in fed:
+            view.block(signals, block, phi)
+        view.flush()
+        each = (time.thread_time() - begin) / len(fed)
+    assert each < 400e-6
+
+
+@pytest.mark.skipif(bool(viewer.missing_driver()), reason=viewer.missing_driver())
+def test_a_viewer_that_connects_shows_it(tmp_path):
+    with LiveView(IMAGE, MANIFEST, 40, 1) as view, viewer.headless_viewer("900x600") as opened:
+        feed(view, IMAGE)
+        view.flush()
+
+        def connected(client):
+            state = client.get_state()
+            if not state.recordings:
+                client.open(view.address)
+            return state.views if any(v.name == "What it sees" for v in state.views) else None
+
+        views = opened.ask(connected, seconds=30)
+        assert [v.reports for v in views] == [[]] * len(views)
+        (tmp_path / "s.png").write_bytes(opened.ask(lambda c: c.take_screenshot()))
+    with Image.open(tmp_path / "s.png") as picture:
+        assert len(np.unique(np.asarray(picture.convert("L")))) > 20
