@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -14,7 +16,31 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def compiled(function: Function) -> Function:
     """Compile strictly (no reordering of floating point) and keep the result on disk."""
-    return cast(Function, numba.njit(cache=True)(function))
+    return cast(Function, kept_while_sources_last(numba.njit(cache=True)(function)))
+
+
+def kept_while_sources_last(dispatcher: Any) -> Any:
+    """Let a result on disk count only as long as no compiled function of the core has changed.
+
+    A compiled function holds what it calls in other files; numba by itself compiles it again
+    only when its own file has changed.
+    """
+    kept: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if hasattr(kept, "_source_stamp"):
+        kept._source_stamp = (kept._source_stamp, _sources())
+    return dispatcher
+
+
+@cache
+def _sources() -> str:
+    """Hash of the core's sources that hold compiled functions."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted([*root.glob("*.py"), *root.glob("incsfa/*.py")]):
+        source = path.read_bytes()
+        if b"@compiled" in source or b"njit(" in source:
+            digest.update(source)
+    return digest.hexdigest()
 
 
 def needs_compiling(function: Callable[..., Any]) -> bool:
