@@ -22,6 +22,13 @@ TIE = 1e-12
 """Share of an action value below which a difference is rounding, so that the tie goes to stay."""
 
 
+LANES = 256
+"""Sums side by side over many streams: one alone waits for each addition.
+
+Their number is part of the result's rounding, so it is fixed and not left to the CPU.
+"""
+
+
 @compiled
 def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
     """Sum T of the values of all streams under a policy.
@@ -33,68 +40,68 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
         gamma: discount factor.
     """
     n = len(stay)
-    staying = 0.0
-    leaving = 0.0
+    horizon = (n - 1 + gamma) / (1.0 - gamma)
     leavers = 0
-    for s in range(n):
-        leaves = policy[s]
-        staying += stay[s] * (1 - leaves)
-        leaving += switch[s] * leaves
-        leavers += leaves
-    fixed = staying / (1.0 - gamma) * (n - 1 + gamma) + leaving
+    total = 0.0
+    whole = n - n % LANES
+    if whole > 0:
+        lanes = np.zeros(LANES)
+        for first in range(0, whole, LANES):
+            for lane in range(np.uint64(LANES)):  # unsigned: needs no look at negative indices
+                s = np.uint64(first) + lane
+                kept = stay[s] * horizon
+                left = switch[s]
+                lanes[lane] += left if policy[s] == 1 else kept
+                leavers += policy[s]
+        for lane in range(LANES):
+            total += lanes[lane]
+    for s in range(whole, n):
+        total += switch[s] if policy[s] == 1 else stay[s] * horizon
+        leavers += policy[s]
     # Written so that nothing cancels when every stream is left and gamma is close to 1.
-    return fixed / (n - leavers + (leavers - 1) * (1.0 - gamma))
+    return total / (n - leavers + (leavers - 1) * (1.0 - gamma))
 
 
 @compiled
-def improve(stay: Float, switch: Float, total: float, gamma: float, policy: Int) -> int:
-    """Make a policy greedy for the values it has; return how many streams changed their mind.
+def improve(
+    stay: Float, switch: Float, total: float, gamma: float, scale: float, policy: Int, Q: Float
+) -> int:
+    """Value both actions under a policy and make it greedy for these values.
+
+    With V(s) the value of s where it is left and where it stays, leaving is better under either
+    policy where the first is greater.
 
     Args:
         stay: (S,) reward of staying.
         switch: (S,) reward of switching, summed over the n-1 streams it may lead to.
         total: sum T of the values under the policy.
         gamma: discount factor.
+        scale: common factor of the values written.
         policy: (S,) read and written: 0 stay, 1 switch.
+        Q: (2 S,) written: for each stream the values of both actions under the policy as it
+            was read.
+
+    Returns:
+        How many streams changed their mind.
     """
     n = len(stay)
-    share, mean = gamma / (n - 1), 1.0 / (n - 1)
+    share, mean = gamma / (n - 1), scale / (n - 1)
     damp, horizon = 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
+    arriving = share * total * scale
     changed = 0
-    for s in range(n):
-        leave = (switch[s] * mean + share * total) * damp
-        value = leave if policy[s] == 1 else stay[s] * horizon
-        q_stay = stay[s] + gamma * value
-        q_switch = switch[s] * mean + share * (total - value)
-        better = 1 if q_switch - q_stay > TIE * (abs(q_stay) + abs(q_switch)) else 0
-        changed += better ^ policy[s]
+    for s in range(np.uint64(n)):
+        reward = stay[s] * scale
+        keep = reward * horizon
+        arrive = switch[s] * mean + arriving
+        leave = arrive * damp
+        before = policy[s]
+        better = np.int64(leave - keep > TIE * (abs(leave) + abs(keep)))
+        value = leave if before == 1 else keep
+        changed += better ^ before
         policy[s] = better
+        Q[np.uint64(2) * s] = reward + gamma * value
+        Q[np.uint64(2) * s + np.uint64(1)] = arrive - share * value
     return changed
-
-
-@compiled
-def action_values(
-    stay: Float, switch: Float, total: float, gamma: float, policy: Int, scale: float, Q: Float
-) -> None:
-    """Values of both actions in every stream under a policy, times `scale`.
-
-    Args:
-        stay: (S,) reward of staying.
-        switch: (S,) reward of switching, summed over the n-1 streams it may lead to.
-        total: sum T of the values under the policy.
-        gamma: discount factor.
-        policy: (S,) 0 stay, 1 switch.
-        scale: common factor.
-        Q: (S, 2) written.
-    """
-    n = len(stay)
-    share, mean = gamma / (n - 1), 1.0 / (n - 1)
-    damp, horizon = 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
-    for s in range(n):
-        leave = (switch[s] * mean + share * total) * damp
-        value = leave if policy[s] == 1 else stay[s] * horizon
-        Q[s, 0] = (stay[s] + gamma * value) * scale
-        Q[s, 1] = (switch[s] * mean + share * (total - value)) * scale
 
 
 @compiled
@@ -116,9 +123,8 @@ def policy_iteration(
         Q[0, 0] = stay_sum[0] / count / (1.0 - gamma)
         Q[0, 1] = Q[0, 0]
         return
-    total = value_sum(stay_sum, switch_sum, policy, gamma)
+    pairs = Q.reshape(-1)
     for _ in range(MAX_SWEEPS):
-        if improve(stay_sum, switch_sum, total, gamma, policy) == 0:
-            break
         total = value_sum(stay_sum, switch_sum, policy, gamma)
-    action_values(stay_sum, switch_sum, total, gamma, policy, 1.0 / count, Q)
+        if improve(stay_sum, switch_sum, total, gamma, 1.0 / count, policy, pairs) == 0:
+            return
