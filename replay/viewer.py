@@ -69,7 +69,9 @@ def open_window(path: Path, *, every: int = 10, memory_limit: str = "2GB") -> No
     """
     with _view_of(path, every) as view:
         port = str(free_port())
-        _run([str(view), "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit])
+        run_program(
+            [str(view), "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit]
+        )
 
 
 def serve(
@@ -86,7 +88,7 @@ def serve(
     with _view_of(path, every) as view:
         proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
         print(f"http://127.0.0.1:{page_port}/?url={proxy}", file=sys.stderr, flush=True)
-        _run(
+        run_program(
             [
                 "--serve-web",
                 *("--bind", "127.0.0.1"),
@@ -251,9 +253,18 @@ def _view_of(path: Path, every: int) -> Iterator[Path]:
         yield view
 
 
-def _run(arguments: Sequence[str]) -> None:
-    """Run the viewer until it ends; an interrupt ends it and is passed on."""
-    process = subprocess.Popen([str(program()), *arguments], env=environment())
+def run_program(arguments: Sequence[str], *, quiet: bool = False) -> None:
+    """Run the viewer, or its server, until it ends; an interrupt ends it and is passed on.
+
+    Args:
+        arguments: of the program.
+        quiet: let it say warnings only.
+
+    Raises:
+        CdmisfaError: it ended with an error.
+    """
+    words = {**environment(), "RUST_LOG": "warn"} if quiet else environment()
+    process = subprocess.Popen([str(program()), *arguments], env=words)
     try:
         code = process.wait()
     except BaseException:

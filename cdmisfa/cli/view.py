@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.progress import bar
 
 FILE = click.Path(path_type=Path)
 
@@ -38,14 +39,22 @@ def view_command(
 ) -> None:
     """Open a run in the Rerun viewer, or save, serve or picture it.
 
-    RUN is the folder of a run, or its run.mcap.
+    RUN is the folder of a run, or its run.mcap, a recording, or an .rrd file. A sweep that
+    kept its logs is served as a table, one row per run, until interrupted.
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
         raise click.UsageError("choose one of --save, --web and --screenshot")
     if at is not None and screenshot is None:
         raise click.UsageError("--at goes with --screenshot")
     import replay.viewer as viewer
+    from replay.catalogue import runs_in, serve_catalogue
 
+    if runs_in(run):
+        if save is not None or web or screenshot is not None:
+            raise click.UsageError(f"{run} holds many runs, which are only served: name one run")
+        with bar("preparing views", "runs") as shown:
+            serve_catalogue(run, progress=shown.update)
+        return
     if save is not None:
         viewer.save(run, save, every=every, force=force)
         click.echo(f"view {save}", err=True)
