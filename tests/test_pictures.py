@@ -1,0 +1,28 @@
+"""Pages show pictures that are there, small enough, and accounted for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+IMAGES = ROOT / "docs" / "images"
+MOST_BYTES = 400_000
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md"), IMAGES / "README.md"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?://)([^)#\s]+)", page.read_text("utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_every_picture_is_small_accounted_for_and_shown() -> None:
+    pages = {page: page.read_text("utf-8") for page in PAGES}
+    card = pages.pop(IMAGES / "README.md")
+    for picture in IMAGES.glob("*.png"):
+        assert picture.stat().st_size < MOST_BYTES
+        assert f"`{picture.name}`" in card
+        assert any(f"images/{picture.name})" in text for text in pages.values())
