@@ -7,20 +7,29 @@ import importlib
 import pkgutil
 
 import benchmarks
+from benchmarks.report import write_page
 
 
 def main() -> None:
-    """Run benchmarks one after another; each writes results/NAME.json and NAME.md."""
+    """Run benchmarks one after another; each writes results/NAME.json, `page` the page."""
     modules = pkgutil.iter_modules(benchmarks.__path__)
     names = sorted(m.name for m in modules if not m.name.startswith("_") and m.name != "report")
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("name", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}")
+    parser.add_argument(
+        "name", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}, or page"
+    )
     parser.add_argument("--quick", action="store_true", help="fewer rounds")
+    parser.add_argument("--full", action="store_true", help="the longest cases too (scaling)")
     arguments = parser.parse_args()
-    for name in arguments.name or names:
+    for name in arguments.name or [*names, "page"]:
+        if name == "page":
+            print(write_page())
+            continue
         if name not in names:
             parser.error(f"no benchmark {name}: there are {', '.join(names)}")
-        importlib.import_module(f"benchmarks.{name}").main(quick=arguments.quick)
+        importlib.import_module(f"benchmarks.{name}").main(
+            quick=arguments.quick, full=arguments.full
+        )
 
 
 if __name__ == "__main__":

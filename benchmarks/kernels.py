@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from benchmarks.report import interleaved, ratio, save, table
+from benchmarks.report import interleaved, ratio, save
 from cdmisfa.config import LearnerConfig
 from cdmisfa.expansion import quadratic
 from cdmisfa.incsfa import gram, new_state, parameters, strict
@@ -199,8 +199,8 @@ def _result(times: dict[str, list[float]], ours: str, **case: int) -> dict[str, 
     return {**case, "ours": ours, "us_per_frame": micros, "times_faster_than": ratios}
 
 
-def main(*, quick: bool = False) -> None:
-    """Measure, and write results/kernels.json and kernels.md."""
+def main(*, quick: bool = False, full: bool = False) -> None:
+    """Measure, and write results/kernels.json."""
     rounds = 3 if quick else 7
     with threadpool_limits(1):
         _measure(rounds)
@@ -216,12 +216,12 @@ def _measure(rounds: int) -> None:
         for c in cases
     ]
     header = ["inputs", "K", "J", "tau", "kernel", "us a frame", *(f"vs {o}" for o in others)]
-    text = (
-        "# IncSFA kernels\n\n"
+    save(
+        "kernels",
+        "IncSFA kernels",
         "CPU time of one thread, medians of interleaved rounds. IncrementalPCA does the "
-        "whitening only.\n\n"
-        + table(header, rows)
-        + "\n\nOne core of this machine:\n\n"
-        + table(["limit", "value"], list(limits.items()))
+        "whitening only. The last table is what one core of this machine can do.",
+        [(header, rows), (["limit", "value"], list(limits.items()))],
+        limits=limits,
+        cases=cases,
     )
-    save("kernels", {"limits": limits, "cases": cases}, text)

@@ -15,24 +15,30 @@ import numba
 import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
+PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 
 
-def interleaved(work: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, list[float]]:
-    """CPU microseconds of the calling thread per unit of work, one list entry a round.
+def interleaved(
+    work: Mapping[str, Callable[[], int]],
+    rounds: int,
+    clock: Callable[[], int] = time.thread_time_ns,
+) -> dict[str, list[float]]:
+    """CPU microseconds per unit of work, one list entry a round.
 
     The candidates take turns, so that a slow spell of the machine hits all of them.
 
     Args:
         work: name -> a call that does some units of work and returns how many.
         rounds: how often each has its turn, after one turn to warm up.
+        clock: nanoseconds, of the calling thread; or of the process or the wall.
     """
     times: dict[str, list[float]] = {name: [] for name in work}
     for turn in range(rounds + 1):
         for name, call in work.items():
-            start = time.thread_time_ns()
+            start = clock()
             units = call()
             if turn:
-                times[name].append((time.thread_time_ns() - start) / 1000 / units)
+                times[name].append((clock() - start) / 1000 / units)
     return times
 
 
@@ -64,11 +70,54 @@ def table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
-def save(name: str, results: Mapping[str, Any], markdown: str) -> None:
-    """Write results/NAME.json and results/NAME.md, and print the latter."""
+def save(
+    name: str,
+    title: str,
+    note: str,
+    tables: Sequence[tuple[Sequence[str], Sequence[Sequence[Any]]]],
+    **data: Any,
+) -> None:
+    """Write results/NAME.json, and print its tables.
+
+    Args:
+        name: of the benchmark.
+        title: its heading on the page.
+        note: what was measured, and how.
+        tables: (header, rows) of each table.
+        data: further values for the file.
+    """
     RESULTS.mkdir(exist_ok=True)
-    document = {"benchmark": name, "platform": platform_facts(), **results}
+    document = {
+        "benchmark": name,
+        "title": title,
+        "note": note,
+        "platform": platform_facts(),
+        "tables": [{"header": list(header), "rows": list(rows)} for header, rows in tables],
+        **data,
+    }
     text = json.dumps(document, indent=1) + "\n"
     (RESULTS / f"{name}.json").write_text(text, encoding="utf-8")
-    (RESULTS / f"{name}.md").write_text(markdown + "\n", encoding="utf-8")
-    print(markdown)
+    print(section(document))
+
+
+def section(document: Mapping[str, Any]) -> str:
+    """The part of the page that shows one benchmark's results."""
+    tables = [table(t["header"], t["rows"]) for t in document["tables"]]
+    facts = ", ".join(f"{key} {value}" for key, value in document["platform"].items())
+    return "\n\n".join(
+        [f"## {document['title']}", document["note"], *tables, f"Measured on: {facts}."]
+    )
+
+
+def write_page() -> Path:
+    """Write docs/benchmarks.md from the results there are."""
+    documents = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(RESULTS.glob("*.json"))]
+    head = (
+        "# Benchmarks\n\n`make bench` measures all of it and makes this page from "
+        "`benchmarks/results/*.json`; `python -m benchmarks NAME [--quick]` measures one part, "
+        "`python -m benchmarks page` makes the page. Candidates take turns, times are CPU time, "
+        "and what counts is the median of the ratios within each round: a slow spell of the "
+        "machine hits all of them."
+    )
+    PAGE.write_text("\n\n".join([head, *map(section, documents)]) + "\n", encoding="utf-8")
+    return PAGE

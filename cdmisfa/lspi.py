@@ -48,11 +48,11 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
         lanes = np.zeros(LANES)
         for first in range(0, whole, LANES):
             for lane in range(np.uint64(LANES)):  # unsigned: needs no look at negative indices
-                s = np.uint64(first) + lane
-                kept = stay[s] * horizon
-                left = switch[s]
-                lanes[lane] += left if policy[s] == 1 else kept
-                leavers += policy[s]
+                at = np.uint64(first) + lane
+                kept = stay[at] * horizon
+                left = switch[at]
+                lanes[lane] += left if policy[at] == 1 else kept
+                leavers += policy[at]
         for lane in range(LANES):
             total += lanes[lane]
     for s in range(whole, n):

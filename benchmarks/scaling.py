@@ -1,0 +1,125 @@
+"""How cost grows with streams, frames and jobs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from benchmarks.report import interleaved, ratio, save
+from cdmisfa.agent import OUTCOME, Agent, Rules, new_agent, rules, think
+from cdmisfa.compiled import compiled
+from cdmisfa.config import LearnerConfig
+from cdmisfa.gate import NOVEL
+from cdmisfa.learner import CuriousLearner
+from cdmisfa.streams import OscillatorySource
+
+STREAMS = (10, 100, 1000, 10_000)
+
+
+@compiled
+def _steps(
+    agent: Agent,
+    rules: Rules,
+    out: NDArray[np.void],
+    y: NDArray[np.float64],
+    uniforms: NDArray[np.float64],
+    blocks: int,
+) -> None:
+    for b in range(blocks):
+        draws = uniforms[b % len(uniforms)]
+        think(agent, rules, out, NOVEL, 1e-3 * (1.0 + draws[3]), y, 2 * b, draws[:3])
+
+
+def agent_steps(n: int, blocks: int) -> Callable[[], int]:
+    """A call of some iterations of an agent of n streams whose every block is novel."""
+    config = LearnerConfig(outputs=1)
+    agent, constants = new_agent(config, n, 0), rules(config, n)
+    rng = np.random.default_rng(0)
+    y, uniforms, out = rng.standard_normal((2, 1)), rng.random((997, 4)), np.zeros(1, OUTCOME)
+
+    def call() -> int:
+        _steps(agent, constants, out, y, uniforms, blocks)
+        return blocks
+
+    return call
+
+
+def learn_frames(frames: int) -> tuple[float, float]:
+    """Learn that many frames; CPU microseconds a frame, and this process' peak memory in MB."""
+    config = LearnerConfig(outputs=1, tau=100)
+    source = OscillatorySource()
+    learner = CuriousLearner(config, source.spec, 0)
+    start = time.thread_time_ns()
+    for _ in range(frames // config.tau):
+        learner.step(source.take(learner.stream, config.tau))
+    cost = (time.thread_time_ns() - start) / 1000 / frames
+    return cost, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _send_learned(frames: int, pipe: Any) -> None:
+    learn_frames(1000)
+    pipe.send(learn_frames(frames))
+
+
+def apart(frames: int) -> tuple[float, float]:
+    """`learn_frames` in a process of its own, so that the peak is this one's."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_send_learned, args=(frames, theirs))
+    process.start()
+    result: tuple[float, float] = ours.recv()
+    process.join()
+    return result
+
+
+def trials(jobs: int, frames: int) -> Callable[[], int]:
+    """A call that learns 4 times that many frames in some processes."""
+
+    def call() -> int:
+        Parallel(n_jobs=jobs)(delayed(learn_frames)(frames) for _ in range(4))
+        return 4
+
+    return call
+
+
+def main(*, quick: bool = False, full: bool = False) -> None:
+    """Measure, and write results/scaling.json."""
+    rounds = 3 if quick else 9
+    streams = STREAMS[:2] if quick else STREAMS
+    lengths = (1_000, 10_000) if quick else (10_000, 100_000, *((1_000_000,) if full else ()))
+    work = {str(n): agent_steps(n, 20_000 // n + 200) for n in streams}
+    steps = interleaved(work, rounds)
+    by_streams = [
+        [n, round(statistics.median(steps[str(n)]), 2), f"{ratio(steps[str(n)], steps['10']):.1f}x"]
+        for n in streams
+    ]
+    by_frames = []
+    for frames in lengths:
+        cost, peak = apart(frames)
+        by_frames.append([frames, round(cost, 2), round(peak, 1)])
+    jobs = {"1": trials(1, 40 * lengths[0]), "2": trials(2, 40 * lengths[0])}
+    walls = interleaved(jobs, 2 if quick else 3, time.perf_counter_ns)
+    by_jobs = [
+        [n, round(statistics.median(t) / 1000), f"{ratio(walls['1'], t):.2f}x"]
+        for n, t in walls.items()
+    ]
+    save(
+        "scaling",
+        "Scaling",
+        "One iteration of the agent for n streams (every block novel, policy iteration "
+        "included). CPU time a frame and peak memory of a process that learns from the "
+        "oscillatory streams in blocks of 100. Trials in processes, by the wall's clock.",
+        [
+            (["streams", "us a step", "of 10 streams"], by_streams),
+            (["frames", "us a frame", "peak MB"], by_frames),
+            (["jobs", f"ms a trial of {40 * lengths[0]} frames", "speed"], by_jobs),
+        ],
+    )
