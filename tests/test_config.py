@@ -276,3 +276,9 @@ def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
 def test_fields_that_cannot_be_configured_are_a_programmers_error() -> None:
     with pytest.raises(TypeError, match="cannot be configured"):
         convert(1, dict, "scene.x")
+
+
+def test_the_page_of_keys_explains_each() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text("utf-8")
+    keys = [field.name for field in dataclasses.fields(LearnerConfig)]
+    assert [key for key in keys if f"| `{key}` |" not in page] == []
