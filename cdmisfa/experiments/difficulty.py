@@ -51,7 +51,7 @@ TRAINING = 4000
 
 def plan(request: Request) -> list[dict[str, Any]]:
     """20 seeds of each stream; the iCub's views where there is a recording."""
-    n = request.count(20, 3)
+    n = request.count(20, 12)
     trials: list[dict[str, Any]] = [
         {"scene": "oscillatory", "stream": stream, "recording": None, "identity": None, "seed": s}
         for stream in range(3)
