@@ -97,6 +97,11 @@ class LogFile:
         """Whether the file was finished or abandoned."""
         return self._stream.closed
 
+    @property
+    def size(self) -> int:
+        """Bytes written so far; the chunk in progress is not among them."""
+        return self._stream.tell()
+
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Register a message schema; the same schema gets the same id.
 

@@ -19,18 +19,10 @@ from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.eyes import HeadPose
 from recorder.logfile import LogWriteError
+from recorder.parts import Split, ViewParts, view_logs
 from recorder.rendering import render_here, render_in_processes, requests
 from recorder.scenes import open_scene
-from recorder.viewlog import (
-    Identity,
-    ViewLog,
-    check_identity,
-    earlier_logs,
-    keep,
-    kept_path,
-    sha256,
-    whole_frames,
-)
+from recorder.viewlog import Identity, sha256
 
 MAX_JOBS = 256
 
@@ -72,6 +64,7 @@ def record(
     jobs: int = 1,
     force: bool = False,
     resume: bool = False,
+    split: Split | None = None,
     progress: Progress | None = None,
 ) -> list[ViewRecording]:
     """Record the first frames of a scene into a folder.
@@ -90,6 +83,7 @@ def record(
         jobs: processes that render.
         force: overwrite an earlier recording in the folder.
         resume: go on where an earlier attempt with the same arguments ended.
+        split: write every view as parts of limited size or duration.
         progress: called after every block.
 
     Raises:
@@ -120,14 +114,21 @@ def record(
         make_folder(folder, source.spec, force=force)
         with _stoppable() as stopped, ExitStack() as open_logs:
             poses = _poses(source)
-            earlier = {v: _to_continue(folder, v, identity) for v in names} if resume else {}
-            logs = []
-            for name in names:
-                log = _open_log(
-                    folder, name, identity, settings, poses.get(name), frames, earlier.get(name)
+            logs = [
+                ViewParts(
+                    folder,
+                    name,
+                    identity,
+                    settings,
+                    split=split,
+                    pose=poses.get(name),
+                    resume=frames if resume else None,
                 )
+                for name in names
+            ]
+            for log in logs:
                 open_logs.callback(log.abandon)
-                logs.append(log)
+                log.open()
             by_stream = {log.stream: log for log in logs}
             wanted = requests({log.stream: log.t for log in logs}, frames)
             blocks = (
@@ -144,14 +145,12 @@ def record(
                         raise _StoppedError(f"{folder} is not finished: go on with --resume")
             for log in logs:
                 log.finish()
-    for log in logs:
-        kept_path(log.path).unlink(missing_ok=True)
-    return [written(log) for log in logs]
+    return [written(log.view, path, held) for log in logs for path, held in log.parts]
 
 
-def written(log: ViewLog) -> ViewRecording:
-    """What a finished log came to."""
-    return ViewRecording(log.view, log.path, log.t, log.path.stat().st_size, sha256(log.path))
+def written(view: str, path: Path, frames: int) -> ViewRecording:
+    """What a finished file of a view came to."""
+    return ViewRecording(view, path, frames, path.stat().st_size, sha256(path))
 
 
 class _StoppedError(CdmisfaError):
@@ -192,55 +191,10 @@ def make_folder(folder: Path, spec: SourceSpec, *, force: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if force:
             for name in spec.streams:
-                for old in earlier_logs(folder / f"{name}.mcap"):
+                for old in view_logs(folder, name):
                     old.unlink()
     except OSError as error:
         raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
-
-
-def _to_continue(folder: Path, view: str, identity: Identity) -> tuple[Path, int] | None:
-    """The earlier log of a view that holds the most frames, and how many.
-
-    Raises:
-        UsageError: it is a recording of something else.
-    """
-    path = folder / f"{view}.mcap"
-    earlier = {p: whole_frames(p, view) for p in earlier_logs(path)}
-    best = max(earlier, key=lambda p: earlier[p], default=None)
-    if best is None or not earlier[best]:
-        if path in earlier:
-            raise UsageError(f"{path} holds no frames of {view}: overwrite with --force")
-        for torn in earlier:
-            torn.unlink()
-        return None
-    check_identity(best, identity.metadata(view))
-    return best, earlier[best]
-
-
-def _open_log(
-    folder: Path,
-    view: str,
-    identity: Identity,
-    settings: RecordConfig,
-    pose: HeadPose | None,
-    frames: int,
-    earlier: tuple[Path, int] | None,
-) -> ViewLog:
-    """A view's log, with the first frames taken over from an earlier one."""
-    if earlier is None:
-        return ViewLog(folder, view, identity, settings, pose=pose)
-    path, held = folder / f"{view}.mcap", min(earlier[1], frames)
-    try:
-        kept = keep(path, earlier[0])
-    except OSError as error:
-        raise LogWriteError(f"{path} cannot be continued: {error.strerror}") from error
-    log = ViewLog(folder, view, identity, settings, pose=pose)
-    try:
-        log.copy(kept, held)
-    except BaseException:
-        log.abandon()
-        raise
-    return log
 
 
 @contextlib.contextmanager

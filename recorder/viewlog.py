@@ -61,8 +61,8 @@ class Identity:
         """The configuration as the attachment holds it."""
         return (json.dumps(self.config, indent=2, sort_keys=True) + "\n").encode()
 
-    def metadata(self, view: str) -> dict[str, str]:
-        """The view's metadata record."""
+    def metadata(self, view: str, first_frame: int = 0) -> dict[str, str]:
+        """The view's metadata record, in a file that begins with a frame."""
         spec = self.spec
         values = {
             "schema": str(SCHEMA_VERSION),
@@ -75,7 +75,7 @@ class Identity:
             "truth": ",".join(spec.truth),
             "fps": repr(spec.fps),
             "start_ns": str(spec.start_ns),
-            "first_frame": "0",
+            "first_frame": str(first_frame),
             "seed": str(self.seed),
             "config_sha256": hashlib.sha256(self.config_json()).hexdigest(),
         }
@@ -95,6 +95,8 @@ class ViewLog:
         identity: what is recorded.
         settings: how it is written.
         pose: of the head in this view, where there is a head; written once a second.
+        name: of the file, instead of the view's.
+        first_frame: with which the file begins.
 
     Attributes:
         view: name of the view.
@@ -110,11 +112,13 @@ class ViewLog:
         settings: RecordConfig,
         *,
         pose: HeadPose | None = None,
+        name: str | None = None,
+        first_frame: int = 0,
     ) -> None:
         spec = identity.spec
         self.view = view
         self.stream = spec.streams.index(view)
-        self.t = 0
+        self.t = self._first = first_frame
         self._spec = spec
         self._pose = pose
         self._pose_every = max(round(spec.fps), 1)
@@ -126,12 +130,12 @@ class ViewLog:
         self._truth = TruthEncoder(spec.truth)
         self._head = PoseEncoder(ROOT_FRAME)
         self._log = LogFile(
-            folder / f"{view}.mcap",
+            folder / (name or f"{view}.mcap"),
             library=f"cdmisfa {_version('cdmisfa')}",
             compression=settings.compression,
             chunk_size=settings.chunk_size,
         )
-        self._log.add_metadata(METADATA, identity.metadata(view))
+        self._log.add_metadata(METADATA, identity.metadata(view, first_frame))
         self._log.add_attachment(
             CONFIG_NAME, "application/json", identity.config_json(), log_time=spec.start_ns
         )
@@ -152,6 +156,11 @@ class ViewLog:
         """The file's name once it is finished."""
         return self._log.path
 
+    @property
+    def size(self) -> int:
+        """Bytes that were handed to the operating system: whole chunks."""
+        return self._log.size
+
     def write(self, block: Block) -> None:
         """Write the frames of a block, which must start at `t`.
 
@@ -166,7 +175,7 @@ class ViewLog:
         truth, pose = channels.get(TRUTH_TOPIC), self._pose
         for frame, values in zip(block.frames, block.truth, strict=True):
             t, time = self.t, self._spec.time_ns(self.t)
-            if pose is not None and t % self._pose_every == 0:
+            if pose is not None and (t % self._pose_every == 0 or t == self._first):
                 data = self._head(time, pose.position, pose.quaternion)
                 write(channels[POSE_TOPIC], time, data, t)
             if truth is not None:
@@ -175,7 +184,7 @@ class ViewLog:
             self.t += 1
 
     def copy(self, path: Path, frames: int) -> None:
-        """Take over the first frames of an earlier log of the same view.
+        """Take over the frames before `frames` of an earlier log of the same part.
 
         Raises:
             LogWriteError: the disk does not take it.
@@ -188,6 +197,14 @@ class ViewLog:
                 self._log.write(target, message.log_time, message.data, message.sequence)
         self.t = frames
 
+    def flush(self) -> None:
+        """Hand everything to the operating system.
+
+        Raises:
+            LogWriteError: the disk does not take it.
+        """
+        self._log.flush()
+
     def finish(self) -> None:
         """Give the file its index and its name."""
         self._log.finish()
@@ -197,9 +214,9 @@ class ViewLog:
         self._log.abandon()
 
 
-def whole_frames(path: Path, view: str) -> int:
-    """How many frames from the first on a log holds without a gap, damaged or not."""
-    count = 0
+def whole_frames(path: Path, view: str, first: int = 0) -> int:
+    """Up to before which frame a log holds all from the first on, damaged or not."""
+    count = first
     for channel, message in _messages(path):
         if channel.topic == view_topic(view):
             if message.sequence != count:

@@ -67,7 +67,7 @@ def convert(
                     progress(done / len(logs))
         for log in logs:
             log.finish()
-    return [written(log) for log in logs]
+    return [written(log.view, log.path, log.t) for log in logs]
 
 
 def view_names(topics: Sequence[str]) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import itertools
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +13,9 @@ import numpy as np
 
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
 from cdmisfa.errors import LogDamagedError, LogExhaustedError
+from recorder.logfile import PARTIAL
 from replay.files import log_files, sha256
+from replay.reader import LogReader
 from replay.viewfacts import ViewFacts
 from replay.viewfile import ViewFile, intersection
 
@@ -21,6 +24,9 @@ CACHE_BYTES: Final = 1024 * 1024
 
 Few, because playing moves forward, and memory that is used again is still in the CPU's cache.
 """
+_FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
+_SMALLEST: Final = 64
+"""Bytes that no log of a recording has less of once its header is written."""
 _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns")
 _SAME_VALUES: Final = ("scene", "seed", "config_sha256")
 
@@ -48,7 +54,7 @@ class RecordedSource:
         """
         self.warnings: tuple[str, ...] = ()
         self._loop = loop
-        self._files = log_files(paths)
+        self._files = [path for path in log_files(paths) if not _only_begun(path)]
         self._hashes: list[dict[str, Any]] | None = None
         self._views: list[list[ViewFile]] = []
         opened: list[ViewFile] = []
@@ -219,6 +225,17 @@ class RecordedSource:
                 if start <= frame < stop:
                     return view, frame, min(wanted, min(high, stop) - frame)
         raise AssertionError(f"frame {frame} is in no file")
+
+
+def _only_begun(path: Path) -> bool:
+    """Whether a file is a further part that its recorder had begun, but not a frame of it."""
+    if not _FURTHER_PART.fullmatch(path.name):
+        return False
+    try:
+        with LogReader(path) as reader:
+            return not reader.segments
+    except LogDamagedError:
+        return path.stat().st_size < _SMALLEST
 
 
 def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:

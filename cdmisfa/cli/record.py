@@ -37,6 +37,11 @@ if TYPE_CHECKING:
     help="Draw the scene from outside instead of recording it.",
 )
 @click.option("--resume", is_flag=True, help="Go on where an interrupted recording ended.")
+@click.option(
+    "--split",
+    metavar="LIMIT",
+    help="Begin a new file of each view at this size or duration: 512MB, 10min.",
+)
 @options.force
 @options.as_json
 def record_command(
@@ -51,6 +56,7 @@ def record_command(
     scene_picture: Path | None,
     force: bool,
     resume: bool,
+    split: str | None,
     as_json: bool,
 ) -> None:
     """Record what a scene shows, one MCAP file per view.
@@ -71,8 +77,10 @@ def record_command(
             return
     if out is None:
         raise click.UsageError("say -o FOLDER, where the recording goes")
+    from recorder.parts import Split
     from recorder.recording import record
 
+    parts = None if split is None else Split.parse(split)
     with bar("recording", "frames") as shown:
         files = record(
             scene,
@@ -84,6 +92,7 @@ def record_command(
             jobs=jobs,
             force=force,
             resume=resume,
+            split=parts,
             progress=lambda done: shown.update(done, frames),
         )
     print_recording(out, frames, files, as_json=as_json)

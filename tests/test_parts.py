@@ -1,0 +1,165 @@
+"""A recording in parts is the recording, whatever happened while it was written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from source_contract import SourceContract, same
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.errors import UsageError
+from cdmisfa.streams import OscillatorySource
+from recorder.parts import Split
+from recorder.recording import record
+from replay.recorded import RecordedSource
+from replay.verify import verify
+
+FRAMES = 700
+BY_TIME = Split(seconds=3)
+BY_SIZE = Split(size=12_000)
+
+
+@pytest.fixture(scope="module", params=[BY_TIME, BY_SIZE], ids=["time", "size"])
+def split(request: pytest.FixtureRequest) -> Split:
+    return request.param  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="module")
+def parts(split: Split, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("parts") / "rec"
+    record("oscillatory", folder, frames=FRAMES, split=split)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+class TestParts(SourceContract):
+    ends = True
+    long = 200
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, parts: Path) -> None:
+        self.folder = parts
+
+    def open(self) -> FrameSource:
+        return RecordedSource(self.folder)
+
+
+def test_parts_read_as_one(parts: Path) -> None:
+    assert len(list(parts.glob("x1-*.mcap"))) > 3
+    assert verify(parts)["ok"]
+    live, recorded = OscillatorySource(), RecordedSource(parts)
+    assert recorded.spec.length == FRAMES
+    for i in range(FRAMES // 35):
+        same(live.take(i % 3, 35), recorded.take(i % 3, 35))
+
+
+def test_parts_are_as_long_as_asked_for(tmp_path: Path) -> None:
+    files = record("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
+    assert [f.frames for f in files if f.name == "x2"] == [150, 150, 100]
+    files = record("oscillatory", tmp_path / "b", frames=FRAMES, split=BY_SIZE)
+    sizes = np.array([f.bytes for f in files if f.name == "x1"])
+    assert (sizes[:-1] >= 12_000).all()
+    assert (sizes < 20_000).all()
+
+
+def test_a_resumed_recording_has_the_same_parts(parts: Path, split: Split, tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    for frames in (90, 300, 431, FRAMES):
+        record("oscillatory", folder, frames=frames, split=split, resume=True)
+    assert contents(folder) == contents(parts)
+    torn = folder / "x2-002.mcap"
+    torn.with_name(torn.name + ".partial").write_bytes(torn.read_bytes()[:9000])
+    for later in sorted(folder.glob("x2-*.mcap"))[2:]:
+        later.unlink()
+    record("oscillatory", folder, frames=FRAMES, split=split, resume=True)
+    assert contents(folder) == contents(parts)
+
+
+def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
+    parts: Path, split: Split, tmp_path: Path
+) -> None:
+    words = "3s" if split == BY_TIME else "12kB"
+    program = (
+        "import sys, time; from pathlib import Path; from recorder.parts import Split;"
+        "from recorder.recording import record;"
+        "record('oscillatory', Path(sys.argv[1]), frames=700, split=Split.parse(sys.argv[2]),"
+        " progress=lambda _: time.sleep(0.03))"
+    )
+    for attempt, at in enumerate((200, 330, 460)):
+        folder = tmp_path / str(attempt)
+        process = subprocess.Popen([sys.executable, "-c", program, str(folder), words])
+        try:
+            deadline = time.monotonic() + 60
+            while len(list(folder.glob("x3-*"))) <= at // 150:
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+        finally:
+            process.kill()
+            process.wait()
+        source = RecordedSource(folder)
+        length = source.spec.length
+        assert length is not None
+        same(source.take(1, length), OscillatorySource().take(1, length))
+        source.close()
+        record("oscillatory", folder, frames=FRAMES, split=split, resume=True)
+        assert contents(folder) == contents(parts)
+
+
+def test_a_lost_part_is_not_written_over(parts: Path, split: Split, tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    record("oscillatory", folder, frames=FRAMES, split=split)
+    (folder / "x2-001.mcap").unlink()
+    before = contents(folder)
+    with pytest.raises(UsageError, match=r"x2-002\.mcap is there, x2-001\.mcap before it is not"):
+        record("oscillatory", folder, frames=FRAMES, split=split, resume=True)
+    assert contents(folder) == before
+
+
+def test_another_split_is_refused(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
+    before = contents(tmp_path / "a")
+    with pytest.raises(UsageError, match="with this --split it would have 100"):
+        record("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
+    with pytest.raises(UsageError, match="recorded with --split"):
+        record("oscillatory", tmp_path / "a", frames=500, resume=True)
+    with pytest.raises(UsageError, match="ask for more frames"):
+        record("oscillatory", tmp_path / "a", frames=100, split=BY_TIME, resume=True)
+    assert contents(tmp_path / "a") == before
+    record("oscillatory", tmp_path / "a", frames=60, force=True)
+    assert sorted(contents(tmp_path / "a")) == ["x1.mcap", "x2.mcap", "x3.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("text", "split"),
+    [
+        ("512MB", Split(size=512_000_000)),
+        ("1.5 GiB", Split(size=3 * 2**29)),
+        ("10min", Split(seconds=600)),
+        ("0.5h", Split(seconds=1800)),
+    ],
+)
+def test_limits_are_read(text: str, split: Split) -> None:
+    assert Split.parse(text) == split
+
+
+@pytest.mark.parametrize("text", ["", "512", "0MB", "-1s", "10 minutes", "nanGB", "1e9s"])
+def test_other_limits_are_refused(cdmisfa: Cdmisfa, text: str, tmp_path: Path) -> None:
+    done = cdmisfa("record", "oscillatory", "-o", tmp_path / "rec", f"--split={text}")
+    assert (done.code, "512MB or 10min" in done.err) == (2, True)
+    assert not (tmp_path / "rec").exists()
+
+
+def test_each_part_is_a_row(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ("record", "oscillatory", "-o", tmp_path / "rec", "--frames", "120")
+    views = cdmisfa(*words, "--split", "2s", "--json").json["views"]
+    assert [(v["name"], v["frames"]) for v in views[:2]] == [("x1", 100), ("x1", 20)]
+    assert views[1]["file"].endswith("x1-001.mcap")
