@@ -131,7 +131,7 @@ def _reader_of(path: Path, *, ros1: bool) -> Any:
         from rosbags.rosbag2 import Reader as Rosbag2
     except ImportError:
         raise CdmisfaError(
-            f"{path} is a ROS bag, which needs rosbags: pip install 'cdmisfa[ros]'"
+            f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
     with _explained(path):
         return Rosbag1(path) if ros1 else Rosbag2(path)

@@ -124,7 +124,7 @@ def test_without_rosbags_the_extra_is_named(
 ) -> None:
     path = ros1_bag(tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
-    with pytest.raises(CdmisfaError, match=r"cdmisfa\[ros\]"):
+    with pytest.raises(CdmisfaError, match=r"pip install rosbags \(the extra \[ros\]\)"):
         ForeignSource(path, TOPICS)
 
 
