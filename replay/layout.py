@@ -6,6 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from replay.columns import FRAME
+from replay.labels import label, part
 from replay.outline import Outline
 
 MOST_MODULES = 6
@@ -61,10 +62,12 @@ class RunLayout:
 
     Args:
         outline: the run in short.
+        all_views: what was not watched is there too.
     """
 
-    def __init__(self, outline: Outline) -> None:
+    def __init__(self, outline: Outline, *, all_views: bool = False) -> None:
         self._outline = outline
+        self._all_views = all_views
         self._spec = outline.header.spec
         self._axis = whole(outline.frames) if outline.frames else None
         self._images = len(self._spec.frame_shape) == 2
@@ -83,6 +86,7 @@ class RunLayout:
             self._gate(),
             self._decision(),
             self._modules(),
+            *([self._views()] if self._all_views else []),
             table,
             name="Run",
         )
@@ -180,6 +184,17 @@ class RunLayout:
         truth = [self._lines("What the world knows", ["/world/truth"])] if self._spec.truth else []
         learned = rrb.TextLogView(origin="/events", name="Events")
         return rrb.Vertical(*rows, *truth, learned, name="Modules")
+
+    def _views(self) -> rrb.Container:
+        names = self._spec.streams
+        places = [(label(name), f"/views/{part(names, s)}") for s, name in enumerate(names)]
+        if self._images:
+            pictures = [rrb.Spatial2DView(origin=place, name=name) for name, place in places]
+            watched = self._lanes("What it watches", "/lanes/1_stream")
+            grid = rrb.Grid(*pictures, grid_columns=min(len(pictures), 3))
+            return rrb.Vertical(grid, watched, row_shares=[3, 1], name="All views")
+        curves = [self._lines(name, [place]) for name, place in places]
+        return rrb.Vertical(*curves, name="All views")
 
     def _watched(self, name: str) -> rrb.View:
         if self._images:

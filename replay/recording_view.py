@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from cdmisfa.errors import UsageError
 from replay.columns import Clock, Column, ImageColumn
 from replay.config import ViewConfig
 from replay.labels import label, part
 from replay.layout import blueprint, lines, whole
+from replay.outline import Outline
 from replay.recorded import RecordedSource
 
 BLOCK = 500
@@ -34,24 +37,7 @@ def write_recording(recording: rr.RecordingStream, path: Path, config: ViewConfi
     source = RecordedSource(path)
     try:
         first, count, spec = source.t, source.frames, source.spec
-        views = [f"views/{part(spec.streams, s)}" for s in range(len(spec.streams))]
-        clock, images = Clock(spec), len(spec.frame_shape) == 2
-        columns = [_column(recording, clock, view, spec.frame_shape, config) for view in views]
-        truth = Column(recording, clock, "world/truth", config.rows)
-        recording.log(
-            "world/truth", rr.SeriesLines(names=[label(name) for name in spec.truth]), static=True
-        )
-        for t in range(first, first + count, BLOCK):
-            frames = np.arange(t, min(t + BLOCK, first + count))
-            keep = frames % config.every == 0 if images else np.ones(len(frames), dtype=bool)
-            for stream, column in enumerate(columns):
-                source.seek(t)
-                block = source.take(stream, len(frames))
-                column.add(frames[keep], None, block.frames[keep])
-            if spec.truth:
-                truth.add(frames, None, block.truth)
-        for column in [*columns, truth]:
-            column.flush()
+        views = write_views(recording, source, count, config)
         for warning in source.warnings:
             recording.set_time("frame", sequence=first)
             recording.log("events", rr.TextLog(label(warning), level="WARN"))
@@ -63,7 +49,78 @@ def write_recording(recording: rr.RecordingStream, path: Path, config: ViewConfi
         "fps": spec.fps,
     }
     recording.send_property("recording", rr.AnyValues(**properties))
+    images = len(spec.frame_shape) == 2
     recording.send_blueprint(_layout(spec.streams, views, bool(spec.truth), images, first + count))
+
+
+def write_views(
+    recording: rr.RecordingStream,
+    source: RecordedSource,
+    count: int,
+    config: ViewConfig,
+    tau: int | None = None,
+) -> list[str]:
+    """Write every view of a recording, and what the world knows, from the source's t on.
+
+    Args:
+        recording: where they go.
+        source: the recording.
+        count: how many frames.
+        config: every how many frames images are shown.
+        tau: frames of an iteration, for the views of a run, whose truth is there already.
+
+    Returns:
+        The entity of each view.
+    """
+    first, spec = source.t, source.spec
+    views = [f"views/{part(spec.streams, s)}" for s in range(len(spec.streams))]
+    clock, images = Clock(spec), len(spec.frame_shape) == 2
+    columns = [_column(recording, clock, view, spec.frame_shape, config) for view in views]
+    truth = Column(recording, clock, "world/truth", config.rows)
+    if spec.truth and tau is None:
+        names = [label(name) for name in spec.truth]
+        recording.log("world/truth", rr.SeriesLines(names=names), static=True)
+    for t in range(first, first + count, BLOCK):
+        frames = np.arange(t, min(t + BLOCK, first + count))
+        keep = frames % config.every == 0 if images else np.ones(len(frames), dtype=bool)
+        for stream, column in enumerate(columns):
+            source.seek(t)
+            block = source.take(stream, len(frames))
+            column.add(
+                frames[keep], None if tau is None else frames[keep] // tau, block.frames[keep]
+            )
+        if spec.truth and tau is None:
+            truth.add(frames, None, block.truth)
+    for column in [*columns, truth]:
+        column.flush()
+    return views
+
+
+def write_unwatched(
+    recording: rr.RecordingStream, path: Path, outline: Outline, config: ViewConfig
+) -> None:
+    """Write all views of the recording that a run learned from, also while not watched.
+
+    Raises:
+        UsageError: the run learned from another recording, or from a live scene.
+        LogDamagedError: it cannot be read.
+    """
+    learned_from = outline.header.manifest.get("source")
+    source = RecordedSource(path, loop=True)
+    try:
+        if _hashes(source.describe()) != _hashes(learned_from) or not _hashes(learned_from):
+            raise UsageError(
+                f"{path} is not the recording that this run learned from: the SHA-256 of its "
+                "files are others"
+            )
+        write_views(recording, source, outline.frames, config, max(outline.tau, 1))
+    finally:
+        source.close()
+
+
+def _hashes(described: Any) -> list[str]:
+    views = described.get("views", ()) if isinstance(described, Mapping) else ()
+    return [str(view["sha256"]) for view in views if "sha256" in view]
 
 
 def _column(

@@ -22,7 +22,7 @@ from replay.labels import label
 from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
 from replay.outline import Outline, read_outline
-from replay.recording_view import write_recording
+from replay.recording_view import write_recording, write_unwatched
 from replay.run_view import RunView
 from replay.runlog import is_run, run_log
 from replay.summary import summary_text
@@ -40,6 +40,7 @@ def build_view(
     every: int = 10,
     force: bool = True,
     config: ViewConfig | None = None,
+    all_views: Path | None = None,
 ) -> None:
     """Write the view of a run or a recording as an .rrd file, whole or not at all.
 
@@ -49,9 +50,11 @@ def build_view(
         every: show every so many watched frames, of those that were kept.
         force: replace an existing file.
         config: everything else; `every` is then taken from it.
+        all_views: the recording that the run learned from, to show what was not watched too.
 
     Raises:
-        UsageError: there is no such run or recording, or `out` exists and `force` is not set.
+        UsageError: there is no such run or recording, `out` exists and `force` is not set, or
+            the run did not learn from the recording `all_views`.
         LogDamagedError: it cannot be read.
         CdmisfaError: the view cannot be written.
     """
@@ -62,7 +65,9 @@ def build_view(
     if is_run(path):
         log = run_log(path)
         with recording_to(out, _name(log), log) as recording:
-            _write_run(recording, log, config)
+            _write_run(recording, log, config, all_views)
+    elif all_views is not None:
+        raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path) as recording:
             write_recording(recording, path, config)
@@ -99,14 +104,18 @@ def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStr
         partial.unlink(missing_ok=True)
 
 
-def _write_run(recording: rr.RecordingStream, log: Path, config: ViewConfig) -> None:
+def _write_run(
+    recording: rr.RecordingStream, log: Path, config: ViewConfig, all_views: Path | None
+) -> None:
     outline, folder = read_outline(log), log.parent
     modules = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
     _properties(recording, outline, folder)
     text = label(summary_text(outline, _name(log)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     RunView(recording, log, outline, config).write(modules)
-    recording.send_blueprint(RunLayout(outline).blueprint())
+    if all_views is not None:
+        write_unwatched(recording, all_views, outline, config)
+    recording.send_blueprint(RunLayout(outline, all_views=all_views is not None).blueprint())
 
 
 def _name(log: Path) -> str:

@@ -56,18 +56,22 @@ def missing_driver() -> str:
     return ""
 
 
-def save(path: Path, out: Path, *, every: int = 10, force: bool = False) -> None:
+def save(
+    path: Path, out: Path, *, every: int = 10, all_views: Path | None = None, force: bool = False
+) -> None:
     """Write the view of a run or recording to an .rrd file; see `build_view`."""
-    build_view(path, out, every=every, force=force)
+    build_view(path, out, every=every, all_views=all_views, force=force)
 
 
-def open_window(path: Path, *, every: int = 10, memory_limit: str = "2GB") -> None:
+def open_window(
+    path: Path, *, every: int = 10, all_views: Path | None = None, memory_limit: str = "2GB"
+) -> None:
     """Show a run or recording in the viewer, until its window is closed.
 
     Raises:
         CdmisfaError: the viewer ended with an error.
     """
-    with _view_of(path, every) as view:
+    with _view_of(path, every, all_views) as view:
         port = str(free_port())
         run_program(
             [str(view), "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit]
@@ -75,7 +79,12 @@ def open_window(path: Path, *, every: int = 10, memory_limit: str = "2GB") -> No
 
 
 def serve(
-    path: Path, *, every: int = 10, memory_limit: str = "2GB", port: int | None = None
+    path: Path,
+    *,
+    every: int = 10,
+    all_views: Path | None = None,
+    memory_limit: str = "2GB",
+    port: int | None = None,
 ) -> None:
     """Serve the viewer and a run to browsers on this machine, until interrupted.
 
@@ -85,7 +94,7 @@ def serve(
         CdmisfaError: the server ended with an error.
     """
     data_port, page_port = free_port(), port or free_port()
-    with _view_of(path, every) as view:
+    with _view_of(path, every, all_views) as view:
         proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
         print(f"http://127.0.0.1:{page_port}/?url={proxy}", file=sys.stderr, flush=True)
         run_program(
@@ -106,6 +115,7 @@ def screenshot(
     *,
     at: int | None = None,
     every: int = 10,
+    all_views: Path | None = None,
     force: bool = False,
     window: str = WINDOW,
 ) -> None:
@@ -116,6 +126,7 @@ def screenshot(
         out: the PNG file.
         at: frame at which the time cursor stands; by default the last.
         every: show every so many watched frames.
+        all_views: see `build_view`.
         force: replace an existing file.
         window: size, as "1600x1000".
 
@@ -127,7 +138,7 @@ def screenshot(
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     if missing_driver():
         raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
-    with _view_of(path, every) as view:
+    with _view_of(path, every, all_views) as view:
         png = _draw(view, at, window)
     partial = partial_path(out)
     try:
@@ -240,7 +251,7 @@ def _connected(client: Any, port: int, process: subprocess.Popen[bytes], words: 
 
 
 @contextlib.contextmanager
-def _view_of(path: Path, every: int) -> Iterator[Path]:
+def _view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
     """The view of a run, built for as long as it is looked at."""
     if path.suffix == ".rrd":
         if not path.is_file():
@@ -249,7 +260,7 @@ def _view_of(path: Path, every: int) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory(prefix="cdmisfa-view-") as folder:
         view = Path(folder) / f"{path.resolve().stem}.rrd"
-        build_view(path, view, every=every)
+        build_view(path, view, every=every, all_views=all_views)
         yield view
 
 

@@ -25,6 +25,12 @@ FILE = click.Path(path_type=Path)
     show_default=True,
     help="Show every so many watched frames.",
 )
+@click.option(
+    "--all-views",
+    type=FILE,
+    metavar="RECORDING",
+    help="Also show what was not watched, from the recording that the run learned from.",
+)
 @click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
 @options.force
 def view_command(
@@ -34,6 +40,7 @@ def view_command(
     screenshot: Path | None,
     at: int | None,
     every: int,
+    all_views: Path | None,
     memory_limit: str,
     force: bool,
 ) -> None:
@@ -56,12 +63,12 @@ def view_command(
             serve_catalogue(run, progress=shown.update)
         return
     if save is not None:
-        viewer.save(run, save, every=every, force=force)
+        viewer.save(run, save, every=every, all_views=all_views, force=force)
         click.echo(f"view {save}", err=True)
     elif screenshot is not None:
-        viewer.screenshot(run, screenshot, at=at, every=every, force=force)
+        viewer.screenshot(run, screenshot, at=at, every=every, all_views=all_views, force=force)
         click.echo(f"picture {screenshot}", err=True)
     elif web:
-        viewer.serve(run, every=every, memory_limit=memory_limit)
+        viewer.serve(run, every=every, all_views=all_views, memory_limit=memory_limit)
     else:
-        viewer.open_window(run, every=every, memory_limit=memory_limit)
+        viewer.open_window(run, every=every, all_views=all_views, memory_limit=memory_limit)

@@ -1,0 +1,66 @@
+"""The view of a run shows what it did not watch, where its recording is still there."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from cdmisfa.config import LearnerConfig
+from cdmisfa.errors import UsageError
+from cdmisfa.experiments.run import learn
+from recorder.config import SceneConfig
+from recorder.recording import record
+from replay.recorded import RecordedSource
+from replay.view import build_view
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A recording, and a run that went twice around it."""
+    place = tmp_path_factory.mktemp("made")
+    record("oscillatory", place / "rec", SceneConfig(kind="oscillatory"), frames=500)
+    source = RecordedSource(place / "rec", loop=True)
+    learn(source, LearnerConfig(), place / "run", max_iterations=8, rerun=False)
+    source.close()
+    return place
+
+
+def test_every_view_is_there_at_every_frame(made, tmp_path, monkeypatch):
+    monkeypatch.setenv("RERUN_STRICT", "1")
+    build_view(made / "run", tmp_path / "v.rrd", all_views=made / "rec")
+    source = RecordedSource(made / "rec")
+    expected = source.take(1, 500).frames
+    source.close()
+    rows = {}
+    for chunk in RrdReader(str(tmp_path / "v.rrd")).stream():
+        if chunk.entity_path == "/views/2_x2" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            times = zip(
+                batch.column("frame").to_pylist(),
+                batch.column("iteration").to_pylist(),
+                batch.column("Scalars:scalars").to_pylist(),
+                strict=True,
+            )
+            rows |= {t: (k, value) for t, k, value in times}
+    assert sorted(rows) == list(range(800))
+    for t, (k, value) in rows.items():
+        assert k == t // 100
+        np.testing.assert_array_equal(value, expected[t % 500])
+
+
+def test_another_recording_is_refused(made, tmp_path):
+    record("oscillatory", tmp_path / "other", SceneConfig(kind="oscillatory"), frames=501)
+    with pytest.raises(UsageError, match="not the recording"):
+        build_view(made / "run", tmp_path / "v.rrd", all_views=tmp_path / "other")
+    assert not (tmp_path / "v.rrd").exists()
+    with pytest.raises(UsageError, match="anyway"):
+        build_view(made / "rec", tmp_path / "v.rrd", all_views=made / "rec")
+
+
+def test_a_recording_that_was_moved_is_still_the_same(made, tmp_path, cdmisfa):
+    shutil.copytree(made / "rec", tmp_path / "moved")
+    words = ("--all-views", tmp_path / "moved", "--save", tmp_path / "v.rrd")
+    assert cdmisfa("view", made / "run", *words).code == 0
