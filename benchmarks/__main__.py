@@ -13,7 +13,11 @@ from benchmarks.report import write_page
 def main() -> None:
     """Run benchmarks one after another; each writes results/NAME.json, `page` the page."""
     modules = pkgutil.iter_modules(benchmarks.__path__)
-    names = sorted(m.name for m in modules if not m.name.startswith("_") and m.name != "report")
+    names = sorted(
+        m.name
+        for m in modules
+        if not m.name.startswith("_") and m.name not in ("report", "recordings")
+    )
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
         "name", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}, or page"

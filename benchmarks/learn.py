@@ -14,7 +14,7 @@ from cdmisfa.config import LearnerConfig
 from cdmisfa.experiments.run import learn
 from replay.recorded import RecordedSource
 
-CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40)
+CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40, expansion="none")
 
 
 def learning(out: Path | None, iterations: int, *, rerun: bool) -> Callable[[], int]:

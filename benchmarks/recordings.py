@@ -12,7 +12,6 @@ from recorder.config import RecordConfig
 from recorder.viewlog import Identity, ViewLog
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
-VIEWS = ("left", "center", "right")
 
 
 def noisy_pictures(n: int) -> NDArray[np.uint8]:

@@ -1,0 +1,48 @@
+"""Every benchmark runs, at tiny sizes, and its results make a page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import kernels, learn, reader, recorder, report, scaling
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(report, "PAGE", tmp_path / "page.md")
+    return tmp_path / "results"
+
+
+def test_reader(results: Path) -> None:
+    reader.main(quick=True)
+    table = json.loads((results / "reader.json").read_text())["tables"][0]
+    assert [row[0] for row in table["rows"]] == ["sample log", "noisy pictures"]
+    assert "## Reading a recording" in report.write_page().read_text(encoding="utf-8")
+
+
+def test_learn(tmp_path: Path) -> None:
+    assert learn.learning(tmp_path / "run", 2, rerun=True)() == 2
+    assert {"run.mcap", "run.rrd"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_recorder(tmp_path: Path) -> None:
+    assert recorder.rendering("oscillatory", 4)() == 12
+    assert recorder.recording("oscillatory", 4, tmp_path, 1)() == 12
+
+
+def test_scaling() -> None:
+    assert scaling.agent_steps(300, 4)() == 4
+    cost, peak = scaling.learn_frames(200)
+    assert cost > 0
+    assert peak > 10
+
+
+def test_kernels() -> None:
+    frames = kernels.image_frames(12)
+    config = kernels.LearnerConfig(components=4, outputs=1, nu=0.01, tau=4)
+    for kernel in (kernels.gram.update, kernels.strict.update, kernels.plain_numpy):
+        assert kernels.learning(kernel, config, frames, 4)() == 4
