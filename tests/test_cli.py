@@ -102,6 +102,26 @@ class TestJson:
         assert done.json["ok"] is True
         assert done.json["problems"] == []
 
+    def test_verify_takes_one_view_for_itself(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
+    ) -> None:
+        alone = tmp_path / "x2.mcap"
+        alone.write_bytes((oscillatory_recording / "x2.mcap").read_bytes())
+        assert cdmisfa("verify", alone).code == 0
+        done = cdmisfa("verify", tmp_path)
+        assert done.code == 3
+        assert "'x1' of the recording has no file" in done.out
+
+    def test_the_end_of_a_log_is_an_error_with_a_result(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path
+    ) -> None:
+        words = ("learn", oscillatory_recording, "--set", "learner.delta=1e-12")
+        done = cdmisfa(*words, "--json")
+        assert (done.code, done.json["ended"]) == (1, "log_exhausted")
+        assert done.json["iterations"] == 20
+        assert "--loop" in done.err
+        assert "ended after 20 iterations: the recording ended" in cdmisfa(*words).out
+
     def test_signals(self, cdmisfa: Cdmisfa) -> None:
         from cdmisfa.signals import SIGNALS
 
@@ -197,7 +217,8 @@ class TestRuns:
     ) -> None:
         run = tmp_path / "run"
         done = cdmisfa("learn", oscillatory_recording, "-o", run, "--no-rerun")
-        assert_one_line(done, 1, "--loop", str(run))
+        assert "look at it" in done.out
+        assert_one_line(Outcome(done.code, "", done.err), 1, "--loop", str(run))
         assert cdmisfa("info", run, "--json").json["complete"] is True
         looped = cdmisfa("learn", oscillatory_recording, "--loop", "--max-iterations", 25, "--json")
         assert looped.json["iterations"] == 25

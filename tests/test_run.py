@@ -237,3 +237,19 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert json.loads(path.read_text()) == {"a": 1}
     with pytest.raises(CdmisfaError, match="cannot be written"):
         write_json(tmp_path / "none" / "a.json", {})
+
+
+def test_the_folder_is_held_until_the_view_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Path] = []
+
+    def build(folder: Path, view: Path) -> None:
+        with pytest.raises(UsageError, match="in use by another process"):
+            run(folder, force=True)
+        assert (folder / "run.mcap").is_file()
+        seen.append(view)
+
+    monkeypatch.setattr("replay.view.build_view", build)
+    run(tmp_path / "run", rerun=True)
+    assert seen == [tmp_path / "run" / "run.rrd"]

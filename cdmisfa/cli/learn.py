@@ -91,7 +91,7 @@ def learn_command(
         raise click.UsageError("--resume needs -o RUN, the run to go on with")
     if resume and force:
         raise click.UsageError("--force starts anew and --resume goes on: use one of them")
-    from cdmisfa.experiments.run import learn
+    from cdmisfa.experiments.run import RunExhaustedError, learn
     from cdmisfa.experiments.sources import CameraOptions, open_source
 
     if algorithm is not None:
@@ -127,12 +127,12 @@ def learn_command(
                 live=live_view,
                 announce=announce,
             )
+    except RunExhaustedError as error:
+        show(error.result, as_json=as_json)
+        raise
     finally:
         frames.close()
-    if as_json:
-        options.print_json(result.as_json())
-    else:
-        click.echo(summary(result))
+    show(result, as_json=as_json)
     if stop():
         ctx.exit(stop.exit_code)
 
@@ -166,6 +166,14 @@ class Reporter:
             self._next = now + TICK
             note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
             self._shown.update(progress.iteration, progress.max_iterations, note)
+
+
+def show(result: RunResult, *, as_json: bool) -> None:
+    """Print what a run came to."""
+    if as_json:
+        options.print_json(result.as_json())
+    else:
+        click.echo(summary(result))
 
 
 def summary(result: RunResult) -> str:

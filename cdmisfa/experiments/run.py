@@ -95,6 +95,12 @@ class RunResult:
         }
 
 
+class RunExhaustedError(LogExhaustedError):
+    """The recording of a run ended before the run did; `result` is what it came to."""
+
+    result: RunResult
+
+
 def module_table(module: Module, streams: Sequence[str]) -> dict[str, Any]:
     """What a result says about a module, as JSON values."""
     return {
@@ -148,7 +154,7 @@ def learn(
     Raises:
         UsageError: `out` exists and `force` is not set; or `resume` is, and `out` holds no
             run or one with another configuration or source.
-        LogExhaustedError: a recording ended first; what was learned is saved.
+        RunExhaustedError: a recording ended first; what was learned is saved.
     """
     learner = CuriousLearner(config, source.spec, seed)
     limit = max_modules if max_modules is not None else len(source.spec.streams)
@@ -202,25 +208,29 @@ def learn(
                 sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
         if log is not None:
             _save_checkpoint(log, learner, source)
-    result = RunResult(
-        run=str(out) if out is not None else None,
-        source=source.describe(),
-        streams=source.spec.streams,
-        seed=seed,
-        iterations=learner.iteration,
-        frames=learner.iteration * learner.tau,
-        signals_sha256=digest.hexdigest(),
-        modules=tuple(learner.modules),
-        final_policy=tuple(learner.policy.tolist()),
-        epsilon=learner.epsilon,
-        ended=ended,
-        truth=source.spec.truth,
-    )
-    if out is not None:
-        _write_run(out, result, tables, rerun)
+            log.finish()
+        result = RunResult(
+            run=str(out) if out is not None else None,
+            source=source.describe(),
+            streams=source.spec.streams,
+            seed=seed,
+            iterations=learner.iteration,
+            frames=learner.iteration * learner.tau,
+            signals_sha256=digest.hexdigest(),
+            modules=tuple(learner.modules),
+            final_policy=tuple(learner.policy.tolist()),
+            epsilon=learner.epsilon,
+            ended=ended,
+            truth=source.spec.truth,
+        )
+        if out is not None:
+            _write_run(out, result, tables, rerun)
     if exhausted is not None:
         kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {out}"
-        raise LogExhaustedError(f"{exhausted}{kept if out is not None else ''}") from exhausted
+        message = f"{exhausted}{kept if out is not None else ''}"
+        over = RunExhaustedError(message)
+        over.result = result
+        raise over from exhausted
     return result
 
 
@@ -253,7 +263,10 @@ def _run_log(
     force: bool,
     resume: bool,
 ) -> Iterator[Any]:
-    """The run's log, finished on success, a readable prefix on failure; None for no folder."""
+    """The run's log, to be finished inside, and its folder held; None for no folder.
+
+    On failure a log that is not finished is left as a readable prefix.
+    """
     if out is None:
         if resume:
             raise UsageError("which run to go on with? name its folder")
@@ -286,7 +299,6 @@ def _run_log(
         except BaseException:
             log.abandon()
             raise
-        log.finish()
 
 
 @contextlib.contextmanager
