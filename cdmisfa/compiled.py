@@ -16,7 +16,22 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def compiled(function: Function) -> Function:
     """Compile strictly (no reordering of floating point) and keep the result on disk."""
-    return cast(Function, kept_while_sources_last(numba.njit(cache=True)(function)))
+    return _compile(function)
+
+
+def reordered(function: Function) -> Function:
+    """Compile with sums in whichever order is fastest on this processor, and keep the result.
+
+    One machine gives the same bits every time; other processors may differ in the last ones.
+    """
+    return _compile(function, fastmath={"reassoc", "contract"})
+
+
+def _compile(function: Function, **options: Any) -> Function:
+    try:
+        return cast(Function, kept_while_sources_last(numba.njit(cache=True, **options)(function)))
+    except RuntimeError:  # numba found no folder that it may write to
+        return cast(Function, numba.njit(**options)(function))
 
 
 def kept_while_sources_last(dispatcher: Any) -> Any:
@@ -38,7 +53,7 @@ def _sources() -> str:
     digest = hashlib.sha256()
     for path in sorted([*root.glob("*.py"), *root.glob("incsfa/*.py")]):
         source = path.read_bytes()
-        if b"@compiled" in source or b"njit(" in source:
+        if b"@compiled" in source or b"@reordered" in source:
             digest.update(source)
     return digest.hexdigest()
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorder.config import EyesConfig
+from recorder.messages import HeadPose
 from recorder.world import World
 
 LUMA = (299, 587, 114)
@@ -22,19 +22,6 @@ LUMA = (299, 587, 114)
 
 Matrix = tuple[float, ...]
 Vector = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class HeadPose:
-    """Where the head is in the robot's root frame.
-
-    Attributes:
-        position: (x, y, z) of the neck yaw joint, metres.
-        quaternion: (x, y, z, w) of its turn about the vertical.
-    """
-
-    position: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
 
 
 def head_pose(neck: Vector, yaw: float) -> HeadPose:

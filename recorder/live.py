@@ -10,7 +10,8 @@ import numpy as np
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
 from cdmisfa.config import as_table
 from recorder.config import RecordConfig, SceneConfig
-from recorder.eyes import Eyes, HeadPose
+from recorder.eyes import Eyes
+from recorder.messages import HeadPose
 from recorder.motions import Motions
 from recorder.world import World
 

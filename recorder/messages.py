@@ -173,6 +173,19 @@ class TruthEncoder:
         return bytes(self._message.SerializeToString())
 
 
+@dataclass(frozen=True, slots=True)
+class HeadPose:
+    """Where the head is in the robot's root frame.
+
+    Attributes:
+        position: (x, y, z) of the neck yaw joint, metres.
+        quaternion: (x, y, z, w) of its turn about the vertical.
+    """
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
 class PoseEncoder:
     """A pose in a frame as `foxglove.PoseInFrame`."""
 

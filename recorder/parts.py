@@ -11,8 +11,8 @@ from typing import Final
 from cdmisfa.blocks import Block
 from cdmisfa.errors import UsageError
 from recorder.config import RecordConfig
-from recorder.eyes import HeadPose
 from recorder.logfile import LogWriteError
+from recorder.messages import HeadPose
 from recorder.viewlog import (
     Identity,
     ViewLog,

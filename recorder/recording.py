@@ -17,8 +17,8 @@ from cdmisfa.blocks import FrameSource, SourceSpec
 from cdmisfa.config import as_table
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.eyes import HeadPose
 from recorder.logfile import LogWriteError
+from recorder.messages import HeadPose
 from recorder.parts import Split, ViewParts, view_logs
 from recorder.rendering import render_here, render_in_processes, requests
 from recorder.scenes import open_scene

@@ -19,13 +19,13 @@ from mcap.records import Channel, Message
 from cdmisfa.blocks import Block, SourceSpec
 from cdmisfa.errors import UsageError
 from recorder.config import RecordConfig
-from recorder.eyes import HeadPose
 from recorder.logfile import LogFile, partial_path
 from recorder.messages import (
     METADATA,
     POSE_TOPIC,
     SCHEMA_VERSION,
     TRUTH_TOPIC,
+    HeadPose,
     ImageEncoder,
     PoseEncoder,
     TruthEncoder,

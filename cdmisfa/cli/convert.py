@@ -40,9 +40,9 @@ def convert_command(
 
     SOURCE is MCAP files, ROS bags, or a folder of pictures for each stream.
     """
+    from cdmisfa.experiments.convert import convert
     from cdmisfa.experiments.sources import CameraOptions, open_cameras
     from recorder.recording import refuse_existing
-    from replay.convert import convert
 
     for path in source:
         if not path.exists():

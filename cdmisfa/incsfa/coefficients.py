@@ -8,14 +8,12 @@ in O(K^2) a frame.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from cdmisfa.compiled import reordered
 from cdmisfa.incsfa.state import Float, rank_floor, whitening_scale
 
-_reordered = njit(cache=True, fastmath={"reassoc", "contract"})
 
-
-@_reordered
+@reordered
 def ccipca_coefficients(
     gram: Float,
     d: Float,
@@ -59,7 +57,7 @@ def ccipca_coefficients(
         d[i] = np.sqrt(gram[i, i])
 
 
-@_reordered
+@reordered
 def _finish_gram(gram: Float, keep: Float, gain: Float, take: Float, p: Float) -> None:
     """Turn v_i'.v_j (i < j, upper triangle) into v_i'.v_j' and mirror it; p is scratch."""
     K = keep.shape[0]
@@ -77,7 +75,7 @@ def _finish_gram(gram: Float, keep: Float, gain: Float, take: Float, p: Float) -
             gram[j, i] = gram[i, j]
 
 
-@_reordered
+@reordered
 def follow(f: Float, rho: Float, first: int, keep: Float, gain: Float, take: Float) -> None:
     """Bring inner products with the vectors over one CCIPCA step.
 
@@ -98,7 +96,7 @@ def follow(f: Float, rho: Float, first: int, keep: Float, gain: Float, take: Flo
             f[j, s] = x
 
 
-@_reordered
+@reordered
 def features_in_vectors(w: Float, d: Float, scale: Float, m: Float) -> None:
     """Express phi on the vectors: m = w diag(scale).
 
@@ -115,7 +113,7 @@ def features_in_vectors(w: Float, d: Float, scale: Float, m: Float) -> None:
             m[j, k] = w[j, k] * scale[k]
 
 
-@_reordered
+@reordered
 def change_of_features(
     m: Float,
     m_before: Float,

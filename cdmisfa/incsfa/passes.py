@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit
 from numpy.typing import NDArray
 
+from cdmisfa.compiled import reordered
 from cdmisfa.incsfa.state import PIXEL, Float, mean_rate
 
 GROUP = 4
@@ -19,10 +19,7 @@ GROUP = 4
 TILE = 256
 """Columns of a tile: the residuals of a group and the next group are 16 KB, half of L1."""
 
-_reordered = njit(cache=True, fastmath={"reassoc", "contract"})
-
-
-@_reordered
+@reordered
 def centre_tile(
     frames: NDArray[Any],
     first: int,
@@ -61,7 +58,7 @@ def centre_tile(
             us[i] = x - offset * m[i]
 
 
-@_reordered
+@reordered
 def gram_tile(u: Float, start: int, g: Float) -> None:
     """Add a tile's share of the inner products of vectors with each other.
 
@@ -81,7 +78,7 @@ def gram_tile(u: Float, start: int, g: Float) -> None:
             g[t, s] = g[s, t]
 
 
-@_reordered
+@reordered
 def apply_tile(v: Float, start: int, r: Float, shrink: Float, gain: Float, take: Float) -> None:
     """Apply a group's steps to all vectors in a tile of columns.
 
@@ -139,7 +136,7 @@ def apply_tile(v: Float, start: int, r: Float, shrink: Float, gain: Float, take:
             va[i] = x * pa
 
 
-@_reordered
+@reordered
 def measure_tile(v: Float, start: int, u: Float, e: Float) -> None:
     """Add a tile's share of the inner products of all vectors with a group's frames.
 
@@ -181,7 +178,7 @@ def measure_tile(v: Float, start: int, u: Float, e: Float) -> None:
             e[b, 3] += eb3
 
 
-@_reordered
+@reordered
 def apply_group(
     v: Float,
     mean: Float,

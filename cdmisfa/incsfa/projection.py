@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from cdmisfa.compiled import reordered
 from cdmisfa.incsfa.state import PIXEL, Float
 
 CHUNK = 512
 """Columns scaled at a time: 4 KB, so that they stay next to the arithmetic."""
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@reordered
 def project(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
     """Output y = phi x - offset of every row of phi on every frame, without a float copy.
 
