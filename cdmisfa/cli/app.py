@@ -28,7 +28,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "verify": ("logs", "Check that a log is whole: structure, checksums, no gaps."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
     "convert": ("convert", "Write camera logs of others as a recording."),
-    "compare": ("runs", "Check that runs' signals are the same, bit for bit, and show their curves."),
+    "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),
     "plot": ("runs", "Draw the figures of a run."),
     "export": ("runs", "Write a run's signals as a table or arrays, a recording as images."),
     "sweep": ("sweep", "Learn from a source many times, over a grid of settings and seeds."),

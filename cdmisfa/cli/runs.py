@@ -24,7 +24,7 @@ from cdmisfa.errors import NotReproducedError
 def compare_command(
     ctx: click.Context, runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool
 ) -> None:
-    """Check that runs' signals are the same, bit for bit, and show their curves.
+    """Check that runs' signals are the same bits, and show their curves.
 
     Of two runs it says where they first differ, and exits with 4 if they do. Of more it
     prints a table, each run compared with the first, and exits with 0.
