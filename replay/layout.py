@@ -63,11 +63,13 @@ class RunLayout:
     Args:
         outline: the run in short.
         all_views: what was not watched is there too.
+        head: where the head was turned is there too.
     """
 
-    def __init__(self, outline: Outline, *, all_views: bool = False) -> None:
+    def __init__(self, outline: Outline, *, all_views: bool = False, head: bool = False) -> None:
         self._outline = outline
         self._all_views = all_views
+        self._head = head
         self._spec = outline.header.spec
         self._axis = whole(outline.frames) if outline.frames else None
         self._images = len(self._spec.frame_shape) == 2
@@ -192,7 +194,9 @@ class RunLayout:
             pictures = [rrb.Spatial2DView(origin=place, name=name) for name, place in places]
             watched = self._lanes("What it watches", "/lanes/1_stream")
             grid = rrb.Grid(*pictures, grid_columns=min(len(pictures), 3))
-            return rrb.Vertical(grid, watched, row_shares=[3, 1], name="All views")
+            head = [self._lines("Where the head is turned", ["/head/yaw"])] if self._head else []
+            shares = [3, 1, *(1 for _ in head)]
+            return rrb.Vertical(grid, watched, *head, row_shares=shares, name="All views")
         curves = [self._lines(name, [place]) for name, place in places]
         return rrb.Vertical(*curves, name="All views")
 

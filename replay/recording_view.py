@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,20 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from foxglove_schemas_protobuf import PoseInFrame_pb2
+from google.protobuf import message
 
-from cdmisfa.errors import UsageError
+from cdmisfa.errors import LogDamagedError, UsageError
+from recorder.messages import METADATA, POSE_TOPIC
 from replay.columns import Clock, Column, ImageColumn
 from replay.config import ViewConfig
+from replay.files import log_files
 from replay.labels import label, part
 from replay.layout import blueprint, lines, whole
 from replay.outline import Outline
+from replay.reader import LogReader
 from replay.recorded import RecordedSource
+from replay.runlog import read_signals
 
 BLOCK = 500
 """Frames that are read at once."""
@@ -97,9 +104,14 @@ def write_views(
 
 
 def write_unwatched(
-    recording: rr.RecordingStream, path: Path, outline: Outline, config: ViewConfig
-) -> None:
+    recording: rr.RecordingStream, log: Path, path: Path, outline: Outline, config: ViewConfig
+) -> bool:
     """Write all views of the recording that a run learned from, also while not watched.
+
+    Where the recording has head poses, `/head/yaw` says where the head was turned.
+
+    Returns:
+        Whether there is a head.
 
     Raises:
         UsageError: the run learned from another recording, or from a live scene.
@@ -116,6 +128,43 @@ def write_unwatched(
         write_views(recording, source, outline.frames, config, max(outline.tau, 1))
     finally:
         source.close()
+    yaws = head_yaws(path)
+    names = outline.names()
+    if set(yaws) < set(names):
+        return False
+    name = rr.SeriesLines(names=["head turned to the left [degrees]"])
+    recording.log("head/yaw", name, static=True)
+    column = Column(recording, Clock(outline.header.spec), "head/yaw", config.rows)
+    for signals in read_signals(log):
+        yaw = np.array([[yaws[names[signals.stream]]]])
+        column.add(np.array([signals.t]), signals.iteration, yaw)
+    column.flush()
+    return True
+
+
+def head_yaws(path: Path) -> dict[str, float]:
+    """How far the head is turned in each view of a recording, degrees to the left.
+
+    Returns:
+        By the view's name; without the views that do not say it.
+
+    Raises:
+        UsageError: there is no such recording.
+        LogDamagedError: it cannot be read.
+    """
+    found: dict[str, float] = {}
+    for file in log_files(path):
+        with LogReader(file) as reader:
+            facts = next((r.values for r in reader.metadata if r.name == METADATA), {})
+            entry = next(reader.messages({POSE_TOPIC}), None)
+        if entry is None or "view" not in facts:
+            continue
+        try:
+            turn = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose.orientation
+        except message.DecodeError as error:
+            raise LogDamagedError(f"{file} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
+        found[facts["view"]] = math.degrees(2 * math.atan2(turn.z, turn.w))
+    return found
 
 
 def _hashes(described: Any) -> list[str]:

@@ -113,9 +113,9 @@ def _write_run(
     text = label(summary_text(outline, _name(log)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     RunView(recording, log, outline, config).write(modules)
-    if all_views is not None:
-        write_unwatched(recording, all_views, outline, config)
-    recording.send_blueprint(RunLayout(outline, all_views=all_views is not None).blueprint())
+    head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)
+    layout = RunLayout(outline, all_views=all_views is not None, head=head)
+    recording.send_blueprint(layout.blueprint())
 
 
 def _name(log: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from cdmisfa.experiments.run import learn
 from recorder.config import SceneConfig
 from recorder.recording import record
 from replay.recorded import RecordedSource
+from replay.recording_view import head_yaws
+from replay.runlog import read_signals
 from replay.view import build_view
 
 
@@ -64,3 +67,24 @@ def test_a_recording_that_was_moved_is_still_the_same(made, tmp_path, cdmisfa):
     shutil.copytree(made / "rec", tmp_path / "moved")
     words = ("--all-views", tmp_path / "moved", "--save", tmp_path / "v.rrd")
     assert cdmisfa("view", made / "run", *words).code == 0
+
+
+def test_the_head_turns_to_what_is_watched(tmp_path):
+    """In the sample recording the head looks at the left, the centre and the right in turn."""
+    sample = Path(__file__).parents[1] / "sample_logs" / "icub"
+    yaws = head_yaws(sample)
+    assert yaws["left"] > yaws["center"] > yaws["right"]
+    source = RecordedSource(sample)
+    config = LearnerConfig(expansion="none", components=5)
+    learn(source, config, tmp_path / "run", max_iterations=6, rerun=False)
+    source.close()
+    build_view(tmp_path / "run", tmp_path / "v.rrd", all_views=sample)
+    shown = {}
+    for chunk in RrdReader(str(tmp_path / "v.rrd")).stream():
+        if chunk.entity_path == "/head/yaw" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            values = batch.column("Scalars:scalars").flatten().to_pylist()
+            shown |= dict(zip(batch.column("iteration").to_pylist(), values, strict=True))
+    names = ("left", "center", "right")
+    expected = {s.iteration: yaws[names[s.stream]] for s in read_signals(tmp_path / "run")}
+    assert shown == expected
