@@ -17,10 +17,10 @@ from pathlib import Path
 from rerun.chunk import RrdReader
 
 from cdmisfa.errors import CdmisfaError, UsageError
-from replay.live import has_display, open_live
+from replay.live import open_live
 from replay.runlog import is_run, run_log
 from replay.view import build_view
-from replay.viewer import free_port, run_program
+from replay.viewer import free_port, has_display, run_program
 
 VIEW_FILE = "run.rrd"
 """Name of the view in a run's folder."""
@@ -101,7 +101,7 @@ def serve_catalogue(
         if has_display():
             open_live(address)
         arguments = ["server", "--host", "127.0.0.1", "--port", str(port)]
-        run_program([*arguments, "--dataset", f"{folder.resolve().name}={place}"], quiet=True)
+        run_program([*arguments, "--dataset", f"{folder.resolve().name}={place}"])
 
 
 def _identity(view: Path) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -138,13 +137,6 @@ class LiveView:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-
-def has_display() -> bool:
-    """Whether a window can be opened."""
-    return not sys.platform.startswith("linux") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
 
 
 def open_live(address: str, memory_limit: str = "2GB") -> None:

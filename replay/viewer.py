@@ -6,8 +6,10 @@ The viewer is a program of its own. It is started with its telemetry switched of
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import glob
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -23,6 +25,8 @@ import rerun_cli
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import partial_path
 from replay.columns import FRAME
+from replay.recorded import RecordedSource
+from replay.runlog import is_run, read_signals
 from replay.view import build_view
 
 DRIVERS = "/usr/share/vulkan/icd.d/*.json"
@@ -34,6 +38,9 @@ INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
 WINDOW = "1600x1000"
 SETTLE = 6.0
 """Seconds after which the viewer has painted everything and taken its notices away."""
+
+LIMIT = re.compile(r"\d+(%|B|[kMGT]B|[KMGT]iB)")
+"""What Rerun takes for a limit of memory; another makes it panic."""
 
 SECONDS = 120.0
 """Longest time for a picture."""
@@ -47,6 +54,24 @@ def program() -> Path:
 def environment() -> dict[str, str]:
     """Environment for the viewer: CI=1 switches its telemetry off."""
     return {**os.environ, "CI": "1"}
+
+
+def check_limit(limit: str) -> str:
+    """A limit of memory that the viewer takes.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not LIMIT.fullmatch(limit):
+        raise UsageError(f"--memory-limit {limit} is no amount of memory: say 4GB or 75%")
+    return limit
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return not sys.platform.startswith("linux") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
 
 
 def missing_driver() -> str:
@@ -69,8 +94,15 @@ def open_window(
     """Show a run or recording in the viewer, until its window is closed.
 
     Raises:
-        CdmisfaError: the viewer ended with an error.
+        UsageError: no such limit of memory.
+        CdmisfaError: there is no display, or the viewer ended with an error.
     """
+    check_limit(memory_limit)
+    if not has_display():
+        raise CdmisfaError(
+            "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
+            "--screenshot"
+        )
     with _view_of(path, every, all_views) as view:
         port = str(free_port())
         run_program(
@@ -91,8 +123,10 @@ def serve(
     Prints the address on stderr.
 
     Raises:
+        UsageError: no such limit of memory.
         CdmisfaError: the server ended with an error.
     """
+    check_limit(memory_limit)
     data_port, page_port = free_port(), port or free_port()
     with _view_of(path, every, all_views) as view:
         proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
@@ -131,11 +165,13 @@ def screenshot(
         window: size, as "1600x1000".
 
     Raises:
-        UsageError: `out` exists and `force` is not set.
+        UsageError: `out` exists and `force` is not set, or there is no frame `at`.
         CdmisfaError: no driver, or the viewer failed.
     """
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    if at is not None and path.suffix != ".rrd" and at > (last := _last_frame(path)):
+        raise UsageError(f"--at {at}: there is no such frame, the last of {path} is {last}")
     if missing_driver():
         raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
     with _view_of(path, every, all_views) as view:
@@ -146,6 +182,13 @@ def screenshot(
         os.replace(partial, out)
     except OSError as error:
         raise CdmisfaError(f"{out} cannot be written: {error.strerror or error}") from error
+
+
+def _last_frame(path: Path) -> int:
+    if is_run(path):
+        return max((int(s.t) + len(s.y) - 1 for s in read_signals(path)), default=0)
+    with contextlib.closing(RecordedSource(path, salvage=True)) as source:
+        return max(ranges[-1][1] for ranges in source.coverage().values()) - 1
 
 
 def _draw(view: Path, at: int | None, window: str) -> bytes:
@@ -210,8 +253,9 @@ class HeadlessViewer:
 def last_words(words: BinaryIO) -> str:
     """What a viewer said about its end, in one line."""
     words.seek(0)
-    lines = words.read().decode("utf-8", "replace").splitlines()
-    return next((line for line in lines if "panicked" in line), "it does not say why")
+    lines = [line for line in words.read().decode("utf-8", "replace").splitlines() if line.strip()]
+    last = lines[-1].strip() if lines else "it does not say why"
+    return next((line for line in lines if "panicked" in line), last)
 
 
 @contextlib.contextmanager
@@ -228,7 +272,13 @@ def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
     command += ["--port", str(port), "--bind", "127.0.0.1", "--window-size", window]
     with tempfile.TemporaryFile() as words:
         # Output goes to a file: the viewer hangs when nobody empties a pipe.
-        process = subprocess.Popen(command, env=environment(), stdout=words, stderr=words)
+        process = subprocess.Popen(
+            command,
+            env=environment(),
+            stdout=words,
+            stderr=words,
+            preexec_fn=_ends_with_parent(),
+        )
         try:
             client = _connected(ViewerClient, port, process, words)
             yield HeadlessViewer(client, process, words)
@@ -264,27 +314,38 @@ def _view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
         yield view
 
 
-def run_program(arguments: Sequence[str], *, quiet: bool = False) -> None:
+def run_program(arguments: Sequence[str]) -> None:
     """Run the viewer, or its server, until it ends; an interrupt ends it and is passed on.
 
-    Args:
-        arguments: of the program.
-        quiet: let it say warnings only.
-
     Raises:
-        CdmisfaError: it ended with an error.
+        CdmisfaError: it ended with an error, whose last words are given.
     """
-    words = {**environment(), "RUST_LOG": "warn"} if quiet else environment()
-    process = subprocess.Popen([str(program()), *arguments], env=words)
-    try:
-        code = process.wait()
-    except BaseException:
-        _end(process)
-        raise
-    if code:
-        raise CdmisfaError(
-            f"the viewer ended with code {code}: without a display use --web or --screenshot"
+    command = [str(program()), *arguments]
+    variables = {**environment(), "RUST_LOG": "warn"}
+    with tempfile.TemporaryFile() as words:
+        process = subprocess.Popen(
+            command, env=variables, stdout=words, stderr=words, preexec_fn=_ends_with_parent()
         )
+        try:
+            code = process.wait()
+        except BaseException:
+            _end(process)
+            raise
+        if code:
+            raise CdmisfaError(f"the viewer ended with code {code}: {last_words(words)}")
+
+
+def _ends_with_parent() -> Callable[[], None] | None:
+    """What a child does first so that it ends with us, even when we are killed; Linux only."""
+    if not sys.platform.startswith("linux"):
+        return None
+    # The library is opened here: between fork and exec as little as possible may happen.
+    prctl, set_death_signal = ctypes.CDLL(None).prctl, 1
+
+    def ask() -> None:
+        prctl(set_death_signal, signal.SIGTERM)
+
+    return ask
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import subprocess
+import sys
+import time
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +28,7 @@ from replay import layout, viewer
 from replay.columns import tensor_array
 from replay.config import ViewConfig
 from replay.modules import save_modules
+from replay.runlog import read_signals
 from replay.view import build_view
 
 ITERATIONS = 24
@@ -323,3 +328,53 @@ def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):
 def test_telemetry_is_off():
     assert viewer.environment()["CI"] == "1"
     assert viewer.program().is_file()
+
+
+def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(CdmisfaError, match=r"no display .* --web"):
+        viewer.open_window(tmp_path)
+    for limit in ("banana", "4", "GB", "-1GB"):
+        with pytest.raises(UsageError, match="4GB or 75%"):
+            viewer.open_window(tmp_path, memory_limit=limit)
+    assert [viewer.check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
+    last = max(s.t + len(s.y) - 1 for s in read_signals(tmp_path))
+    with pytest.raises(UsageError, match=f"the last of .* is {last}$"):
+        viewer.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a child")
+def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
+    told = tmp_path / "pid"
+    program = tmp_path / "program"
+    program.write_text(f"#!/bin/sh\necho $$ > {told}.part\nmv {told}.part {told}\nexec sleep 60\n")
+    program.chmod(0o755)
+    code = (
+        "import sys, pathlib, replay.viewer as v\n"
+        f"v.program = lambda: pathlib.Path({str(program)!r})\n"
+        "v.run_program([])\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code]) as parent:
+        while not told.exists():
+            assert parent.poll() is None
+            time.sleep(0.02)
+        parent.kill()
+    child = Path("/proc") / told.read_text().strip() / "cmdline"
+    for _ in range(100):
+        if not child.exists() or not child.read_bytes():
+            return
+        time.sleep(0.05)
+    pytest.fail("it runs on")
+
+
+def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(viewer, "program", lambda: program)
+    with pytest.raises(CdmisfaError, match="code 3: no luck"):
+        viewer.run_program([])
+    assert capfd.readouterr().err == ""

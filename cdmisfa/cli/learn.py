@@ -139,7 +139,8 @@ def learn_command(
 
 def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.live import has_display, open_live
+    from replay.live import open_live
+    from replay.viewer import has_display
 
     click.echo(f"live view {address}    look at it: rerun --connect {address}", err=True)
     if has_display():

@@ -56,6 +56,8 @@ def view_command(
     import replay.viewer as viewer
     from replay.catalogue import runs_in, serve_catalogue
 
+    viewer.check_limit(memory_limit)
+
     if runs_in(run):
         if save is not None or web or screenshot is not None:
             raise click.UsageError(f"{run} holds many runs, which are only served: name one run")
