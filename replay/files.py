@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import PARTIAL
+from replay.records import MAGIC
 
 
 def log_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
@@ -36,6 +37,19 @@ def log_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
     if not files:
         raise UsageError("no log was named")
     return files
+
+
+def starts_as_log(path: Path) -> bool:
+    """Whether a file begins as every MCAP file does.
+
+    Raises:
+        CdmisfaError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError as error:
+        raise CdmisfaError(f"{path}: {error.strerror}") from None
 
 
 def sha256(path: Path) -> str:

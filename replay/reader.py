@@ -368,8 +368,8 @@ class LogReader:
     def _refuse(self, where: str, what: str) -> None:
         if not self.salvage:
             raise LogDamagedError(
-                f"{self.path}: {where}: {what}; go on without it with --salvage, or save the rest "
-                "with cdmisfa recover"
+                f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
+                "recording, cdmisfa learn --salvage learns without it)"
             )
         problem = Problem(where, what)
         if problem not in self.problems:

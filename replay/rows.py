@@ -160,8 +160,8 @@ class ChannelRows:
             raise LogDamagedError(
                 f"{self._reader.path}: {self.channel.topic}: after frame "
                 f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
-                f"{frames[at]}: frames are missing or doubled; run cdmisfa verify, or leave "
-                "out what is missing with --salvage"
+                f"{frames[at]}: frames are missing or doubled; run cdmisfa verify; "
+                "cdmisfa learn --salvage leaves out what is missing"
             )
         edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
         for low, high in itertools.pairwise(edges):

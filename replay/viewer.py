@@ -98,7 +98,7 @@ def open_window(
         CdmisfaError: there is no display, or the viewer ended with an error.
     """
     check_limit(memory_limit)
-    if not has_display():
+    if path.exists() and not has_display():  # a wrong path is said first, below
         raise CdmisfaError(
             "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
             "--screenshot"

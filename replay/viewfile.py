@@ -72,7 +72,7 @@ class ViewFile:
         if len(records) != 1:
             raise NoRecordingError(
                 f"{self.path}: no recording of cdmisfa ({len(records)} {METADATA} records); "
-                "for logs of others name their --topic"
+                "cdmisfa learn and convert take logs of others, by their --topic"
             )
         self.facts = view_facts(self.path, records[0].values)
         image = self.facts.dtype == "uint8"

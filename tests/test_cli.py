@@ -284,6 +284,26 @@ class TestErrors:
         assert "Traceback" not in done.err
         assert not (tmp_path / "out.mcap").exists()
 
+    def test_what_is_no_recording_is_refused_as_a_wrong_word(
+        self, cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
+    ) -> None:
+        (tmp_path / "README.md").write_text("# Read me")
+        assert_one_line(cdmisfa("learn", tmp_path / "README.md"), 2, "README.md", "no MCAP file")
+        for run in (oscillatory_run, oscillatory_run / "run.mcap"):
+            assert_one_line(cdmisfa("learn", run), 2, "is a run", f"cdmisfa view {run}")
+
+    @pytest.mark.parametrize("command", ["learn", "view", "export"])
+    def test_damage_is_met_with_what_every_command_has(
+        self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path, command: str
+    ) -> None:
+        data = bytearray((oscillatory_recording / "x1.mcap").read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        (tmp_path / "x1.mcap").write_bytes(data)
+        more = {"view": ("--save", tmp_path / "v.rrd"), "export": ("-o", tmp_path / "o.npz")}
+        done = cdmisfa(command, tmp_path / "x1.mcap", *more.get(command, ()))
+        assert done.code in (2, 3)
+        assert "--salvage" not in done.err or "cdmisfa learn --salvage" in done.err
+
     def test_a_damaged_recording(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
     ) -> None:

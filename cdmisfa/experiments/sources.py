@@ -212,10 +212,34 @@ def open_log(
     from replay.viewfile import NoRecordingError
 
     cameras = cameras or CameraOptions()
+    if cameras == CameraOptions():
+        for path in paths:
+            _refuse_what_is_no_log(path)
     if cameras == CameraOptions() and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError):
             return RecordedSource(paths, loop=loop, salvage=salvage)
     return open_cameras(paths, cameras, loop=loop, salvage=salvage)
+
+
+def _refuse_what_is_no_log(path: Path) -> None:
+    """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
+    from replay.camera_logs import only_foreign
+    from replay.files import starts_as_log
+    from replay.runlog import RUN_FILE, is_run
+
+    if path.is_dir():
+        run = is_run(path)
+    elif starts_as_log(path):
+        run = path.name.startswith(RUN_FILE) and is_run(path)
+    elif only_foreign(path) or ".mcap" in path.suffixes:  # the latter is a damaged log
+        run = False
+    else:
+        raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
+    if run:
+        raise UsageError(
+            f"{path} is a run, not a recording: look at it with cdmisfa view {path}, "
+            "or learn from what it learned from"
+        )
 
 
 def open_cameras(
