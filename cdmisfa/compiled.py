@@ -67,6 +67,8 @@ def needs_compiling(function: Callable[..., Any]) -> bool:
     dispatcher: Any = function
     if dispatcher.signatures:
         return False
+    if dispatcher.stats.cache_path is None:  # nothing can be kept here
+        return True
     source = Path(inspect.getfile(dispatcher.py_func))
     index = f"{source.stem}.{dispatcher.py_func.__qualname__}-*.nbi"
     kept = Path(dispatcher.stats.cache_path).glob(index)
