@@ -32,6 +32,9 @@ from replay.runlog import RunHeader, read_header, read_signals
 FORMS = ("parquet", "npz", "csv", "arrow", "images")
 """What can be written."""
 
+CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
+"""Signals of every frame, for which a row an iteration has no room."""
+
 BATCH = 1000
 """Iterations, or frames, that are held at once."""
 
@@ -163,7 +166,7 @@ def _csv(path: Path, out: Path) -> int:
 
 def _csv_rows(path: Path, file: TextIO, modules: int) -> int:
     writer, rows = csv.writer(file), 0
-    wanted = [s for s in SIGNALS.values() if "T" not in s.dims]
+    wanted = [s for s in SIGNALS.values() if s.name not in CSV_LEAVES_OUT]
     for record in read_signals(path):
         names: list[str] = []
         cells: list[Any] = []

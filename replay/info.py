@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +17,7 @@ from replay.files import log_files
 from replay.reader import Crc, LogReader
 from replay.records import MalformedRecord
 from replay.runlog import METADATA as RUN_METADATA
+from replay.runlog import RUN_FILE
 
 SCHEMA: Final = 1
 """Rises whenever a key of what `describe` gives changes its meaning."""
@@ -46,7 +50,8 @@ def describe(path: str | Path) -> dict[str, Any]:
     Returns:
         `schema`, `path`, `kind` ("recording", "run" or "foreign"), `channels` (topic,
         encoding, schema, messages, start_ns, end_ns, file), `chunks`, `complete`, `crc`
-        ("ok", "absent", "bad" or "unchecked"), `problems` (where, what).
+        ("ok", "absent", "bad" or "unchecked"), `problems` (where, what), `seed` and, of a
+        run's folder, `ended` (why); None where nothing says so.
 
     Raises:
         UsageError: no such log.
@@ -66,7 +71,31 @@ def describe(path: str | Path) -> dict[str, Any]:
         "crc": next(c for c in ("bad", "unchecked", "absent", "ok") if c in crcs),
         "problems": [p for d in documents for p in d["problems"]],
         "metadata": {d["file"]: d["metadata"] for d in documents},
+        "seed": _seed(documents),
+        "ended": _ended(Path(path)),
     }
+
+
+def _seed(documents: Sequence[Mapping[str, Any]]) -> int | None:
+    """The one seed that every file's own record names."""
+    seeds: set[Any] = set()
+    for document in documents:
+        for values in document["metadata"].values():
+            with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError):
+                manifest = json.loads(values.get("manifest", "{}"))
+                seeds.add(int(values.get("seed", manifest.get("seed"))))
+    return seeds.pop() if len(seeds) == 1 else None
+
+
+def _ended(path: Path) -> str | None:
+    folder = path if path.is_dir() else path.parent
+    if path.name != RUN_FILE and not (path / RUN_FILE).is_file():
+        return None
+    try:
+        document = json.loads((folder / "run.json").read_text("utf-8"))
+        return str(document["result"]["ended"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
 
 
 def kind_of(reader: LogReader) -> str:

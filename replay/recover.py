@@ -46,15 +46,15 @@ def recover(src: str | Path, dst: str | Path, *, force: bool = False) -> dict[st
     """
     src, dst = Path(src), Path(dst)
     files = log_files(src)
+    if src.is_dir() and dst.exists() and not dst.is_dir():
+        raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
+    try:
+        (dst if src.is_dir() else dst.parent).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{dst}: {error.strerror}") from None
     if not src.is_dir():
         targets = [dst]
     else:
-        if dst.exists() and not dst.is_dir():
-            raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
-        try:
-            dst.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{dst}: {error.strerror}") from None
         targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -13,23 +15,51 @@ from cdmisfa.errors import LogDamagedError
 @click.command("info")
 @options.path_argument("path")
 @options.as_json
-def info_command(path: Path, as_json: bool) -> None:
-    """Say what is in a recording, a run or any MCAP file."""
+@click.pass_context
+def info_command(ctx: click.Context, path: Path, as_json: bool) -> None:
+    """Say what is in a recording, a run or any MCAP file.
+
+    Exits with 3 when a checksum is wrong.
+    """
     from replay.info import describe
 
     document = describe(path)
     if as_json:
         options.print_json(document)
-        return
+    else:
+        _print_info(path, document)
+    if document["crc"] == "bad":
+        ctx.exit(LogDamagedError.exit_code)
+
+
+def _print_info(path: Path, document: dict[str, Any]) -> None:
     state = "complete" if document["complete"] else "cut short"
-    click.echo(f"{path}: {document['kind']}, {state}, checksums {document['crc']}")
+    words = [document["kind"], state, f"checksums {document['crc']}"]
+    if document["seed"] is not None:
+        words.append(f"seed {document['seed']}")
+    if document["ended"] is not None:
+        words.append(f"ended: {document['ended']}")
+    click.echo(f"{path}: {', '.join(words)}")
     options.print_table(
-        ("topic", "messages", "encoding", "schema", "start_ns", "end_ns"),
+        ("topic", "messages", "encoding", "schema", "from", "to"),
         [
-            [c[key] for key in ("topic", "messages", "encoding", "schema", "start_ns", "end_ns")]
+            [
+                *(c[key] for key in ("topic", "messages", "encoding", "schema")),
+                _clock(c["start_ns"]),
+                _clock(c["end_ns"]),
+            ]
             for c in document["channels"]
         ],
     )
+
+
+def _clock(ns: int | None) -> str:
+    """A log time as date and time of day, UTC, to the millisecond."""
+    if ns is None:
+        return "-"
+    whole, rest = divmod(ns, 10**9)
+    time = datetime.fromtimestamp(whole, tz=UTC)
+    return f"{time:%Y-%m-%d %H:%M:%S}.{rest // 10**6:03}Z"
 
 
 @click.command("verify")
@@ -75,7 +105,10 @@ def recover_command(ctx: click.Context, path: Path, out: Path, force: bool, as_j
     else:
         options.print_table(
             ("topic", "kept", "lost"),
-            [(c["topic"], c["kept"], c["lost"]) for c in report["channels"]],
+            [
+                (c["topic"], c["kept"], "unknown" if c["lost"] is None else c["lost"])
+                for c in report["channels"]
+            ],
         )
         click.echo(f"written {out}")
     if not report["complete"]:

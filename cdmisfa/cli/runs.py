@@ -90,11 +90,16 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 def export_command(path: Path, form: str | None, out: Path, force: bool, as_json: bool) -> None:
     """Write a run's signals as a table or arrays, a recording as images.
 
-    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz, images to a folder.
+    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz, images to a folder. CSV has
+    no room for the outputs frame by frame (y, y_frozen) and leaves them out.
     """
-    from replay.export import export
+    from replay.export import CSV_LEAVES_OUT, export
 
-    rows = export(path, out, form or out.suffix.removeprefix("."), force=force)
+    form = form or out.suffix.removeprefix(".")
+    rows = export(path, out, form, force=force)
+    if form == "csv":
+        left_out = " and ".join(CSV_LEAVES_OUT)
+        click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)
     if as_json:
         options.print_json(
             {"schema": options.SCHEMA, "path": str(path), "file": str(out), "rows": rows}
