@@ -83,9 +83,12 @@ def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStr
         source: what it is made from, so that others of the same name are not taken for it.
 
     Raises:
+        UsageError: its folder is not there.
         CdmisfaError: the file cannot be written.
     """
     partial = partial_path(out)
+    if not out.parent.is_dir():
+        raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
     recording = rr.RecordingStream(APPLICATION, recording_id=_identity(name, source))
     recording.set_log_time_enabled(False)
     try:

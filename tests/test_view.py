@@ -378,3 +378,9 @@ def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
     with pytest.raises(CdmisfaError, match="code 3: no luck"):
         viewer.run_program([])
     assert capfd.readouterr().err == ""
+
+
+def test_a_view_into_a_missing_folder_is_refused_by_its_name(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    with pytest.raises(UsageError, match=r"there is no folder .*nowhere$"):
+        build_view(tmp_path, tmp_path / "nowhere" / "v.rrd")
