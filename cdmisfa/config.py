@@ -75,6 +75,7 @@ class LearnerConfig:
         positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
         within(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
         within(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
+        within(self, "learner", 0.0, 1.0, "nu")
         within(self, "learner", 1e-6, 1.0, "alpha")
         within(self, "learner", 0.0, math.inf, "epsilon_knee")
         within(self, "learner", 1, MAX_COMPONENTS, "components")
@@ -98,7 +99,7 @@ class LearnerConfig:
 
 
 def positive(section: Any, prefix: str, *names: str) -> None:
-    """Refuse values that are not above zero, naming the key.
+    """Refuse values that are not above zero and finite, naming the key.
 
     Raises:
         UsageError: at the first such value.
@@ -106,7 +107,7 @@ def positive(section: Any, prefix: str, *names: str) -> None:
     for name in names:
         value = getattr(section, name)
         if not (value > 0 and math.isfinite(value)):
-            raise UsageError(f"{prefix}.{name} is {value}: it must be above 0")
+            raise UsageError(f"{prefix}.{name} is {value}: it must be above 0 and finite")
 
 
 def within(section: Any, prefix: str, low: float, high: float, *names: str) -> None:

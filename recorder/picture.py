@@ -38,7 +38,7 @@ def scene_picture(scene: SceneConfig, path: Path, *, force: bool = False) -> Pat
 
     Raises:
         UsageError: the file exists, or is no .png.
-        LogWriteError: the file cannot be written.
+        LogWriteError: the file or its folder cannot be written.
         CdmisfaError: the simulator is not installed.
     """
     path = Path(path)
@@ -46,6 +46,10 @@ def scene_picture(scene: SceneConfig, path: Path, *, force: bool = False) -> Pat
         raise UsageError(f"{path}: the picture is a PNG, name it .png")
     if path.exists() and not force:
         raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogWriteError(f"{path.parent} cannot be made: {error.strerror}") from error
     width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
     with World(scene, robot_seen=True) as world:
         _furnish(world, scene)

@@ -17,14 +17,18 @@ from cdmisfa.blocks import FrameSource, SourceSpec
 from cdmisfa.config import as_table
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
+from recorder.folder import held
 from recorder.logfile import LogWriteError
 from recorder.messages import HeadPose
 from recorder.parts import Split, ViewParts, view_logs
 from recorder.rendering import render_here, render_in_processes, requests
 from recorder.scenes import open_scene
-from recorder.viewlog import Identity, sha256
+from recorder.viewlog import Identity, last_end, sha256
 
 MAX_JOBS = 256
+
+DEFAULT_FRAMES = 1000
+"""Frames of each view where nothing else is asked for."""
 
 Progress = Callable[[float], None]
 """Told, after every block, how many frames have been written of every view."""
@@ -59,7 +63,7 @@ def record(
     scene: SceneConfig | None = None,
     settings: RecordConfig | None = None,
     *,
-    frames: int,
+    frames: int | None = None,
     views: Sequence[str] | None = None,
     jobs: int = 1,
     force: bool = False,
@@ -78,7 +82,8 @@ def record(
         folder: made if it does not exist.
         scene: the world; a seed of None is 0.
         settings: the clock and the files.
-        frames: how many, of each view.
+        frames: how many, of each view; by default `DEFAULT_FRAMES`, and where a longer
+            recording is resumed as many as it has.
         views: which views; by default all.
         jobs: processes that render.
         force: overwrite an earlier recording in the folder.
@@ -95,7 +100,7 @@ def record(
     scene = dataclasses.replace(scene, seed=scene.seed or 0)
     settings = settings or RecordConfig()
     folder = Path(folder)
-    if frames < 1:
+    if frames is not None and frames < 1:
         raise UsageError(f"--frames is {frames}: record at least one")
     if not 1 <= jobs <= MAX_JOBS:
         raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
@@ -111,8 +116,14 @@ def record(
             source.spec,
             {"scene": as_table(scene), "record": as_table(settings)},
         )
-        make_folder(folder, source.spec, force=force)
+        make_folder(folder)
         with _stoppable() as stopped, ExitStack() as open_logs:
+            open_logs.enter_context(held(folder))
+            if force:
+                remove_views(folder, names)
+            if resume:
+                frames = _length(folder, names, frames)
+            frames = frames or DEFAULT_FRAMES
             poses = _poses(source)
             logs = [
                 ViewParts(
@@ -145,7 +156,7 @@ def record(
                         raise _StoppedError(f"{folder} is not finished: go on with --resume")
             for log in logs:
                 log.finish()
-    return [written(log.view, path, held) for log in logs for path, held in log.parts]
+    return [written(log.view, path, n) for log in logs for path, n in log.parts]
 
 
 def written(view: str, path: Path, frames: int) -> ViewRecording:
@@ -181,20 +192,49 @@ def refuse_existing(folder: Path, *, force: bool, remedy: str = "overwrite with 
         raise UsageError(f"{folder} exists: choose another folder, {remedy}")
 
 
-def make_folder(folder: Path, spec: SourceSpec, *, force: bool) -> None:
-    """Make a recording's folder; where it may be overwritten, remove the recording in it.
+def make_folder(folder: Path) -> None:
+    """Make a recording's folder.
 
     Raises:
         LogWriteError: it cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if force:
-            for name in spec.streams:
-                for old in view_logs(folder, name):
-                    old.unlink()
     except OSError as error:
         raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+
+
+def remove_views(folder: Path, names: Sequence[str]) -> None:
+    """Remove what a recording holds of some views.
+
+    Raises:
+        LogWriteError: it cannot be removed.
+    """
+    try:
+        for name in names:
+            for old in view_logs(folder, name):
+                old.unlink()
+    except OSError as error:
+        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+
+
+def _length(folder: Path, names: Sequence[str], frames: int | None) -> int:
+    """Frames of each view of a recording that is gone on with.
+
+    Raises:
+        UsageError: a file has more frames than asked for.
+    """
+    longest = 0
+    for name in names:
+        for path in view_logs(folder, name):
+            end = last_end(path, name)
+            if frames is not None and end > frames:
+                raise UsageError(
+                    f"{path} holds {end} frames, more than --frames {frames}: --resume shortens "
+                    f"nothing, give --frames {end} or more, or overwrite with --force"
+                )
+            longest = max(longest, end)
+    return frames or max(longest, DEFAULT_FRAMES)
 
 
 @contextlib.contextmanager

@@ -225,6 +225,12 @@ def whole_frames(path: Path, view: str, first: int = 0) -> int:
     return count
 
 
+def last_end(path: Path, view: str) -> int:
+    """One more than the last frame of a view that a log holds; 0 without any."""
+    ends = (m.sequence + 1 for c, m in _messages(path) if c.topic == view_topic(view))
+    return max(ends, default=0)
+
+
 def check_identity(path: Path, expected: Mapping[str, str]) -> None:
     """Refuse to go on with a log of something else.
 

@@ -94,6 +94,8 @@ def test_values_of_the_wrong_type(key: str, value: Any, words: str) -> None:
         ("nu", 0.0),
         ("nu", -1.0),
         ("nu", math.inf),
+        ("nu", 1.01),
+        ("nu", 1e300),
         ("delta", 0.0),
         ("sigma", -1e-9),
         ("beta", math.inf),
@@ -114,6 +116,11 @@ def test_values_of_the_wrong_type(key: str, value: Any, words: str) -> None:
 def test_values_out_of_range_name_the_key(key: str, value: float) -> None:
     with pytest.raises(UsageError, match=rf"learner\.{key} is"):
         learner(**{key: value})
+
+
+def test_an_infinite_value_is_told_to_be_finite() -> None:
+    with pytest.raises(UsageError, match=r"learner\.nu is inf: .*finite"):
+        learner(nu="inf")
 
 
 def test_texts_become_the_fields_type() -> None:

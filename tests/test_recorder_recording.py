@@ -19,6 +19,7 @@ from cdmisfa.errors import UsageError
 from cdmisfa.streams import OscillatorySource
 from recorder import recording
 from recorder.config import RecordConfig, SceneConfig
+from recorder.folder import held
 from recorder.logfile import LogWriteError, partial_path
 from recorder.recording import record
 from recorder.rendering import BLOCK, requests
@@ -158,8 +159,29 @@ def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
     assert contents(folder) == before
     (folder / "notes.txt").write_text("mine")
     record("oscillatory", folder, frames=3000, views=["x2"], force=True)
-    assert sorted(os.listdir(folder)) == ["notes.txt", "x2.mcap"]
+    after = contents(folder)
+    assert sorted(after) == ["notes.txt", "x1.mcap", "x2.mcap", "x3.mcap"]
+    assert {name: after[name] for name in ("x1.mcap", "x3.mcap")} == {
+        name: before[name] for name in ("x1.mcap", "x3.mcap")
+    }
     assert sha256(folder / "x2.mcap") == sha256(oscillatory / "x2.mcap")
+
+
+def test_going_on_shortens_nothing(tmp_path):
+    folder = tmp_path / "a"
+    record("oscillatory", folder, frames=60)
+    before = contents(folder)
+    with pytest.raises(UsageError, match="holds 60 frames, more than --frames 20"):
+        record("oscillatory", folder, frames=20, resume=True)
+    assert contents(folder) == before
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    with held(folder), pytest.raises(UsageError, match="in use by another process"):
+        record("oscillatory", folder, frames=20)
+    assert contents(folder) == {}
 
 
 @pytest.mark.parametrize(

@@ -104,8 +104,9 @@ def run(args: Sequence[str]) -> int:
             # without standalone mode, Context.exit(code) comes back as the value
             code = cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
             sys.stdout.flush()
-        except (click.Abort, KeyboardInterrupt):
-            return _fail("interrupted", stop.exit_code)
+        except (click.Abort, KeyboardInterrupt) as error:
+            remedy = str(error.__cause__ or error)  # click puts an Abort around an interrupt
+            return _fail(f"interrupted{': ' if remedy else ''}{remedy}", stop.exit_code)
         except BrokenPipeError:
             _drop_stdout()
             return 1

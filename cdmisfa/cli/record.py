@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 @click.option(
     "--frames",
     type=click.IntRange(1),
-    default=1000,
-    show_default=True,
-    help="Frames of each view.",
+    help="Frames of each view; by default 1000, with --resume what a longer one has.",
 )
 @options.seed
 @click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
@@ -74,28 +72,34 @@ def record_command(
         draw(configuration.scene, scene_picture, force=force)
         click.echo(f"picture {scene_picture}", err=True)
         if out is None:
+            if as_json:
+                options.print_json({"schema": options.SCHEMA, "picture": str(scene_picture)})
             return
     if out is None:
         raise click.UsageError("say -o FOLDER, where the recording goes")
     from recorder.parts import Split
-    from recorder.recording import record
+    from recorder.recording import DEFAULT_FRAMES, record
 
     parts = None if split is None else Split.parse(split)
-    with bar("recording", "frames") as shown:
-        files = record(
-            scene,
-            out,
-            configuration.scene,
-            configuration.record,
-            frames=frames,
-            views=views or None,
-            jobs=jobs,
-            force=force,
-            resume=resume,
-            split=parts,
-            progress=lambda done: shown.update(done, frames),
-        )
-    print_recording(out, frames, files, as_json=as_json)
+    try:
+        with bar("recording", "frames") as shown:
+            files = record(
+                scene,
+                out,
+                configuration.scene,
+                configuration.record,
+                frames=frames,
+                views=views or None,
+                jobs=jobs,
+                force=force,
+                resume=resume,
+                split=parts,
+                progress=lambda done: shown.update(done, max(done, frames or DEFAULT_FRAMES)),
+            )
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(f"{out} is not finished: go on with --resume") from error
+    held = sum(file.frames for file in files if file.name == files[0].name)
+    print_recording(out, held, files, as_json=as_json)
 
 
 def print_recording(

@@ -12,7 +12,14 @@ from typing import Final
 from cdmisfa.blocks import SourceSpec
 from cdmisfa.errors import UsageError
 from recorder.config import RecordConfig
-from recorder.recording import ViewRecording, make_folder, refuse_existing, written
+from recorder.folder import held
+from recorder.recording import (
+    ViewRecording,
+    make_folder,
+    refuse_existing,
+    remove_views,
+    written,
+)
 from recorder.viewlog import Identity, ViewLog
 from replay.foreign import ForeignSource
 
@@ -51,10 +58,13 @@ def convert(
     refuse_existing(folder, force=force)
     spec = replace(source.spec, streams=view_names(source.spec.streams))
     identity = Identity(KIND, 0, spec, {"source": dict(source.describe())})
-    make_folder(folder, spec, force=force)
+    make_folder(folder)
     logs: list[ViewLog] = []
     done = 0
     with ExitStack() as unfinished:
+        unfinished.enter_context(held(folder))
+        if force:
+            remove_views(folder, spec.streams)
         for view in spec.streams:
             logs.append(ViewLog(folder, view, identity, settings or RecordConfig()))
             unfinished.callback(logs[-1].abandon)

@@ -32,11 +32,11 @@ from cdmisfa.experiments.checkpoint import (
     save_checkpoint,
     set_aside,
 )
-from cdmisfa.experiments.folder import held
 from cdmisfa.incsfa import strict
 from cdmisfa.learner import CuriousLearner
 from cdmisfa.modules import Module
 from cdmisfa.signals import SCHEMA_VERSION, SignalsHash
+from recorder.folder import held
 
 ENDINGS: Mapping[str, str] = {
     "max_modules": "as many modules as asked for were learned",

@@ -23,9 +23,9 @@ from typing import Any, BinaryIO
 from cdmisfa.config import as_table
 from cdmisfa.errors import CdmisfaError, LogDamagedError
 from cdmisfa.experiments.engines import WorkerDied, run_all
-from cdmisfa.experiments.folder import held
 from cdmisfa.experiments.run import learn, module_table, write_json
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
+from recorder.folder import held
 from recorder.scenes import SCENES, open_scene
 
 ROWS = "rows.jsonl"
