@@ -131,7 +131,7 @@ def test_another_split_is_refused(tmp_path: Path) -> None:
         record("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
     with pytest.raises(UsageError, match="recorded with --split"):
         record("oscillatory", tmp_path / "a", frames=500, resume=True)
-    with pytest.raises(UsageError, match="ask for more frames"):
+    with pytest.raises(UsageError, match="holds 150 frames, more than --frames 100"):
         record("oscillatory", tmp_path / "a", frames=100, split=BY_TIME, resume=True)
     assert contents(tmp_path / "a") == before
     record("oscillatory", tmp_path / "a", frames=60, force=True)
