@@ -7,9 +7,8 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self
 
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
+from replay.indexed import confirm
 from replay.records import (
     INDEX_HEADER,
     MAX_CHUNK,
@@ -28,7 +28,8 @@ from replay.records import (
     decompress,
     decompress_prefix,
 )
-from replay.structure import Attachment, Metadata, RandomFile, Segment, Structure
+from replay.store import Location, RandomFile, Url, location
+from replay.structure import Attachment, Metadata, Segment, Structure
 from replay.tables import MessageTable, indexed_table, walked_table
 
 CACHE_BYTES: Final = 32 * 1024 * 1024
@@ -61,7 +62,8 @@ class LogReader:
 
     Damage is an error that names the file, the chunk and its time range. With
     `salvage` the damaged chunk is left out and noted in `problems` instead, and the
-    unverifiable part of a chunk in which the file ends is read too.
+    unverifiable part of a chunk in which the file ends is read too. Of a URL only what is
+    asked for is read, as far as its summary accounts for every message.
 
     Attributes:
         path: the file.
@@ -70,15 +72,26 @@ class LogReader:
     """
 
     def __init__(
-        self, path: str | Path, *, salvage: bool = False, cache_bytes: int | None = None
+        self,
+        path: str | Location,
+        *,
+        salvage: bool = False,
+        cache_bytes: int | None = None,
+        whole: bool = False,
     ) -> None:
         """Open a log and walk over its structure.
+
+        Args:
+            path: the file, or its URL.
+            salvage: go on over damage.
+            cache_bytes: decoded chunks that are kept.
+            whole: walk over all of a URL's bytes, too.
 
         Raises:
             UsageError: it cannot be opened.
             LogDamagedError: not an MCAP file, or its structure is damaged.
         """
-        self.path = Path(path)
+        self.path = location(path)
         self.salvage = salvage
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
@@ -88,7 +101,8 @@ class LogReader:
         self._defined = 0
         self._file = RandomFile(self.path)
         try:
-            self._structure = Structure(self._file, self._refuse)
+            by_index = isinstance(self.path, Url) and not whole
+            self._structure = Structure(self._file, self._refuse, by_index=by_index)
             self._time_tail()
             self._check_data_crc()
         except MalformedRecord as error:
@@ -104,6 +118,11 @@ class LogReader:
     def size(self) -> int:
         """Bytes of the file."""
         return self._file.size
+
+    @property
+    def by_index(self) -> bool:
+        """Whether only the summary was read, and no chunk before it is asked for."""
+        return self._structure.by_index
 
     @property
     def profile(self) -> str:
@@ -154,6 +173,10 @@ class LogReader:
     @property
     def attachments(self) -> list[Attachment]:
         """The attachments; their CRCs were checked."""
+        try:
+            self._structure.load_attachments()
+        except MalformedRecord as error:
+            self._refuse("attachments", str(error))
         return self._structure.attachments
 
     @property
@@ -208,7 +231,8 @@ class LogReader:
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
-        for segment, table in self.tables(start=start, stop=stop, ordered=ordered):
+        tables = self.tables(start=start, stop=stop, ordered=ordered, topics=topics)
+        for segment, table in tables:
             numbers = np.unique(table.channel)
             known = {int(c): self._channel(int(c), segment) for c in numbers}
             wanted = {
@@ -236,11 +260,17 @@ class LogReader:
                     )
 
     def tables(
-        self, *, start: int | None = None, stop: int | None = None, ordered: bool = True
+        self,
+        *,
+        start: int | None = None,
+        stop: int | None = None,
+        ordered: bool = True,
+        topics: Collection[str] | None = None,
     ) -> Iterator[tuple[Segment, MessageTable]]:
         """Give the messages chunk by chunk as columns, in the order of `messages`.
 
-        Chunks whose times overlap come in pieces.
+        Chunks whose times overlap come in pieces. Of a URL, chunks without any of `topics`
+        are left out.
 
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
@@ -248,6 +278,10 @@ class LogReader:
         low, high = start or 0, 2**64 if stop is None else stop
         segments = list(enumerate(self.segments))
         chosen = [(i, s) for i, s in segments if s.end >= low and s.start < high]
+        if self.by_index:
+            numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
+            chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
+            self.expect([s for _, s in chosen])
         groups = _overlapping(chosen) if ordered else [[pair] for pair in chosen]
         for group in groups:
             if len(group) > 1:
@@ -259,6 +293,10 @@ class LogReader:
             if ordered and (table.log_time[1:] < table.log_time[:-1]).any():
                 table = table.select(np.argsort(table.log_time, kind="stable"))
             yield group[0][1], _within(table, low, high)
+
+    def expect(self, segments: Iterable[Segment]) -> None:
+        """Say which chunks will be decoded, one after the other, so that they come in time."""
+        self._file.expect([(segment.offset, segment.stop) for segment in segments])
 
     def table(self, segment: Segment) -> MessageTable | None:
         """Decode a chunk and check it; the last few are kept.
@@ -314,8 +352,9 @@ class LogReader:
         Raises:
             MalformedRecord: together they are larger than any chunk.
         """
-        first, last = segment.indexes[0].offset - INDEX_HEADER, segment.indexes[-1]
-        stop = last.offset + 16 * last.count
+        if segment.stated:
+            confirm(self._file, segment)
+        first, stop = segment.indexes[0].offset - INDEX_HEADER, segment.stop
         if stop - segment.data_offset > 2 * MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
         raw = memoryview(self._file.read(segment.data_offset, stop - segment.data_offset))
@@ -385,7 +424,7 @@ class LogReader:
 
     def _check_data_crc(self) -> None:
         structure = self._structure
-        if not structure.data_crc:
+        if not structure.data_crc or structure.by_index:
             return
         if self._file.crc(0, structure.data_end) == structure.data_crc:
             return
@@ -399,6 +438,8 @@ class LogReader:
             self._cached -= len(old.data)
 
     def _decode(self, segment: Segment) -> MessageTable:
+        if segment.stated:
+            confirm(self._file, segment)
         stored = self._file.read(segment.data_offset, segment.stored)
         if segment.cut:
             raw = decompress_prefix(stored, segment.compression, min(segment.size, MAX_CHUNK))

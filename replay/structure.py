@@ -7,17 +7,15 @@ summary claims is compared with what was found.
 
 from __future__ import annotations
 
-import os
 import struct
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
 
-from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.errors import LogDamagedError
 from replay.records import (
     MAGIC,
     MAX_CHUNK,
@@ -31,18 +29,18 @@ from replay.records import (
     channel,
     check_size,
     chunk_header,
-    crc32,
     schema,
     statistics,
 )
+from replay.store import RandomFile
 
 RUN_BYTES: Final = 1024 * 1024
 """Messages outside chunks are read in runs of about this many bytes."""
-_PEEK: Final = 4096
 _CHUNK_HEADER: Final = 256
 _LOOSE: Final = struct.Struct("<HIQ")
 _INDEX: Final = struct.Struct("<HI")
 _FOOTER_BYTES: Final = RECORD_HEADER.size + 20
+_DATA_END_BYTES: Final = RECORD_HEADER.size + 4
 _OPEN_LENGTH: Final = 2**64 - 1
 _BEFORE_DATA: Final = 1024 * 1024
 
@@ -74,6 +72,7 @@ class Segment:
         indexes: the chunk's message indexes.
         counts: messages of each channel where a walk counted them.
         cut: the file ends within it.
+        stated: only the summary speaks of it, its own header was not read.
     """
 
     offset: int
@@ -88,6 +87,13 @@ class Segment:
     indexes: list[IndexPart] = field(default_factory=list)
     counts: dict[int, int] | None = None
     cut: bool = False
+    stated: bool = False
+
+    @property
+    def stop(self) -> int:
+        """Place in the file after its message indexes."""
+        ends = (part.offset + 16 * part.count for part in self.indexes)
+        return max(ends, default=self.data_offset + self.stored)
 
     @property
     def name(self) -> str:
@@ -128,81 +134,6 @@ class Attachment:
     crc: int
 
 
-class RandomFile:
-    """A file read at any place through one small window; never past its end."""
-
-    def __init__(self, path: Path) -> None:
-        """Open the file.
-
-        Raises:
-            UsageError: it cannot be opened.
-        """
-        self.path = path
-        try:
-            self._fd: int | None = os.open(path, os.O_RDONLY)
-            self.size = os.fstat(self._fd).st_size
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
-        if not path.is_file():
-            self.close()
-            raise UsageError(f"{path}: not a file")
-        self._window = b""
-        self._window_at = 0
-
-    def grow(self) -> bool:
-        """Look at the file's size again; whether it grew."""
-        before, self.size = self.size, os.fstat(self._descriptor()).st_size
-        self._window = b""
-        return self.size > before
-
-    def peek(self, offset: int, count: int) -> bytes:
-        """Up to `count` (few) bytes, read ahead for the peeks that follow."""
-        at = offset - self._window_at
-        if at < 0 or at + count > len(self._window):
-            self._window = self.read(offset, max(count, _PEEK))
-            self._window_at, at = offset, 0
-        return self._window[at : at + count]
-
-    def read(self, offset: int, count: int) -> bytes:
-        """`count` bytes, fewer only where the file ends."""
-        count = max(min(count, self.size - offset), 0)
-        parts: list[bytes] = []
-        while count:
-            try:
-                part = os.pread(self._descriptor(), min(count, 1 << 30), offset)
-            except OSError as error:
-                raise LogDamagedError(f"{self.path}: {error.strerror}") from None
-            if not part:
-                break
-            parts.append(part)
-            offset, count = offset + len(part), count - len(part)
-        return parts[0] if len(parts) == 1 else b"".join(parts)
-
-    def blocks(self, offset: int, stop: int) -> Iterator[bytes]:
-        """Give the bytes from `offset` to `stop`, 1 MiB at a time."""
-        while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
-            yield part
-            offset += len(part)
-
-    def crc(self, offset: int, stop: int) -> int:
-        """CRC-32 of the bytes from `offset` to `stop`."""
-        value = 0
-        for block in self.blocks(offset, stop):
-            value = crc32(block, value)
-        return value
-
-    def close(self) -> None:
-        """Let go of the file."""
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
-
-    def _descriptor(self) -> int:
-        if self._fd is None:
-            raise ValueError(f"{self.path} is closed")
-        return self._fd
-
-
 class Definitions:
     """The schemas and channels of a log; an id has one meaning."""
 
@@ -238,9 +169,15 @@ class Definitions:
 
 
 class Structure:
-    """What the walk found.
+    """What the walk found, or what the summary names.
+
+    Args:
+        file: the log.
+        refuse: told of every damage.
+        by_index: believe a summary that accounts for every message, and read no chunk.
 
     Attributes:
+        by_index: the summary was believed.
         segments: chunks and runs of loose messages, in file order.
         tail: the segment within which the file ends, or None.
         complete: the file has its end, and nothing is missing.
@@ -249,8 +186,9 @@ class Structure:
         data_end: place where the data section ends.
     """
 
-    def __init__(self, file: RandomFile, refuse: Refuse) -> None:
+    def __init__(self, file: RandomFile, refuse: Refuse, *, by_index: bool = False) -> None:
         self._file = file
+        self.by_index = False
         self._refuse = refuse
         self.definitions = Definitions(refuse)
         self.segments: list[Segment] = []
@@ -267,6 +205,8 @@ class Structure:
         self._chunk_offsets: list[int] = []
         self._limit: int | None = None
         self._has_indexes = False
+        self._has_summary = False
+        self._attachment_spans: list[tuple[int, int]] = []
         self._metadata_bytes = 0
         self._run: Segment | None = None
         self._last_chunk: Segment | None = None
@@ -277,7 +217,49 @@ class Structure:
         if start != MAGIC:
             raise LogDamagedError(f"{file.path}: not an MCAP file (its first bytes are not MCAP's)")
         self._read_end()
-        self._walk_data()
+        if not by_index or not self._take_index():
+            self._walk_data()
+
+    def load_attachments(self) -> None:
+        """Read the attachments that the summary names, and check them."""
+        spans, self._attachment_spans = self._attachment_spans, []
+        for start, stop in spans:
+            self._record_at(start, stop, Opcode.ATTACHMENT)
+
+    def _take_index(self) -> bool:
+        """Take the chunks from the summary; whether it accounts for every message."""
+        from replay.indexed import indexed_segments  # which needs the classes of this module
+
+        if self._limit is None or not self._has_summary:
+            return False
+        known = set(self.definitions.channels)
+        stop = self._file.size - len(MAGIC) - _FOOTER_BYTES
+        try:
+            found = indexed_segments(self._file, self._limit, stop, self.statistics, known)
+            if found is None:
+                return False
+            segments, spans = found
+            self._record_at(len(MAGIC), None, Opcode.HEADER)
+            self._record_at(self._limit - _DATA_END_BYTES, self._limit, Opcode.DATA_END)
+            for start, end in spans.metadata:
+                self._record_at(start, end, Opcode.METADATA)
+        except MalformedRecord as error:
+            self._refuse("summary", str(error))
+            self._at, self.data_crc, self.metadata = len(MAGIC), None, []
+            return False
+        self.segments, self._attachment_spans = segments, spans.attachments
+        self.by_index = self.complete = True
+        return True
+
+    def _record_at(self, start: int, stop: int | None, opcode: Opcode) -> None:
+        """Take in a record that the summary names."""
+        found, length = RECORD_HEADER.unpack(
+            self._file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+        )
+        if found != opcode or stop not in (None, start + RECORD_HEADER.size + length):
+            raise MalformedRecord(f"at byte {start} is no {opcode.name} record")
+        self._at = start
+        self._take(found, start + RECORD_HEADER.size, length)
 
     def _walk_data(self) -> None:
         while self.data_crc is None:
@@ -511,6 +493,7 @@ class Structure:
         self._limit = begin
         try:
             self._walk_summary(begin, footer_at)
+            self._has_summary = start == begin
         except MalformedRecord as error:
             self._refuse("summary", str(error))
 

@@ -1,0 +1,366 @@
+"""Logs behind URLs, through fsspec: only the parts that are asked for, each checked.
+
+Nothing is taken on trust: every answer must be the part that was asked for, of an object that
+is still the one that was opened.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import bisect
+import re
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, TypeVar
+
+from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.store import Url
+
+EDGE_BYTES: Final = 64 * 1024
+"""What is read of the beginning, and of the end, at once."""
+CACHE_BYTES: Final = 16 * 1024 * 1024
+"""Bytes of an object that are kept; the last part always is."""
+_LEAST: Final = 16 * 1024
+_MOST: Final = 1024 * 1024
+_TRIES: Final = 3
+_CONNECT_SECONDS: Final = 20.0
+_READ_SECONDS: Final = 60.0
+_WAIT_SECONDS: Final = 600.0
+_RANGE: Final = re.compile(r"bytes (\d{1,19})-(\d{1,19})/(\d{1,19})", re.ASCII)
+_NOTHING: Final = re.compile(r"bytes \*/0+", re.ASCII)
+
+Value = TypeVar("Value")
+
+
+class RemoteError(LogDamagedError):
+    """A server that does not give a log, or not the one that was opened."""
+
+
+class _Again(Exception):  # noqa: N818 - asks for another try
+    """What may go better the next time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of an object, with what identifies the whole."""
+
+    data: bytes
+    total: int
+    tag: str
+
+
+class _Remote(Protocol):
+    """Where parts come from."""
+
+    loop: asyncio.AbstractEventLoop
+
+    async def part(self, start: int, stop: int) -> Part:
+        """Fetch the bytes from `start` to before `stop`, or to the end."""
+
+
+class RemoteStore:
+    """An object on a server, read part by part.
+
+    Attributes:
+        size: its bytes, as the server says.
+        tag: what the server calls this version of it: its ETag, or its date.
+    """
+
+    def __init__(self, url: Url) -> None:
+        """Look for the object and read its beginning.
+
+        Raises:
+            RemoteError: the server does not give it.
+            CdmisfaError: what reads URLs is not installed.
+        """
+        self._url = url
+        self._remote = _connect(url)
+        self._parts: OrderedDict[int, bytes] = OrderedDict()
+        self._held = 0
+        self._spans: list[tuple[int, int]] = []
+        self._starts: list[int] = []
+        self._ahead: tuple[int, int, Future[Part]] | None = None
+        self._reach, self._follows = _LEAST, -1
+        self.size, self.tag = 0, ""
+        first = self._wait(self._start(0, EDGE_BYTES), 0, EDGE_BYTES)
+        self.size, self.tag = first.total, first.tag
+        self._keep(0, self._checked(first, 0, EDGE_BYTES))
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        """Read `count` bytes from `offset` on, fewer only at the end.
+
+        Raises:
+            RemoteError: the server does not give them, or the object changed.
+        """
+        count = max(min(count, self.size - offset), 0)
+        if not count:
+            return b""
+        found = self._cached(offset, count)
+        if found is None:
+            start, stop = self._choose(offset, offset + count)
+            found = self._fetch(start, stop)[offset - start : offset - start + count]
+        return found
+
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
+        """Hear which spans, from and up to before, will be read, one after the other."""
+        self._spans = sorted(spans)
+        self._starts = [start for start, _ in self._spans]
+
+    def grow(self) -> bool:
+        """Say no: an object is written as a whole."""
+        return False
+
+    def close(self) -> None:
+        """Forget what was read; harmless when called twice."""
+        if self._ahead is not None:
+            self._ahead[2].cancel()
+            self._ahead = None
+        self._parts.clear()
+        self._held = 0
+
+    def _choose(self, start: int, stop: int) -> tuple[int, int]:
+        """What to fetch for a read: the chunks that are expected, or somewhat more."""
+        number = bisect.bisect_right(self._starts, start) - 1
+        if number >= 0 and stop <= self._spans[number][1]:
+            return self._bundle(number)
+        if start == self._follows:
+            self._reach = min(2 * self._reach, _MOST)
+        else:
+            self._reach = _LEAST
+        if self.size - start <= EDGE_BYTES:
+            start = max(self.size - EDGE_BYTES, 0)
+        stop = min(max(stop, start + self._reach), self.size)
+        self._follows = stop
+        return start, stop
+
+    def _bundle(self, number: int) -> tuple[int, int]:
+        """Expected spans from one on that touch, up to a limit."""
+        start, stop = self._spans[number]
+        for begin, end in self._spans[number + 1 :]:
+            if begin != stop or end - start > _MOST:
+                break
+            stop = end
+        return start, stop
+
+    def _fetch(self, start: int, stop: int) -> bytes:
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and (ahead[0] > start or stop > ahead[1]):
+            ahead[2].cancel()
+            ahead = None
+        if ahead is None:
+            data = self._checked(self._wait(self._start(start, stop), start, stop), start, stop)
+        else:
+            data = self._checked(self._wait(ahead[2], *ahead[:2]), *ahead[:2])[start - ahead[0] :]
+        self._keep(start, data)
+        self._read_ahead(start, stop)
+        return data
+
+    def _read_ahead(self, start: int, stop: int) -> None:
+        """Ask for the expected spans after those that were just fetched."""
+        number = bisect.bisect_left(self._starts, stop)
+        planned = bisect.bisect_right(self._starts, start) - 1
+        if number < len(self._spans) and planned >= 0 and start < self._spans[planned][1]:
+            begin, end = self._bundle(number)
+            if begin not in self._parts:
+                self._ahead = begin, end, self._start(begin, end)
+
+    def _start(self, start: int, stop: int) -> Future[Part]:
+        return asyncio.run_coroutine_threadsafe(self._remote.part(start, stop), self._remote.loop)
+
+    def _wait(self, future: Future[Part], start: int, stop: int) -> Part:
+        """Wait for a part; what may be a passing fault is tried again."""
+        for attempt in range(_TRIES):
+            try:
+                return future.result(_WAIT_SECONDS)
+            except RemoteError as error:
+                raise RemoteError(f"{self._url}: {error}") from None
+            except _Again as error:
+                if attempt == _TRIES - 1 or not self.size:
+                    raise RemoteError(f"{self._url}: {error}") from None
+            except Exception as error:
+                raise RemoteError(f"{self._url}: {_words(error)}") from None
+            time.sleep(0.2 * 4**attempt)
+            future = self._start(start, stop)
+        raise AssertionError("every try ends")
+
+    def _checked(self, part: Part, start: int, stop: int) -> bytes:
+        if (part.total, part.tag) != (self.size, self.tag):
+            raise RemoteError(f"{self._url}: it changed while it was read; begin again")
+        if len(part.data) != min(stop, self.size) - start:
+            raise RemoteError(
+                f"{self._url}: the server sent {len(part.data)} bytes of {stop - start} "
+                f"at byte {start}"
+            )
+        return part.data
+
+    def _cached(self, offset: int, count: int) -> bytes | None:
+        for start, data in self._parts.items():
+            if start <= offset and offset + count <= start + len(data):
+                self._parts.move_to_end(start)
+                return data[offset - start : offset - start + count]
+        return None
+
+    def _keep(self, start: int, data: bytes) -> None:
+        self._held += len(data) - len(self._parts.pop(start, b""))
+        self._parts[start] = data
+        while self._held > CACHE_BYTES and len(self._parts) > 1:
+            self._held -= len(self._parts.popitem(last=False)[1])
+
+
+class _HttpRemote:
+    """An object of a web server."""
+
+    def __init__(self, url: Url) -> None:
+        import aiohttp
+        import fsspec
+        from yarl import URL
+
+        timeout = aiohttp.ClientTimeout(
+            total=None, sock_connect=_CONNECT_SECONDS, sock_read=_READ_SECONDS
+        )
+        # Unpacking on the way would make other bytes of the parts, without a limit.
+        settings = {"timeout": timeout, "auto_decompress": False}
+        self._files = fsspec.filesystem(url.scheme, client_kwargs=settings)
+        self.loop = self._files.loop
+        self._address = URL(url.address, encoded="%" in url.address)
+
+    async def part(self, start: int, stop: int) -> Part:
+        import aiohttp
+
+        session = await self._files.set_session()
+        headers = {"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"}
+        try:
+            async with session.get(self._address, headers=headers) as answer:
+                return await self._taken(answer, start, stop)
+        except (aiohttp.ClientError, asyncio.IncompleteReadError, TimeoutError) as error:
+            raise _Again(_words(error)) from None
+
+    async def _taken(self, answer: Any, start: int, stop: int) -> Part:
+        headers = answer.headers
+        tag = headers.get("ETag") or headers.get("Last-Modified") or ""
+        if answer.status >= 500 or answer.status == 429:
+            raise _Again(f"the server answers {answer.status} {answer.reason}")
+        if answer.status == 416 and _NOTHING.fullmatch(headers.get("Content-Range", "")):
+            return Part(b"", 0, tag)
+        if answer.status not in (200, 206):
+            raise RemoteError(f"the server answers {answer.status} {answer.reason}")
+        if headers.get("Content-Encoding", "identity") != "identity":
+            raise RemoteError("the server packs it on the way: download it first")
+        if answer.status == 200:
+            length = headers.get("Content-Length", "")
+            if start or not length.isdecimal() or int(length) > stop:
+                raise RemoteError(
+                    "the server sends no parts of a file (range requests): download it first"
+                )
+            return Part(await answer.content.readexactly(int(length)), int(length), tag)
+        total, count = _range_of(headers.get("Content-Range", ""), start, stop)
+        return Part(await answer.content.readexactly(count), total, tag)
+
+
+class _S3Remote:
+    """An object of an S3 bucket."""
+
+    def __init__(self, url: Url) -> None:
+        self._files = _s3()
+        self.loop = self._files.loop
+        self._bucket, self._key, _ = self._files.split_path(url.address)
+
+    async def part(self, start: int, stop: int) -> Part:
+        try:
+            answer = await self._files._call_s3(
+                "get_object",
+                Bucket=self._bucket,
+                Key=self._key,
+                Range=f"bytes={start}-{stop - 1}",
+            )
+        except OSError as error:
+            if "InvalidRange" in f"{error} {error.__cause__!r}" and not start:
+                return Part(b"", 0, "")
+            raise
+        total, count = _range_of(answer.get("ContentRange", ""), start, stop)
+        data = bytearray()
+        async with answer["Body"] as body:
+            while len(data) < count and (more := await body.read(count - len(data))):
+                data += more
+        return Part(bytes(data), total, answer.get("ETag", ""))
+
+
+def listed(url: Url) -> list[Url]:
+    """The logs right below an S3 prefix, finished or `.partial`, by name.
+
+    Raises:
+        UsageError: there is none.
+        RemoteError: the server does not list it.
+    """
+    files = _importing(_s3)
+
+    async def keys() -> list[str]:
+        return [str(e["name"]) for e in await files._ls(url.address, detail=True, refresh=True)]
+
+    try:
+        names = _waited(files.loop, keys())
+    except Exception as error:
+        raise RemoteError(f"{url}: {_words(error)}") from None
+    logs = [Url(f"s3://{n}") for n in sorted(names) if n.endswith((".mcap", ".mcap.partial"))]
+    if not logs:
+        raise UsageError(f"{url}: no .mcap file below this prefix")
+    return logs
+
+
+def _range_of(text: str, start: int, stop: int) -> tuple[int, int]:
+    """Total size and bytes of an answer, which must be the part that was asked for."""
+    found = _RANGE.fullmatch(text)
+    first, last, total = map(int, found.groups()) if found else (-1, -1, -1)
+    if first != start or last != min(stop, total) - 1:
+        raise RemoteError(
+            f"asked for the bytes {start} to {stop - 1}, the server answers {text[:60]!r}"
+        )
+    return total, last + 1 - first
+
+
+def _connect(url: Url) -> _Remote:
+    kind: type[_S3Remote] | type[_HttpRemote] = _S3Remote if url.scheme == "s3" else _HttpRemote
+    return _importing(lambda: kind(url))
+
+
+def _s3() -> Any:
+    import fsspec
+
+    limits = {"connect_timeout": _CONNECT_SECONDS, "read_timeout": _READ_SECONDS}
+    files = fsspec.filesystem("s3", use_listings_cache=False, config_kwargs=limits)
+    files.retries = _TRIES
+    return files
+
+
+def _importing(make: Callable[[], Value]) -> Value:
+    try:
+        return make()
+    except ImportError:
+        raise CdmisfaError(
+            "reading URLs needs packages that are not installed: pip install 'cdmisfa[cloud]'"
+        ) from None
+
+
+def _waited(loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, Value]) -> Value:
+    return asyncio.run_coroutine_threadsafe(work, loop).result(_WAIT_SECONDS)
+
+
+def _words(error: BaseException) -> str:
+    """What a server, or the way to it, has against us, in one line."""
+    if type(error).__name__ == "NoCredentialsError":
+        return (
+            "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
+            "FSSPEC_S3_ANON=true for a public bucket"
+        )
+    if isinstance(error, FileNotFoundError):
+        return "there is no such object"
+    if isinstance(error, PermissionError):
+        return f"the server refuses it ({str(error)[:100]})"
+    if isinstance(error, TimeoutError):
+        return "the server does not answer in time"
+    if isinstance(error, asyncio.IncompleteReadError):
+        return f"the server sent {len(error.partial)} bytes of {error.expected} and went away"
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
