@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,6 +41,15 @@ WATCHED_TOPIC = "/watched"
 PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
+
+NEVER_NS = 2**62
+"""More log time than any run has."""
+
+CHUNK_BYTES = 256 * 1024
+"""Size at which a chunk of the log is closed."""
+
+FLUSH_SECONDS = 1.0
+"""Longest time for which something that was written waits for the operating system."""
 
 _ITERATION = re.compile(r"iteration (\d{1,18})")
 
@@ -111,9 +121,17 @@ class RunWriter:
         self.spec = spec
         self._watched_every = max(watched_every, 1)
         self._phi_every = max(phi_every, 1)
-        # Values hardly compress, so the quicker codec; of images a tenth is left.
-        codec: Literal["zstd", "lz4"] = "zstd" if _is_image(spec) else "lz4"
-        self._log = LogFile(path, force=force, library="cdmisfa", compression=codec)
+        # The learner is quicker than the log's clock: what waits is flushed by the wall's. Of
+        # images zstd leaves a tenth less than lz4, and takes twice as long.
+        self._log = LogFile(
+            path,
+            force=force,
+            library="cdmisfa",
+            compression="lz4",
+            chunk_size=CHUNK_BYTES,
+            flush_ns=NEVER_NS,
+        )
+        self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
             METADATA,
             {
@@ -156,23 +174,23 @@ class RunWriter:
             block: the frames it is about.
             phi: (J, I) weights of the abstraction after the block.
         """
-        time, k = signals.log_time, signals.iteration
+        at, k = signals.log_time, signals.iteration
         sequence = k & 0xFFFFFFFF
-        self._log.write(self._signals, time, signals_message.encode(signals), sequence)
+        self._log.write(self._signals, at, signals_message.encode(signals), sequence)
         if block.truth.shape[1]:
-            self._log.write(
-                self._truth, time, matrix_message.encode(block.t, block.truth), sequence
-            )
+            self._log.write(self._truth, at, matrix_message.encode(block.t, block.truth), sequence)
         if self._images:
             encode = self._images[block.stream]
             for i in range(-block.t % self._watched_every, len(block), self._watched_every):
-                at = self.spec.time_ns(block.t + i)
-                self._log.write(self._watched, at, encode(at, block.frames[i]), sequence)
+                shown = self.spec.time_ns(block.t + i)
+                self._log.write(self._watched, shown, encode(shown, block.frames[i]), sequence)
         else:
             frames = block.frames.reshape(len(block), -1)
-            self._log.write(self._watched, time, matrix_message.encode(block.t, frames), sequence)
+            self._log.write(self._watched, at, matrix_message.encode(block.t, frames), sequence)
         if k % self._phi_every == 0 or signals.saved:
-            self._log.write(self._phi, time, matrix_message.encode(block.t, phi), sequence)
+            self._log.write(self._phi, at, matrix_message.encode(block.t, phi), sequence)
+        if time.monotonic() >= self._next_flush:
+            self.flush()
 
     def event(
         self,
@@ -185,9 +203,9 @@ class RunWriter:
         entry = Log_pb2.Log(
             level=Log_pb2.Log.Level.Value(level), message=text, name=f"iteration {iteration}"
         )
-        time = self.spec.time_ns(t)
-        entry.timestamp.FromNanoseconds(time)
-        self._log.write(self._event, time, entry.SerializeToString(), iteration & 0xFFFFFFFF)
+        at = self.spec.time_ns(t)
+        entry.timestamp.FromNanoseconds(at)
+        self._log.write(self._event, at, entry.SerializeToString(), iteration & 0xFFFFFFFF)
 
     def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
         """Copy what another log of the same run holds of its first iterations.
@@ -222,6 +240,7 @@ class RunWriter:
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
         self._log.flush()
+        self._next_flush = time.monotonic() + FLUSH_SECONDS
 
     def finish(self) -> None:
         """Write the index and give the file its name."""
@@ -328,9 +347,9 @@ def read_watched(path: Path) -> Iterator[tuple[int, NDArray[Any]]]:
     log = run_log(path)
     header = read_header(log)
     shape = header.spec.frame_shape
-    for time, data in _messages(log, WATCHED_TOPIC):
+    for at, data in _messages(log, WATCHED_TOPIC):
         if _is_image(header.spec):
-            yield header.frame_at(time), _pixels(data, shape, log)[None]
+            yield header.frame_at(at), _pixels(data, shape, log)[None]
         else:
             t, values = matrix_message.decode(data, f"{log} {WATCHED_TOPIC}")
             yield t, _reshaped(values, (-1, *shape), log)
@@ -356,7 +375,7 @@ def read_events(path: Path) -> Iterator[Event]:
     """What happened, in order."""
     log = run_log(path)
     header = read_header(log)
-    for time, data in _messages(log, EVENT_TOPIC):
+    for at, data in _messages(log, EVENT_TOPIC):
         try:
             entry = Log_pb2.Log.FromString(data)
         except message.DecodeError as error:
@@ -364,7 +383,7 @@ def read_events(path: Path) -> Iterator[Event]:
         match = _ITERATION.fullmatch(entry.name)
         level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
         iteration = int(match[1]) if match else -1
-        yield Event(header.frame_at(time), iteration, entry.message, level)
+        yield Event(header.frame_at(at), iteration, entry.message, level)
 
 
 def _is_image(spec: SourceSpec) -> bool:
