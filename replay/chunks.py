@@ -115,7 +115,7 @@ class ChunkScanner:
             return None
         wanted = [counts.get(layout.channel, 0) for layout in self._layouts]
         ends = np.empty((len(wanted), max(wanted)), np.int64)
-        if segment.end >= 2**63 or not self._scan(
+        if max(segment.start, segment.end) >= 2**63 or not self._scan(
             data,
             np.frombuffer(index, np.uint8),
             segment.start,

@@ -1,0 +1,104 @@
+"""Ten thousand broken logs, and every one that ever broke the reader; tests/fuzz.py has more."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import fuzz
+import fuzz_mutations
+import fuzz_oracle
+import pytest
+
+from cdmisfa.errors import LogDamagedError
+from replay.reader import LogReader
+
+CASES = 10_000
+BATCHES = 20
+
+
+@pytest.mark.parametrize("batch", range(BATCHES))
+def test_no_broken_log_breaks_a_promise(tmp_path: Path, batch: int) -> None:
+    for number in range(batch, CASES, BATCHES):
+        case = fuzz_mutations.mutated(number)
+        try:
+            fuzz_oracle.check(case, tmp_path / "log.mcap", number)
+        except Exception as error:
+            pytest.fail(f"case {number} ({case.base}): {type(error).__name__}: {error}")
+
+
+def test_little_memory_is_asked_for(tmp_path: Path) -> None:
+    for number in range(0, CASES, 500):
+        fuzz_oracle.check_memory(fuzz_mutations.mutated(number), tmp_path / "log.mcap")
+
+
+def test_what_once_broke_the_reader_does_so_no_more(tmp_path: Path) -> None:
+    for path in fuzz.KEPT.glob("*.mcap"):
+        for number in range(6):
+            fuzz_oracle.check(fuzz.kept(path), tmp_path / "log.mcap", number)
+
+
+def test_the_cases_reach_every_corner_of_the_reader(tmp_path: Path) -> None:
+    """Neither all refused nor all whole, and never the same twice."""
+    path, outcomes, files = tmp_path / "log.mcap", Counter[str](), set()
+    for number in range(600):
+        case = fuzz_mutations.mutated(number)
+        assert fuzz_mutations.mutated(number).raw == case.raw
+        files.add(case.raw)
+        path.write_bytes(case.raw)
+        try:
+            with LogReader(path) as reader:
+                outcomes["read" if len(list(reader.messages())) else "empty"] += 1
+        except LogDamagedError as error:
+            outcomes["in chunk" if ": chunk at byte" in str(error) else "outside"] += 1
+    assert len(files) > 550
+    assert all(outcomes[where] > 15 for where in ("read", "in chunk", "outside")), outcomes
+
+
+def test_a_reader_that_believes_everything_is_found_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from replay import reader
+
+    monkeypatch.setattr(reader, "crc32", lambda data, value=0: 0)
+    monkeypatch.setattr(reader.LogReader, "_check_data_crc", lambda self: None)
+
+    def decode(self: LogReader, segment: reader.Segment) -> reader.MessageTable:
+        segment_crc, segment.crc = segment.crc, 0
+        try:
+            return original(self, segment)
+        finally:
+            segment.crc = segment_crc
+
+    original = reader.LogReader._decode
+    monkeypatch.setattr(reader.LogReader, "_decode", decode)
+
+    def hunt() -> None:
+        for number in range(400):
+            fuzz_oracle.check(fuzz_mutations.mutated(number), tmp_path / "log.mcap")
+
+    with pytest.raises(fuzz_oracle.BrokenPromise, match="checksum"):
+        hunt()
+
+
+def test_a_job_goes_on_where_it_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[int] = []
+    monkeypatch.setattr(fuzz, "STATE", tmp_path)
+    monkeypatch.setattr(fuzz, "EVERY", 5)
+
+    def examine(number: int, path: Path) -> str | None:
+        if number == 12 and number not in seen:
+            seen.append(number)
+            raise KeyboardInterrupt
+        seen.append(number)
+        return "wrong" if number == 3 else None
+
+    monkeypatch.setattr(fuzz, "examine", examine)
+    with pytest.raises(KeyboardInterrupt):
+        fuzz.main(["--cases", "20"])
+    assert fuzz.main(["--cases", "20"]) == 1
+    assert sorted(set(seen)) == list(range(20))
+    assert seen.count(9) == 1
+    assert "1 found" in capsys.readouterr().out
