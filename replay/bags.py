@@ -1,4 +1,4 @@
-"""ROS bags: the images of a rosbag2 (.db3, or split) or of a ROS 1 .bag, through rosbags."""
+"""ROS bags: the images of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs import choose_topic
-from replay.images import Decoder, image_decoder, shrink
+from replay.images import RECIPE, Decoder, image_decoder, shrink
 from replay.records import Bytes, MalformedRecord
 
 _ROS1_TYPES = {
@@ -33,6 +33,8 @@ class BagImages:
         UsageError: no such topic, or no images on it.
         LogDamagedError: rosbags cannot read it.
     """
+
+    recipe = RECIPE
 
     def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
         self.path = path

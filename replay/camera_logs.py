@@ -1,27 +1,29 @@
-"""Where the images of other people's cameras lie: logs, bags, folders of pictures."""
+"""Where the images of other people's cameras lie: logs, bags, videos, folders of pictures."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.blocks import NANOSECONDS
 from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.files import log_files, sha256
-from replay.images import SCHEMAS, Decoder, compressed_gray, image_decoder, shrink
+from replay.files import identity, log_files, sha256
+from replay.images import RECIPE, SCHEMAS, Decoder, compressed_gray, image_decoder, shrink
 from replay.reader import LogReader
 from replay.records import Bytes, Channel, MalformedRecord
+from replay.store import Location, Url, location
 from replay.structure import Segment
 
 CACHE_BYTES: Final = 1024 * 1024
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 BAGS: Final = (".bag", ".db3")
+VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 
 Found = TypeVar("Found")
 
@@ -30,15 +32,19 @@ class ImageStream(Protocol):
     """The images of one camera, in the order of time.
 
     Attributes:
-        path: the log or the folder they are in.
         times: (n,) uint64, when each was taken, in nanoseconds; empty where nobody knows,
             in which case they are `count` images at any even rate.
         count: how many there are.
+        recipe: how an image becomes a frame, for the record.
     """
 
-    path: Path
+    recipe: str
     times: NDArray[np.uint64]
     count: int
+
+    @property
+    def path(self) -> Location:
+        """The log or the folder they are in."""
 
     @property
     def topic(self) -> str:
@@ -60,12 +66,12 @@ class ImageStream(Protocol):
 
 
 def open_images(
-    path: Path, topic: str | None, size: tuple[int, int], *, salvage: bool = False
+    path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
 ) -> ImageStream:
     """Open the images on a topic of a log, or in a folder.
 
     Args:
-        path: an MCAP log, a ROS bag or a folder of pictures.
+        path: an MCAP log or its URL, a ROS bag, a video or a folder of pictures.
         topic: the topic; may be left out where there is one topic of images.
         size: (height, width) of a frame.
         salvage: leave out what is damaged.
@@ -74,53 +80,76 @@ def open_images(
         UsageError: no such topic, or no images on it.
         LogDamagedError: the log is damaged.
     """
+    if isinstance(path, Url):
+        return McapImages(path, topic, size, salvage=salvage)
     if _is_bag(path):
         from replay.bags import BagImages
 
         return BagImages(path, topic, size)
+    if is_split(path):
+        from replay.joined import open_joined
+
+        return open_joined(path, parts_of(path), topic, size, salvage=salvage)
     if path.is_dir():
         return FolderImages(path, topic, size)
+    if path.suffix.lower() in VIDEOS:
+        from replay.video import VideoImages
+
+        return VideoImages(path, topic, size)
     return McapImages(path, topic, size, salvage=salvage)
 
 
-def image_logs(paths: Sequence[Path]) -> list[Path]:
-    """List the logs that paths mean: a folder of MCAP files is each of them.
+def image_logs(paths: Sequence[str | Location]) -> list[Location]:
+    """List the logs that paths mean: a folder of MCAP files is each of them, a rosbag2 one log.
 
     Raises:
         UsageError: there is none.
     """
-    found: list[Path] = []
-    for path in paths:
-        if _is_bag(path) or _is_picture_folder(path):
+    found: list[Location] = []
+    for path in map(location, paths):
+        if only_foreign(path) or (isinstance(path, Path) and is_split(path)):
             found.append(path)
         else:
             found += log_files(path)
     return found
 
 
-def only_foreign(path: Path) -> bool:
+def only_foreign(path: Location) -> bool:
     """Whether a path can be no recording of ours, by its kind."""
-    return _is_bag(path) or _is_picture_folder(path)
+    if isinstance(path, Url):
+        return False
+    video = path.suffix.lower() in VIDEOS and path.is_file()
+    return video or _is_bag(path) or _is_picture_folder(path)
 
 
-def fingerprint(path: Path) -> str:
-    """SHA-256 of a file, or over the names and contents of a folder's files.
+def is_split(path: Path) -> bool:
+    """Whether a folder is a rosbag2 of MCAP files, which are parts of one log."""
+    return (path / "metadata.yaml").is_file() and any(path.glob("*.mcap"))
+
+
+def parts_of(folder: Path) -> list[Path]:
+    """The parts of a rosbag2, in order."""
+    return sorted(folder.glob("*.mcap"), key=_by_number)
+
+
+def fingerprint(path: Location) -> dict[str, Any]:
+    """What tells a log from others: see `identity`; of a folder, names and contents count.
 
     Raises:
         CdmisfaError: a file cannot be read.
     """
-    if not path.is_dir():
-        return sha256(path)
+    if isinstance(path, Url) or not path.is_dir():
+        return identity(path)
     whole = hashlib.sha256()
     for file in sorted(p for p in path.iterdir() if p.is_file()):
         whole.update(f"{file.name}\0{sha256(file)}\n".encode("utf-8", "surrogateescape"))
-    return whole.hexdigest()
+    return {"file": path.name, "sha256": whole.hexdigest()}
 
 
 def _is_bag(path: Path) -> bool:
-    """A ROS bag; one in a single MCAP file is read as that."""
+    """A ROS bag that is not in MCAP files."""
     if path.is_dir():
-        return (path / "metadata.yaml").exists() and len(list(path.glob("*.mcap"))) != 1
+        return (path / "metadata.yaml").exists() and not any(path.glob("*.mcap"))
     return path.suffix in BAGS
 
 
@@ -133,7 +162,7 @@ def _is_picture_folder(path: Path) -> bool:
 
 
 def choose_topic(
-    path: Path, topic: str | None, readable: Sequence[tuple[str, Found]], others: dict[str, str]
+    path: Location, topic: str | None, readable: Sequence[tuple[str, Found]], others: dict[str, str]
 ) -> Found:
     """Find the one channel of images that is meant.
 
@@ -173,8 +202,10 @@ class McapImages:
         LogDamagedError: the log is damaged.
     """
 
+    recipe = RECIPE
+
     def __init__(
-        self, path: Path, topic: str | None, size: tuple[int, int], *, salvage: bool = False
+        self, path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
     ) -> None:
         self.path = path
         self.size = size
@@ -207,12 +238,8 @@ class McapImages:
         """
         if self._last is not None and self._last[0] == row:
             return self._last[1]
-        segment = self._segments[int(self._segment_of[row])]
-        table = self.reader.table(segment)
         try:
-            if table is None:
-                raise MalformedRecord("it is damaged")
-            image = shrink(self._decode(table.payload(int(self._row_in[row]))), *self.size)
+            image = shrink(self._decode(self._payload(row)), *self.size)
         except MalformedRecord as error:
             raise LogDamagedError(
                 f"{self.path}: {self.topic} at {self.times[row]} ns: {error}"
@@ -223,6 +250,18 @@ class McapImages:
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
         self.reader.close()
+
+    def _payload(self, row: int) -> bytes:
+        table = self.reader.table(self._segments[int(self._segment_of[row])])
+        if table is None:
+            raise MalformedRecord("it is damaged")
+        place = int(self._row_in[row])
+        if self.reader.by_index:
+            own = np.flatnonzero(table.channel == self.channel.id)
+            if place >= len(own) or table.log_time[own[place]] != self.times[row]:
+                raise MalformedRecord("its chunk holds other messages than the summary names")
+            place = int(own[place])
+        return table.payload(place)
 
     def _find(self, topic: str | None) -> tuple[Channel, Decoder]:
         readable: list[tuple[str, tuple[Channel, Decoder]]] = []
@@ -238,16 +277,19 @@ class McapImages:
         return choose_topic(self.path, topic, readable, others)
 
     def _index(self) -> None:
-        """Find every message of the topic; one pass over the log checks all of it."""
+        """Find every message of the topic.
+
+        One pass over a log checks all of it; of a URL only its message indexes are read, and
+        each chunk is checked when its images are.
+        """
         self._segments: list[Segment] = []
         times, members, rows = [], [], []
-        for segment, table in self.reader.tables(ordered=False):
-            own = np.flatnonzero(table.channel == self.channel.id)
-            if len(own):
-                times.append(table.log_time[own])
-                members.append(np.full(len(own), len(self._segments), np.int32))
-                rows.append(own.astype(np.int32))
-                self._segments.append(segment)
+        found = self._by_index() if self.reader.by_index else self._by_pass()
+        for segment, log_times, places in found:
+            times.append(log_times)
+            members.append(np.full(len(places), len(self._segments), np.int32))
+            rows.append(places.astype(np.int32))
+            self._segments.append(segment)
         if not times:
             raise UsageError(f"{self.path}: there is no message on {self.channel.topic}")
         order = np.argsort(np.concatenate(times), kind="stable")
@@ -257,6 +299,24 @@ class McapImages:
         self._segment_of = np.concatenate(members)[order]
         self._row_in = np.concatenate(rows)[order]
         self.count = len(order)
+        self.reader.expect(self._segments)
+
+    def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
+        """Log times of the topic's messages in each chunk, and their rows in its table."""
+        for segment, table in self.reader.tables(ordered=False):
+            own = np.flatnonzero(table.channel == self.channel.id)
+            if len(own):
+                yield segment, table.log_time[own], own
+
+    def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
+        """As `_by_pass`, with their rows among the topic's own messages of the chunk."""
+        number = self.channel.id
+        segments = [s for s in self.reader.segments if (s.channel_counts() or {}).get(number)]
+        self.reader.expect(segments, indexes=True)
+        for segment in segments:
+            pairs = np.concatenate([p for c, p in self.reader.index(segment) if c == number])
+            pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+            yield segment, pairs[:, 0], np.arange(len(pairs))
 
 
 class FolderImages:
@@ -270,6 +330,8 @@ class FolderImages:
     Raises:
         UsageError: it is no topic of the folder.
     """
+
+    recipe = RECIPE
 
     def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
         self.path = path

@@ -5,25 +5,31 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import PARTIAL
+from replay.reader import LogReader
 from replay.records import MAGIC
+from replay.store import Location, Url, location
 
 
-def log_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
-    """List the MCAP files of folders, and files that are named.
+def log_files(paths: str | Location | Iterable[str | Location]) -> list[Location]:
+    """List the MCAP files of folders and of S3 prefixes, and files that are named.
 
     In a folder a `.partial` counts where the finished file is not there.
 
     Raises:
         UsageError: there is none.
+        LogDamagedError: a server does not list it.
     """
-    if isinstance(paths, str | Path):
+    if isinstance(paths, str | Path | Url):
         paths = [paths]
-    files: list[Path] = []
-    for path in map(Path, paths):
-        if path.is_dir():
+    files: list[Location] = []
+    for path in map(location, paths):
+        if isinstance(path, Url):
+            files += _listed(path)
+        elif path.is_dir():
             whole = sorted(path.glob("*.mcap"))
             cut = sorted(path.glob(f"*.mcap{PARTIAL}"))
             found = whole + [p for p in cut if p.with_suffix("") not in whole]
@@ -52,6 +58,23 @@ def starts_as_log(path: Path) -> bool:
         raise CdmisfaError(f"{path}: {error.strerror}") from None
 
 
+def identity(path: Location) -> dict[str, Any]:
+    """What tells a log from others: of a file the SHA-256 of all of it.
+
+    Of a URL, so that not every byte is read, its size and `index_sha256`: over the file from
+    its data end record on, which holds the checksum of all data and where each chunk is. Where
+    the index does not account for every message, `sha256` over all of it, too.
+
+    Raises:
+        CdmisfaError: it cannot be read.
+    """
+    if not isinstance(path, Url):
+        return {"file": path.name, "sha256": sha256(path)}
+    with LogReader(path) as reader:
+        name = "index_sha256" if reader.by_index else "sha256"
+        return {"file": path.name, "url": str(path), "bytes": reader.size, name: reader.digest()}
+
+
 def sha256(path: Path) -> str:
     """SHA-256 of a file, read piece by piece.
 
@@ -63,3 +86,14 @@ def sha256(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise CdmisfaError(f"{path}: {error.strerror}") from None
+
+
+def _listed(url: Url) -> list[Location]:
+    """An S3 prefix as its logs, as in a folder; any other URL as itself."""
+    if not url.folder:
+        return [url]
+    from replay.remote import listed
+
+    found = listed(url)
+    whole = {log.name for log in found}
+    return [log for log in found if log.name.removesuffix(PARTIAL) not in whole - {log.name}]

@@ -169,7 +169,11 @@ class FollowedSource:
             Why they cannot be opened (yet).
         """
         try:
-            seen = [(path, path.stat().st_size) for path in log_files(self._path)]
+            seen = [
+                (path, path.stat().st_size)
+                for path in log_files(self._path)
+                if isinstance(path, Path)
+            ]
             if seen == self._seen and self._source is not None:
                 return None
             source = RecordedSource(self._path)

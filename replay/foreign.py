@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from cdmisfa.blocks import NANOSECONDS, Block, SourceSpec, check_request, freeze
 from cdmisfa.errors import LogExhaustedError, UsageError
 from replay.camera_logs import ImageStream, even_times, fingerprint, image_logs, open_images
-from replay.images import RECIPE, step_of
+from replay.images import step_of
+from replay.joined import join_parts
+from replay.store import Location, Url
 
 Align = Literal["index", "time"]
 MAX_FRAMES: Final = 2**31
@@ -36,10 +38,11 @@ class Aligned:
 
 
 class ForeignSource:
-    """Cameras in MCAP logs, ROS bags and folders of pictures, gray and small, on one clock.
+    """Cameras in MCAP logs, ROS bags, videos and folders of pictures, gray and small, on one clock.
 
     Args:
-        paths: one log, or one log or folder of pictures a stream.
+        paths: one log, or one log, video or folder of pictures a stream. Logs that follow one
+            another in time are parts of one stream, unless they are aligned by index.
         topics: the topics, a stream each; none where each log has one topic of images.
         size: (height, width) of a frame.
         align: how streams of unequal length, start or rate are put on one clock: "index"
@@ -57,7 +60,7 @@ class ForeignSource:
 
     def __init__(
         self,
-        paths: str | Path | Sequence[str | Path],
+        paths: str | Location | Sequence[str | Location],
         topics: Sequence[str] = (),
         *,
         size: tuple[int, int] = (48, 128),
@@ -76,16 +79,18 @@ class ForeignSource:
             raise UsageError(f"--rate is {rate}: it must be in [0.001, 1000000]")
         if min(size) < 1:
             raise UsageError(f"--size is {size[1]}x{size[0]}: it must be above 0")
-        named = [paths] if isinstance(paths, str | Path) else paths
-        self._files = image_logs([Path(path) for path in named])
+        named = [paths] if isinstance(paths, str | Path | Url) else paths
+        self._files = image_logs(named)
         self._loop = loop
         self._t = 0
-        self._hashes: list[dict[str, str]] | None = None
+        self._hashes: list[dict[str, Any]] | None = None
         self._size = size
         self._streams: list[ImageStream] = []
         try:
             for path, topic in _pairs(self._files, topics):
                 self._streams.append(open_images(path, topic, size, salvage=salvage))
+            if align != "index":
+                self._streams = join_parts(self._streams)
             self._align_by = align
             self._fps = rate or _rate(self._streams)
             self._times = [
@@ -165,15 +170,13 @@ class ForeignSource:
     def describe(self) -> Mapping[str, Any]:
         """The logs with their SHA-256, the topics, and how they became frames."""
         if self._hashes is None:
-            self._hashes = [
-                {"file": path.name, "sha256": fingerprint(path)} for path in self._files
-            ]
+            self._hashes = [fingerprint(path) for path in self._files]
         return {
             "kind": "foreign",
             "files": self._hashes,
             "topics": [s.topic for s in self._streams],
             "size": list(self._spec.frame_shape),
-            "recipe": RECIPE,
+            "recipe": "; ".join(dict.fromkeys(s.recipe for s in self._streams)),
             "align": self._align_by,
             "rate": self._fps,
             "alignment": self.alignment,
@@ -264,7 +267,7 @@ class ForeignSource:
         return shlex.join([*words, "-o", "RUN"])
 
 
-def _pairs(files: Sequence[Path], topics: Sequence[str]) -> list[tuple[Path, str | None]]:
+def _pairs(files: Sequence[Location], topics: Sequence[str]) -> list[tuple[Location, str | None]]:
     if len(files) == 1:
         return [(files[0], topic) for topic in topics] or [(files[0], None)]
     if not topics:
@@ -273,7 +276,8 @@ def _pairs(files: Sequence[Path], topics: Sequence[str]) -> list[tuple[Path, str
         return [(file, topics[0]) for file in files]
     if len(topics) != len(files):
         raise UsageError(
-            f"{len(files)} logs and {len(topics)} topics: name one log, or one --topic for each"
+            f"{len(files)} logs and {len(topics)} topics: name one log, or one --topic for each; "
+            "parts of one log with several topics go in a folder with their metadata.yaml"
         )
     return list(zip(files, topics, strict=True))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
 from recorder.messages import METADATA
@@ -18,6 +19,8 @@ from replay.reader import Crc, LogReader
 from replay.records import MalformedRecord
 from replay.runlog import METADATA as RUN_METADATA
 from replay.runlog import RUN_FILE
+from replay.store import Location, location
+from replay.structure import Segment
 
 SCHEMA: Final = 1
 """Rises whenever a key of what `describe` gives changes its meaning."""
@@ -42,10 +45,11 @@ class ChannelSurvey:
             self.end = high if self.end is None else max(self.end, high)
 
 
-def describe(path: str | Path) -> dict[str, Any]:
+def describe(path: str | Location) -> dict[str, Any]:
     """Describe a recording's or run's folder, or any MCAP file, as JSON values.
 
-    Torn and damaged files are described as far as they can be read.
+    Torn and damaged files are described as far as they can be read. Of a URL whose summary
+    accounts for every message no more than that is read, and `crc` is "unchecked".
 
     Returns:
         `schema`, `path`, `kind` ("recording", "run" or "foreign"), `channels` (topic,
@@ -57,6 +61,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         UsageError: no such log.
         LogDamagedError: not an MCAP file.
     """
+    path = location(path)
     files = log_files(path)
     documents = [_describe_file(file) for file in files]
     kinds = {d["kind"] for d in documents}
@@ -72,7 +77,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "problems": [p for d in documents for p in d["problems"]],
         "metadata": {d["file"]: d["metadata"] for d in documents},
         "seed": _seed(documents),
-        "ended": _ended(Path(path)),
+        "ended": _ended(path) if isinstance(path, Path) else None,
     }
 
 
@@ -133,6 +138,40 @@ def survey_index(reader: LogReader) -> dict[int, ChannelSurvey]:
     return found
 
 
+def survey_summary(reader: LogReader) -> dict[int, ChannelSurvey]:
+    """Count the messages of each channel by the summary, reading few message indexes.
+
+    A channel begins in one of the chunks that begin before any message of it that is known.
+    """
+    found = {number: ChannelSurvey() for number in reader.channels}
+    chunks: dict[int, list[Segment]] = {}
+    for segment in reader.segments:
+        for number, count in (segment.channel_counts() or {}).items():
+            if count:
+                found[number].messages += count
+                chunks.setdefault(number, []).append(segment)
+    for number, segments in chunks.items():
+        channel = found[number]
+        for segment in sorted(segments, key=lambda s: s.start):
+            if channel.start is not None and segment.start >= channel.start:
+                break
+            low = int(_indexed_times(reader, segment, number).min())
+            channel.start = low if channel.start is None else min(low, channel.start)
+        for segment in sorted(segments, key=lambda s: s.end, reverse=True):
+            if channel.end is not None and segment.end <= channel.end:
+                break
+            channel.end = max(int(_indexed_times(reader, segment, number).max()), channel.end or 0)
+    return found
+
+
+def _indexed_times(reader: LogReader, segment: Segment, number: int) -> NDArray[np.uint64]:
+    try:
+        pairs = [pairs[:, 0] for n, pairs in reader.index(segment) if n == number]
+    except MalformedRecord as error:
+        raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
+    return np.concatenate(pairs)
+
+
 def crc_state(reader: LogReader, *, decoded: bool) -> Crc:
     """Say what the checksums of a log amount to."""
     if any("CRC" in problem.what for problem in reader.problems):
@@ -142,10 +181,13 @@ def crc_state(reader: LogReader, *, decoded: bool) -> Crc:
     return "absent" if reader.crc_absent() else "ok"
 
 
-def _describe_file(path: Path) -> dict[str, Any]:
+def _describe_file(path: Location) -> dict[str, Any]:
     with LogReader(path, salvage=True) as reader:
-        decode = sum(s.size for s in reader.segments) <= CHECK_BYTES
-        surveys = survey(reader) if decode else survey_index(reader)
+        decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
+        if reader.by_index:
+            surveys = survey_summary(reader)
+        else:
+            surveys = survey(reader) if decode else survey_index(reader)
         channels = []
         for number, found in sorted(surveys.items()):
             channel = reader.channels.get(number)

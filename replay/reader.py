@@ -6,6 +6,7 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 
 from __future__ import annotations
 
+import hashlib
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -204,6 +205,13 @@ class LogReader:
             )
         return self._file.read(attachment.offset, attachment.size)
 
+    def digest(self) -> str:
+        """SHA-256 of the file; where only the summary was read, from its data's end on."""
+        whole = hashlib.sha256()
+        for block in self._file.blocks(self._structure.data_end if self.by_index else 0, self.size):
+            whole.update(block)
+        return whole.hexdigest()
+
     def crc_absent(self) -> int:
         """Count the chunks and runs of messages that no CRC protects."""
         if self._structure.data_crc:
@@ -294,9 +302,15 @@ class LogReader:
                 table = table.select(np.argsort(table.log_time, kind="stable"))
             yield group[0][1], _within(table, low, high)
 
-    def expect(self, segments: Iterable[Segment]) -> None:
-        """Say which chunks will be decoded, one after the other, so that they come in time."""
-        self._file.expect([(segment.offset, segment.stop) for segment in segments])
+    def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
+        """Say which chunks will be read, one after the other, so that they come in time.
+
+        Args:
+            segments: the chunks.
+            indexes: only their message indexes.
+        """
+        spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
+        self._file.expect(list(spans))
 
     def table(self, segment: Segment) -> MessageTable | None:
         """Decode a chunk and check it; the last few are kept.

@@ -6,7 +6,6 @@ import bisect
 import itertools
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,8 +13,9 @@ import numpy as np
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
 from cdmisfa.errors import LogDamagedError, LogExhaustedError
 from recorder.logfile import PARTIAL
-from replay.files import log_files, sha256
+from replay.files import identity, log_files
 from replay.reader import LogReader
+from replay.store import Location, Url
 from replay.viewfacts import ViewFacts
 from replay.viewfile import ViewFile, intersection
 
@@ -35,7 +35,8 @@ class RecordedSource:
     """The views of a recording on their common clock.
 
     Args:
-        paths: a recording's folder, or the files of its views, finished or `.partial`.
+        paths: a recording's folder, or the files of its views, finished or `.partial`; or an
+            S3 prefix, or URLs.
         loop: begin again at the end instead of stopping there.
         salvage: leave out, in every view, what is damaged in one of them.
 
@@ -44,7 +45,11 @@ class RecordedSource:
     """
 
     def __init__(
-        self, paths: str | Path | Iterable[str | Path], *, loop: bool = False, salvage: bool = False
+        self,
+        paths: str | Location | Iterable[str | Location],
+        *,
+        loop: bool = False,
+        salvage: bool = False,
     ) -> None:
         """Open every view and check that they belong together.
 
@@ -142,9 +147,8 @@ class RecordedSource:
             self._hashes = [
                 {
                     "name": view.facts.view,
-                    "file": view.path.name,
                     "frames": view.count,
-                    "sha256": sha256(view.path),
+                    **identity(view.path),
                 }
                 for parts in self._views
                 for view in parts
@@ -171,7 +175,7 @@ class RecordedSource:
 
     def _name(self) -> str:
         parents = {path.parent for path in self._files}
-        return str(self._files[0] if len(self._files) == 1 else sorted(parents)[0])
+        return str(self._files[0]) if len(self._files) == 1 else min(map(str, parents))
 
     def _set_clock(self) -> None:
         """Find the frames that every view has, whole."""
@@ -227,9 +231,9 @@ class RecordedSource:
         raise AssertionError(f"frame {frame} is in no file")
 
 
-def _only_begun(path: Path) -> bool:
+def _only_begun(path: Location) -> bool:
     """Whether a file is a further part that its recorder had begun, but not a frame of it."""
-    if not _FURTHER_PART.fullmatch(path.name):
+    if isinstance(path, Url) or not _FURTHER_PART.fullmatch(path.name):
         return False
     try:
         with LogReader(path) as reader:

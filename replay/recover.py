@@ -15,6 +15,7 @@ from replay.files import log_files
 from replay.info import ChannelSurvey
 from replay.reader import LogReader
 from replay.records import Channel, Schema
+from replay.store import Location, Url, location
 from replay.tables import MessageTable
 
 
@@ -27,7 +28,7 @@ class _Tally:
     digest: Any = field(default_factory=hashlib.sha256)
 
 
-def recover(src: str | Path, dst: str | Path, *, force: bool = False) -> dict[str, Any]:
+def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dict[str, Any]:
     """Write a complete, indexed log of everything in `src` that is readable.
 
     The new file is read again, with its checksums, and compared before this returns.
@@ -44,20 +45,18 @@ def recover(src: str | Path, dst: str | Path, *, force: bool = False) -> dict[st
         LogDamagedError: not an MCAP file.
         LogWriteError: the disk does not take it.
     """
-    src, dst = Path(src), Path(dst)
+    src, dst = location(src), Path(dst)
     files = log_files(src)
-    if src.is_dir() and dst.exists() and not dst.is_dir():
+    many = src.folder if isinstance(src, Url) else src.is_dir()
+    if many and dst.exists() and not dst.is_dir():
         raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
     try:
-        (dst if src.is_dir() else dst.parent).mkdir(parents=True, exist_ok=True)
+        (dst if many else dst.parent).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{dst}: {error.strerror}") from None
-    if not src.is_dir():
-        targets = [dst]
-    else:
-        targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
+    targets = [dst / file.name.removesuffix(PARTIAL) for file in files] if many else [dst]
     for file, target in zip(files, targets, strict=True):
-        if target.exists() and file.samefile(target):
+        if isinstance(file, Path) and target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
     reports = [_recover_file(f, t, force) for f, t in zip(files, targets, strict=True)]
     return {
@@ -70,8 +69,8 @@ def recover(src: str | Path, dst: str | Path, *, force: bool = False) -> dict[st
     }
 
 
-def _recover_file(src: Path, dst: Path, force: bool) -> dict[str, Any]:
-    with LogReader(src, salvage=True) as reader:
+def _recover_file(src: Location, dst: Path, force: bool) -> dict[str, Any]:
+    with LogReader(src, salvage=True, whole=True) as reader:
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             tallies, unverified = _copy(reader, log)

@@ -103,6 +103,7 @@ class ChannelRows:
         self._decode = decode
         self._decoded: OrderedDict[int, Rows] = OrderedDict()
         self._segments: list[Segment] = []
+        self._to_confirm: dict[int, ViewFacts] = {}
         counts: list[int] = []
         for segment in reader.segments:
             count = self._count(segment)
@@ -122,6 +123,8 @@ class ChannelRows:
             LogDamagedError: a log time that is no frame's, a frame twice or out of order,
                 and without `salvage` a frame that is missing.
         """
+        if self._reader.by_index and not salvage:
+            return self._stated_runs(facts)
         found: list[Run] = []
         row = 0
         batch: list[NDArray[np.uint64]] = []
@@ -137,6 +140,27 @@ class ChannelRows:
                     raise LogDamagedError(f"{self._reader.path}: {error}") from None
         self._number(batch, row, facts, found, salvage)
         return found
+
+    def _stated_runs(self, facts: ViewFacts) -> list[Run]:
+        """Number the messages by how many the summary says each chunk has.
+
+        Each chunk's log times are compared with this when it is read.
+        """
+        self._to_confirm = dict.fromkeys(range(len(self._segments)), facts)
+        count = self._starts[-1]
+        return [Run(facts.first_frame, facts.first_frame + count, 0)] if count else []
+
+    def _confirm(self, number: int) -> None:
+        """Check the log times of a chunk whose frames were numbered by the summary."""
+        facts = self._to_confirm.pop(number, None)
+        if facts is None:
+            return
+        start = facts.first_frame + self._starts[number]
+        before = [Run(facts.first_frame, start, 0)] if self._starts[number] else []
+        try:
+            self._number([self._times(number)], self._starts[number], facts, before, False)
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self._reader.path}: {error}") from None
 
     def _number(
         self,
@@ -207,6 +231,7 @@ class ChannelRows:
             here = min(self._starts[number + 1] - row, count) - at
             segment = self._segments[number]
             found.append(Piece(segment.offset, segment, which, low, here, at))
+            self._confirm(number)
             at, number = at + here, number + 1
         return found
 
@@ -233,6 +258,7 @@ class ChannelRows:
 
     def _table(self, number: int) -> MessageTable:
         segment = self._segments[number]
+        self._confirm(number)
         table = self._reader.table(segment)
         if table is None:
             raise LogDamagedError(f"{self._reader.path}: {segment.name} is damaged")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,12 +13,13 @@ from replay.files import log_files
 from replay.info import crc_state, kind_of, survey
 from replay.reader import Crc, LogReader
 from replay.recorded import RecordedSource
+from replay.store import Location, location
 from replay.viewfile import ViewFile
 
 _BLOCK: Final = 256
 
 
-def verify(path: str | Path) -> dict[str, Any]:
+def verify(path: str | Location) -> dict[str, Any]:
     """Check a log, or all logs of a folder, by decoding everything in them.
 
     Of a recording also: each view has every frame once; of a folder, that the views have the
@@ -34,20 +34,20 @@ def verify(path: str | Path) -> dict[str, Any]:
     """
     problems: list[dict[str, str]] = []
     files: list[dict[str, str]] = []
-    views: list[Path] = []
+    views: list[Location] = []
     for file in log_files(path):
         state, kind = _check_file(file, problems)
         files.append({"file": str(file), "crc": state})
         if kind == "recording":
             views.append(file)
     if views:
-        _check_views(views, problems, alone=Path(path).is_file())
+        _check_views(views, problems, alone=log_files(path) == [location(path)])
     return {"ok": not problems, "problems": problems, "files": files}
 
 
-def _check_file(path: Path, problems: list[dict[str, str]]) -> tuple[Crc, str]:
+def _check_file(path: Location, problems: list[dict[str, str]]) -> tuple[Crc, str]:
     try:
-        with LogReader(path, salvage=True) as reader:
+        with LogReader(path, salvage=True, whole=True) as reader:
             found = survey(reader)
             for number in found.keys() - reader.channels.keys():
                 _note(problems, path, f"holds messages of channel {number}, never defined")
@@ -65,7 +65,7 @@ def _check_file(path: Path, problems: list[dict[str, str]]) -> tuple[Crc, str]:
         return "bad", "foreign"
 
 
-def _check_views(paths: list[Path], problems: list[dict[str, str]], *, alone: bool) -> None:
+def _check_views(paths: list[Location], problems: list[dict[str, str]], *, alone: bool) -> None:
     sound = True
     streams: set[str] = set()
     names: set[str] = set()
@@ -109,11 +109,11 @@ def _decode(view: ViewFile) -> None:
             view.truth(at, np.empty((n, len(view.facts.truth))))
 
 
-def _note(problems: list[dict[str, str]], path: Path, what: str, where: str = "") -> None:
+def _note(problems: list[dict[str, str]], path: Location, what: str, where: str = "") -> None:
     problem = {"where": f"{path}: {where}" if where else str(path), "what": what}
     if problem not in problems:
         problems.append(problem)
 
 
-def _without(path: Path, error: LogDamagedError) -> str:
+def _without(path: Location, error: LogDamagedError) -> str:
     return str(error).removeprefix(f"{path}: ")

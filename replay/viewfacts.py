@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from cdmisfa.blocks import NANOSECONDS
 from cdmisfa.errors import LogDamagedError
 from recorder.messages import SCHEMA_VERSION
+from replay.store import Location
 
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
@@ -58,7 +58,7 @@ class ViewFacts:
         return np.asarray(np.clip(frames, -1, MAX_FRAMES), dtype=np.int64)
 
 
-def view_facts(path: Path, values: Mapping[str, str]) -> ViewFacts:
+def view_facts(path: Location, values: Mapping[str, str]) -> ViewFacts:
     """Check a file's statement about itself.
 
     Raises:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import bisect
 import operator
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from replay.chunks import ChunkScanner, RowLayout
 from replay.reader import LogReader
 from replay.records import MalformedRecord
 from replay.rows import ChannelRows, PixelRows, Rows, Run, TruthRows
+from replay.store import Location
 from replay.tables import MessageTable, windows
 from replay.viewfacts import view_facts
 
@@ -51,7 +51,7 @@ class ViewFile:
     """
 
     def __init__(
-        self, path: Path, *, salvage: bool = False, cache_bytes: int | None = None
+        self, path: Location, *, salvage: bool = False, cache_bytes: int | None = None
     ) -> None:
         """Open one view's file and check the times of its frames.
 
@@ -97,6 +97,7 @@ class ViewFile:
             self.ranges = intersection(
                 self.ranges, [(run.start, run.stop) for run in self._truth_runs]
             )
+        self.reader.expect(self.reader.segments)
         self._payload = self._find_payload() if self.ranges else Payload(0, 0, b"")
 
     @property
