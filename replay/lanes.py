@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from cdmisfa.signals import BlockSignals
 from replay.columns import Clock
 from replay.labels import label, part
 from replay.palette import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Rgb, colour, packed
+from replay.signal_columns import SignalColumns
 
 STAY, SWITCH = "stay", "switch"
 
@@ -42,21 +44,17 @@ class Lanes:
         self._declared: dict[str, int] = {}
         self._iteration = 0
 
-    def add(self, signals: BlockSignals) -> None:
-        """Take the state of one iteration in."""
-        stream = label(self._names[signals.stream])
-        self._iteration = signals.iteration
-        self._put(signals, "lanes/1_stream", stream, colour(signals.stream))
-        learned = f"module {signals.module}"
-        self._put(signals, "lanes/2_learning", learned, colour(signals.module - 1))
-        self._put(signals, "lanes/3_gate", *_verdict(signals))
-        action = (STAY, SKY) if signals.action == 0 else (SWITCH, VERMILLION)
-        self._put(signals, "lanes/4_action", *action)
-        drawn = ("explored", ORANGE) if signals.explored else ("greedy", BLUE)
-        self._put(signals, "lanes/5_chosen_by", *drawn)
+    def add(self, columns: SignalColumns) -> None:
+        """Take the states of consecutive iterations in."""
+        self._iteration = int(columns.iterations[-1])
+        self._put(columns, "lanes/1_stream", columns["stream"], self._stream)
+        self._put(columns, "lanes/2_learning", columns["module"], _learning)
+        verdicts = np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0))
+        self._put(columns, "lanes/3_gate", verdicts, _verdict)
+        self._put(columns, "lanes/4_action", columns["action"], _action)
+        self._put(columns, "lanes/5_chosen_by", columns["explored"], _chosen)
         for s, path in self._policies.items():
-            planned = (SWITCH, GREY) if signals.policy[s] else (STAY, colour(s))
-            self._put(signals, path, *planned)
+            self._put(columns, path, columns["policy"][:, s], partial(_planned, stream=s))
 
     def end(self, frames: int) -> None:
         """Write what is left; all lanes end with the run.
@@ -98,16 +96,48 @@ class Lanes:
             static=True,
         )
 
-    def _put(self, signals: BlockSignals, path: str, state: str, rgb: Rgb) -> None:
+    def _put(
+        self,
+        columns: SignalColumns,
+        path: str,
+        codes: NDArray[np.int64],
+        name: Callable[[int], tuple[str, Rgb]],
+    ) -> None:
+        """Keep the places where what the codes stand for changes."""
         changes = self._changes.setdefault(path, [])
-        self._colours.setdefault(path, {}).setdefault(state, rgb)
-        if not changes or changes[-1][2] != state:
-            changes.append((signals.t, signals.iteration, state))
+        colours = self._colours.setdefault(path, {})
+        begins = np.flatnonzero(np.diff(codes.astype(np.int64), prepend=int(codes[0]) + 1))
+        rows = zip(codes[begins], columns.frames[begins], columns.iterations[begins], strict=True)
+        for code, t, iteration in rows:
+            state, rgb = name(int(code))
+            colours.setdefault(state, rgb)
+            if not changes or changes[-1][2] != state:
+                changes.append((int(t), int(iteration), state))
+
+    def _stream(self, stream: int) -> tuple[str, Rgb]:
+        return label(self._names[stream]), colour(stream)
 
 
-def _verdict(signals: BlockSignals) -> tuple[str, Rgb]:
-    if signals.novel:
+_NOVEL = -1
+
+
+def _learning(module: int) -> tuple[str, Rgb]:
+    return f"module {module}", colour(module - 1)
+
+
+def _verdict(code: int) -> tuple[str, Rgb]:
+    if code == _NOVEL:
         return "novel", GREEN
-    if signals.known_by > 0:
-        return f"known by {signals.known_by}", colour(signals.known_by - 1)
-    return "constant", PURPLE
+    return (f"known by {code}", colour(code - 1)) if code else ("constant", PURPLE)
+
+
+def _action(action: int) -> tuple[str, Rgb]:
+    return (STAY, SKY) if action == 0 else (SWITCH, VERMILLION)
+
+
+def _chosen(explored: int) -> tuple[str, Rgb]:
+    return ("explored", ORANGE) if explored else ("greedy", BLUE)
+
+
+def _planned(action: int, stream: int) -> tuple[str, Rgb]:
+    return (SWITCH, GREY) if action else (STAY, colour(stream))

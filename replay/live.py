@@ -11,7 +11,6 @@ import os
 import subprocess
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -27,6 +26,7 @@ from replay.layout import MOST_MODULES, RunLayout
 from replay.outline import LINES, Outline
 from replay.run_view import RunView
 from replay.runlog import RunHeader
+from replay.signal_columns import columns_of_records
 from replay.view import APPLICATION
 from replay.viewer import environment, free_port, program
 
@@ -82,7 +82,10 @@ class LiveView:
         self._recording.send_recording_name("live")
         self._recording.send_blueprint(RunLayout(outline).blueprint())
         # No image is left out here: of each block only the first is taken.
-        self._view = RunView(self._recording, Path(), outline, ViewConfig(every=1))
+        config = ViewConfig(every=1)
+        self._view = RunView(
+            self._recording, outline.header, outline.streams(config.streams), config
+        )
         self._images = len(spec.frame_shape) == 2
         self._records: list[BlockSignals] = []
         self._watched: list[NDArray[Any]] = []
@@ -110,7 +113,8 @@ class LiveView:
         if self._records and self._phi is not None:
             last, starts = self._records[-1], np.array([s.t for s in self._records])
             every = (starts[:, None] + np.arange(len(last.y))).reshape(-1)
-            self._view.add(self._records)
+            for columns in columns_of_records(self._records):
+                self._view.add(columns)
             self._view.watched(starts if self._images else every, np.concatenate(self._watched))
             if self._view.spec.truth:
                 self._view.truth(every, np.concatenate(self._truth))

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.signals import BlockSignals
-from replay.runlog import RunHeader, read_header, read_signals
+from replay.runlog import RunHeader, read_header, run_log
+from replay.signal_columns import SignalColumns
+from replay.stretch import read_columns
 
 Float = NDArray[np.float64]
 
@@ -62,8 +63,7 @@ class Outline:
     @property
     def delta(self) -> float | None:
         """Threshold of eta-dot, where the configuration names it."""
-        value = self.header.setting("learner", "delta")
-        return float(value) if isinstance(value, int | float) else None
+        return delta_of(self.header)
 
     def streams(self, most: int) -> list[int]:
         """The most watched streams, at most so many, in their own order."""
@@ -91,6 +91,54 @@ class Outline:
         return (lower - margin if low is None else lower), upper + margin
 
 
+def delta_of(header: RunHeader) -> float | None:
+    """Threshold of eta-dot, where a run's configuration names it."""
+    value = header.setting("learner", "delta")
+    return float(value) if isinstance(value, int | float) else None
+
+
+class Tally:
+    """Sums a run up, as its records come.
+
+    Attributes:
+        header: what stands at the beginning of its log.
+    """
+
+    def __init__(self, header: RunHeader) -> None:
+        self.header = header
+        self._visits = np.zeros(len(header.spec.streams), dtype=np.int64)
+        self._lines: dict[str, list[Float]] = {name: [] for name in LINES}
+        self._saved: list[Saved] = []
+        self._iterations = self._modules = self._tau = self._outputs = 0
+        self._policy: tuple[int, ...] = ()
+
+    def add(self, columns: SignalColumns) -> None:
+        """Take the next records in."""
+        _, self._tau, self._outputs = columns["y"].shape
+        self._visits += self._tau * np.bincount(columns["stream"], minlength=len(self._visits))
+        for name, parts in self._lines.items():
+            parts.append(columns[name].reshape(-1))
+        self._modules = max(self._modules, columns["y_frozen"].shape[1])
+        self._saved += [_save_of(columns, i) for i in np.flatnonzero(columns["saved"]).tolist()]
+        self._iterations += len(columns)
+        self._policy = tuple(columns["policy"][-1].tolist())
+
+    def outline(self) -> Outline:
+        """What was taken in, in short."""
+        return Outline(
+            header=self.header,
+            iterations=self._iterations,
+            frames=int(self._visits.sum()),
+            tau=self._tau,
+            outputs=self._outputs,
+            modules=self._modules,
+            visits=self._visits.copy(),
+            saved=tuple(self._saved),
+            policy=self._policy,
+            lines={name: _joined(parts) for name, parts in self._lines.items()},
+        )
+
+
 def read_outline(path: Path) -> Outline:
     """Read a run through once.
 
@@ -98,43 +146,22 @@ def read_outline(path: Path) -> Outline:
         UsageError: there is no such run.
         LogDamagedError: it cannot be read.
     """
-    header = read_header(path)
-    visits = np.zeros(len(header.spec.streams), dtype=np.int64)
-    lines: dict[str, list[Float]] = {name: [] for name in LINES}
-    saved: list[Saved] = []
-    last: BlockSignals | None = None
-    count = modules = 0
-    for signals in read_signals(path):
-        visits[signals.stream] += len(signals.y)
-        for name in LINES:
-            lines[name].append(np.atleast_1d(getattr(signals, name)))
-        modules = max(modules, len(signals.y_frozen))
-        if signals.saved:
-            saved.append(_save_of(signals))
-        count, last = count + 1, signals
-    return Outline(
-        header=header,
-        iterations=count,
-        frames=int(visits.sum()),
-        tau=0 if last is None else len(last.y),
-        outputs=0 if last is None else last.y.shape[1],
-        modules=modules,
-        visits=visits,
-        saved=tuple(saved),
-        policy=() if last is None else tuple(last.policy.tolist()),
-        lines={name: _joined(parts) for name, parts in lines.items()},
-    )
+    log = run_log(path)
+    tally = Tally(read_header(log))
+    for columns in read_columns(log, tally.header):
+        tally.add(columns)
+    return tally.outline()
 
 
-def _save_of(signals: BlockSignals) -> Saved:
+def _save_of(columns: SignalColumns, place: int) -> Saved:
     return Saved(
-        module=signals.module,
-        stream=signals.stream,
-        iteration=signals.iteration,
-        t=signals.t,
-        policy=tuple(signals.policy.tolist()),
-        eta=tuple(signals.eta.tolist()),
-        eta_dot=tuple(signals.eta_dot.tolist()),
+        module=int(columns["module"][place]),
+        stream=int(columns["stream"][place]),
+        iteration=int(columns.iterations[place]),
+        t=int(columns.frames[place]),
+        policy=tuple(columns["policy"][place].tolist()),
+        eta=tuple(columns["eta"][place].tolist()),
+        eta_dot=tuple(columns["eta_dot"][place].tolist()),
     )
 
 

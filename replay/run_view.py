@@ -8,8 +8,6 @@ those of run.mcap. `/world`, `/lanes`, `/decision`, `/gate`, `/abstraction` and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import groupby, islice
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,14 +15,16 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.modules import Module
-from cdmisfa.signals import SIGNALS, BlockSignals, Signal
+from cdmisfa.signals import SIGNALS, Signal
 from replay.columns import Clock, Column, ImageColumn, TensorColumn
 from replay.config import ViewConfig
 from replay.labels import label, part
 from replay.lanes import Lanes
-from replay.outline import Outline
+from replay.outline import Outline, delta_of
 from replay.palette import GREY, VERMILLION, colour, packed, shade
-from replay.runlog import read_events, read_phi, read_signals, read_truth, read_watched
+from replay.runlog import RunHeader
+from replay.signal_columns import SignalColumns
+from replay.stretch import Stretch
 
 AXES = {"S": "stream", "A": "action", "J": "output"}
 """Names of tensors' dimensions; the second S of a tensor is the next stream."""
@@ -34,9 +34,6 @@ TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2}
 """Colours of signals that are drawn beside another one."""
-
-BATCH = 100
-"""Records that are turned into rows together."""
 
 SPARSE = 10
 """With more streams than are shown one by one, tensors are kept every so many iterations."""
@@ -50,63 +47,68 @@ class RunView:
 
     Args:
         recording: the recording.
-        path: the run.
-        outline: the run in short.
-        config: how it is shown.
+        header: what stands at the beginning of the run's log.
+        streams: those that get lines and lanes of their own.
+        config: how the run is shown.
 
     Attributes:
         spec: what the learner's source delivered.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, path: Path, outline: Outline, config: ViewConfig
+        self,
+        recording: rr.RecordingStream,
+        header: RunHeader,
+        streams: Sequence[int],
+        config: ViewConfig,
     ) -> None:
         self._recording = recording
-        self._path = path
-        self._outline = outline
+        self._delta = delta_of(header)
         self._config = config
-        self.spec = outline.header.spec
+        self.spec = header.spec
         self._clock = Clock(self.spec)
         self._columns: dict[str, Column] = {}
-        self._streams = outline.streams(config.streams)
+        self._streams = streams
+        self._tau = 1
         self._lanes = Lanes(recording, self._clock, self.spec.streams, self._streams)
 
-    def write(self, modules: Sequence[Module]) -> None:
-        """Write everything that the log holds.
+    def take(self, stretch: Stretch) -> None:
+        """Take what a log holds of some iterations."""
+        for columns in stretch.signals:
+            self.add(columns)
+        for frames, watched in stretch.watched:
+            self.watched(frames, watched)
+        for frames, truth in stretch.truth:
+            self.truth(frames, truth)
+        for t, phi in stretch.phi:
+            self.weights("abstraction/phi", t, phi)
+        for event in stretch.events:
+            self.event(event.t, event.iteration, event.text, event.level)
+
+    def finish(self, outline: Outline, modules: Sequence[Module]) -> None:
+        """Write what is known at the end, and hand over everything that waits.
 
         Args:
+            outline: the run in short.
             modules: the frozen modules, for their weights.
         """
-        records = read_signals(self._path)
-        while batch := list(islice(records, BATCH)):
-            self.add(batch)
-        for t, frames in read_watched(self._path):
-            self.watched(t + np.arange(len(frames)), frames)
-        for t, values in read_truth(self._path):
-            self.truth(t + np.arange(len(values)), values)
-        for t, phi in read_phi(self._path):
-            self.weights("abstraction/phi", t, phi)
         for module in modules:
-            t = module.iteration * self._outline.tau
+            t = module.iteration * self._tau
             self.weights(f"modules/{module.index}/weights", t, module.phi)
-        for event in read_events(self._path):
-            self.event(event.t, event.iteration, event.text, event.level)
-        if self._outline.iterations:
-            end = max(self._outline.frames - self._outline.tau, 1)
-            self.threshold(np.array([0, end]), np.array([0, self._outline.iterations - 1]))
-        self._lanes.end(self._outline.frames)
+        if outline.iterations:
+            end = max(outline.frames - outline.tau, 1)
+            self.threshold(np.array([0, end]), np.array([0, outline.iterations - 1]))
+        self._lanes.end(outline.frames)
         self.flush()
 
-    def add(self, records: Sequence[BlockSignals]) -> None:
-        """Take records of consecutive iterations."""
-        for _, group in groupby(records, key=_shapes):
-            batch = _Batch(list(group))
-            self._signals(batch)
-            self._decision(batch)
-            self._gate(batch)
-            self._saved(batch)
-        for signals in records:
-            self._lanes.add(signals)
+    def add(self, columns: SignalColumns) -> None:
+        """Take the records of consecutive iterations."""
+        self._tau = max(columns.tau, 1)
+        self._signals(columns)
+        self._decision(columns)
+        self._gate(columns)
+        self._saved(columns)
+        self._lanes.add(columns)
 
     def watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
         """Take (n, *frame_shape) of what the learner saw at n frames."""
@@ -139,9 +141,9 @@ class RunView:
 
     def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
         """Draw the line that eta-dot must fall below, through these frames."""
-        if self._outline.delta is not None:
+        if self._delta is not None:
             line = self._line("abstraction/delta", ["δ threshold"], 0, rgb=GREY)
-            line.add(frames, iterations, np.full((len(frames), 1), self._outline.delta))
+            line.add(frames, iterations, np.full((len(frames), 1), self._delta))
 
     def flush(self) -> None:
         """Hand over everything that waits."""
@@ -149,30 +151,33 @@ class RunView:
             column.flush()
         self._lanes.flush()
 
-    def _signals(self, batch: _Batch) -> None:
+    def _signals(self, columns: SignalColumns) -> None:
         """Every signal's values as they are."""
+        outputs = columns["y"].shape[2]
         for signal in SIGNALS.values():
             if signal.name in TIMELINE_SIGNALS:
                 continue
-            value, path = batch.values(signal.name), f"signals/{signal.name}"
+            value, path = columns[signal.name], f"signals/{signal.name}"
             if signal.show == "heat":
-                self._tensor(signal, path, batch, value)
+                self._tensor(signal, path, columns, value)
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
-                    labels = _labels(signal, i + 1, self._outline.outputs)
+                    labels = _labels(signal, i + 1, outputs)
                     line = self._line(f"{path}/{i + 1}", labels, i + 1)
-                    frames, iterations = batch.times("T" in signal.dims)
+                    frames, iterations = columns.times("T" in signal.dims)
                     line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
             else:
-                labels = _labels(signal, 0, self._outline.outputs)
+                labels = _labels(signal, 0, outputs)
                 number = BESIDE.get(signal.name, 0)
                 line = self._line(path, labels if signal.dims != "S" else None, number)
-                frames, iterations = batch.times(signal.dims.startswith("T"))
+                frames, iterations = columns.times(signal.dims.startswith("T"))
                 line.add(frames, iterations, value.reshape(len(frames), -1))
 
-    def _tensor(self, signal: Signal, path: str, batch: _Batch, value: NDArray[Any]) -> None:
+    def _tensor(
+        self, signal: Signal, path: str, columns: SignalColumns, value: NDArray[Any]
+    ) -> None:
         crowded = len(self.spec.streams) > self._config.streams
-        kept = batch.iterations % SPARSE == 0 if crowded else np.ones(len(value), dtype=bool)
+        kept = columns.iterations % SPARSE == 0 if crowded else np.ones(len(value), dtype=bool)
         if value.size and kept.any():
             names = [AXES[d] for d in signal.dims]
             if names.count("stream") > 1:
@@ -181,35 +186,37 @@ class RunView:
                 path,
                 lambda: TensorColumn(self._recording, self._clock, path, self._config.rows, names),
             )
-            column.add(batch.frames[kept], batch.iterations[kept], value[kept])
+            column.add(columns.frames[kept], columns.iterations[kept], value[kept])
 
-    def _decision(self, batch: _Batch) -> None:
+    def _decision(self, columns: SignalColumns) -> None:
         """Reward and value of each shown stream, as lines in the streams' colours."""
-        reward, value = batch.values("R"), batch.values("Q")
+        reward, value = columns["R"], columns["Q"]
         for s in self._streams:
             name = self.spec.streams[s]
             place = part(self.spec.streams, s)
             if reward.size:
                 line = self._line(f"decision/R_stay/{place}", [f"R stay {name}"], s)
-                line.add(*batch.times(), reward[:, s, 0, s])
+                line.add(*columns.times(), reward[:, s, 0, s])
             line = self._line(f"decision/advantage/{place}", [f"Q stay - switch {name}"], s)
-            line.add(*batch.times(), value[:, s, 0] - value[:, s, 1])
+            line.add(*columns.times(), value[:, s, 0] - value[:, s, 1])
 
-    def _gate(self, batch: _Batch) -> None:
+    def _gate(self, columns: SignalColumns) -> None:
         """Each frozen module's band of 2 SD, whose blocks it knows."""
-        mean, width = batch.values("band_mean"), 2 * batch.values("band_sd")
+        mean, width = columns["band_mean"], 2 * columns["band_sd"]
         edges = np.concatenate([mean - width, mean + width], axis=2)
         for i in range(edges.shape[1]):
             labels = [f"band of module {i + 1}"] * edges.shape[2]
-            self._line(f"gate/band/{i + 1}", labels, i, width=1.0).add(*batch.times(), edges[:, i])
+            self._line(f"gate/band/{i + 1}", labels, i, width=1.0).add(
+                *columns.times(), edges[:, i]
+            )
 
-    def _saved(self, batch: _Batch) -> None:
+    def _saved(self, columns: SignalColumns) -> None:
         """Where eta-dot stood when a module was saved."""
-        saved = batch.values("saved")
+        saved = columns["saved"]
         if saved.any():
             marks = self._column("abstraction/saved", self._marks)
-            eta_dot = batch.values("eta_dot")[saved, :1]
-            marks.add(batch.frames[saved], batch.iterations[saved], eta_dot)
+            eta_dot = columns["eta_dot"][saved, :1]
+            marks.add(columns.frames[saved], columns.iterations[saved], eta_dot)
 
     def _marks(self) -> Column:
         path = "abstraction/saved"
@@ -238,7 +245,7 @@ class RunView:
         return rr.Tensor(phi.copy(), dim_names=("output", "input"))
 
     def _iteration(self, t: Frames) -> Frames:
-        return t // max(self._outline.tau, 1)
+        return t // self._tau
 
     def _set_time(self, t: int, iteration: int) -> None:
         self._recording.set_time("frame", sequence=t)
@@ -276,31 +283,6 @@ class RunView:
         if path not in self._columns:
             self._columns[path] = make()
         return self._columns[path]
-
-
-class _Batch:
-    """Records of consecutive iterations whose values have the same shapes."""
-
-    def __init__(self, records: Sequence[BlockSignals]) -> None:
-        self._records = records
-        self.frames = np.array([s.t for s in records])
-        self.iterations = np.array([s.iteration for s in records])
-
-    def values(self, name: str) -> NDArray[Any]:
-        """A signal's values, (n, *dims)."""
-        return np.array([getattr(s, name) for s in self._records])
-
-    def times(self, per_frame: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Frames and iterations of the rows: one a record, or one a frame of it."""
-        if not per_frame:
-            return self.frames, self.iterations
-        tau = len(self._records[0].y)
-        frames = (self.frames[:, None] + np.arange(tau)).reshape(-1)
-        return frames, np.repeat(self.iterations, tau)
-
-
-def _shapes(signals: BlockSignals) -> tuple[tuple[int, ...], ...]:
-    return signals.y.shape, signals.y_frozen.shape, signals.R.shape
 
 
 def _labels(signal: Signal, module: int, outputs: int) -> list[str]:

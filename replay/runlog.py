@@ -151,7 +151,7 @@ class RunWriter:
             EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR)
         )
         self._images: dict[int, ImageEncoder] = {}
-        if _is_image(spec):
+        if is_image(spec):
             height, width = spec.frame_shape
             encoders = [ImageEncoder(height, width, name) for name in spec.streams]
             self._images = dict(enumerate(encoders))
@@ -348,11 +348,11 @@ def read_watched(path: Path) -> Iterator[tuple[int, NDArray[Any]]]:
     header = read_header(log)
     shape = header.spec.frame_shape
     for at, data in _messages(log, WATCHED_TOPIC):
-        if _is_image(header.spec):
-            yield header.frame_at(at), _pixels(data, shape, log)[None]
+        if is_image(header.spec):
+            yield header.frame_at(at), decode_image(data, shape, log)[None]
         else:
             t, values = matrix_message.decode(data, f"{log} {WATCHED_TOPIC}")
-            yield t, _reshaped(values, (-1, *shape), log)
+            yield t, reshaped(values, (-1, *shape), log)
 
 
 def read_truth(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
@@ -361,7 +361,7 @@ def read_truth(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
     columns = len(read_header(log).spec.truth)
     for _, data in _messages(log, TRUTH_TOPIC):
         t, values = matrix_message.decode(data, f"{log} {TRUTH_TOPIC}")
-        yield t, _reshaped(values, (-1, columns), log)
+        yield t, reshaped(values, (-1, columns), log)
 
 
 def read_phi(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
@@ -376,30 +376,49 @@ def read_events(path: Path) -> Iterator[Event]:
     log = run_log(path)
     header = read_header(log)
     for at, data in _messages(log, EVENT_TOPIC):
-        try:
-            entry = Log_pb2.Log.FromString(data)
-        except message.DecodeError as error:
-            raise LogDamagedError(f"{log} {EVENT_TOPIC}: not a foxglove.Log message") from error
-        match = _ITERATION.fullmatch(entry.name)
-        level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
-        iteration = int(match[1]) if match else -1
-        yield Event(header.frame_at(at), iteration, entry.message, level)
+        yield decode_event(data, header.frame_at(at), log)
 
 
-def _is_image(spec: SourceSpec) -> bool:
+def is_image(spec: SourceSpec) -> bool:
+    """Whether frames are images, not vectors."""
     return spec.dtype == "uint8" and len(spec.frame_shape) == 2
 
 
-def _pixels(data: bytes, shape: tuple[int, ...], log: Path) -> NDArray[np.uint8]:
+def decode_event(data: bytes, t: int, log: Path) -> Event:
+    """What happened at frame t, in the bytes of its message.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message.
+    """
+    try:
+        entry = Log_pb2.Log.FromString(data)
+    except message.DecodeError as error:
+        raise LogDamagedError(f"{log} {EVENT_TOPIC}: not a foxglove.Log message") from error
+    match = _ITERATION.fullmatch(entry.name)
+    level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
+    return Event(t, int(match[1]) if match else -1, entry.message, level)
+
+
+def decode_image(data: bytes, shape: tuple[int, ...], log: Path) -> NDArray[np.uint8]:
+    """The watched (height, width) image in the bytes of its message.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message, or of another size.
+    """
     try:
         pixels = RawImage_pb2.RawImage.FromString(data).data
     except message.DecodeError as error:
         raise LogDamagedError(f"{log} {WATCHED_TOPIC}: not a foxglove.RawImage") from error
-    image: NDArray[np.uint8] = _reshaped(np.frombuffer(pixels, np.uint8), shape, log)
+    image: NDArray[np.uint8] = reshaped(np.frombuffer(pixels, np.uint8), shape, log)
     return image
 
 
-def _reshaped(values: NDArray[Any], shape: tuple[int, ...], log: Path) -> NDArray[Any]:
+def reshaped(values: NDArray[Any], shape: tuple[int, ...], log: Path) -> NDArray[Any]:
+    """Values in another shape.
+
+    Raises:
+        LogDamagedError: they do not fill it.
+    """
     try:
         return values.reshape(shape)
     except ValueError as error:

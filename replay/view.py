@@ -9,7 +9,7 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,11 @@ from replay.config import ViewConfig
 from replay.labels import label
 from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
-from replay.outline import Outline, read_outline
+from replay.outline import Outline, Tally, read_outline
 from replay.recording_view import write_recording, write_unwatched
 from replay.run_view import RunView
-from replay.runlog import is_run, run_log
+from replay.runlog import is_run, read_header, run_log
+from replay.stretch import read_stretches
 from replay.summary import summary_text
 
 APPLICATION = "cdmisfa"
@@ -110,12 +111,20 @@ def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStr
 def _write_run(
     recording: rr.RecordingStream, log: Path, config: ViewConfig, all_views: Path | None
 ) -> None:
-    outline, folder = read_outline(log), log.parent
-    modules = load_modules(folder) if (folder / MODULES_FILE).is_file() else ()
+    header, folder = read_header(log), log.parent
+    streams: Sequence[int] = range(len(header.spec.streams))
+    if len(streams) > config.streams:  # which are watched most is known at the end only
+        streams = read_outline(log).streams(config.streams)
+    tally, view = Tally(header), RunView(recording, header, streams, config)
+    for stretch in read_stretches(log, header, every=config.every):
+        for columns in stretch.signals:
+            tally.add(columns)
+        view.take(stretch)
+    outline = tally.outline()
+    view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
     _properties(recording, outline, folder)
     text = label(summary_text(outline, _name(log)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
-    RunView(recording, log, outline, config).write(modules)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)
     layout = RunLayout(outline, all_views=all_views is not None, head=head)
     recording.send_blueprint(layout.blueprint())
