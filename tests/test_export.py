@@ -9,13 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 from run_data import VECTOR, write_run
 
 from cdmisfa.errors import UsageError
 from cdmisfa.signals import SIGNALS
-from recorder.config import SceneConfig
-from recorder.recording import record
 from replay import export as module
 from replay.export import export
 
@@ -56,7 +53,14 @@ def test_npz_holds_every_number(run):
     folder, records = run
     export(folder, folder / "run.npz", "npz")
     with np.load(folder / "run.npz") as arrays:
-        assert set(arrays.files) == set(SIGNALS)
+        assert set(arrays.files) == {*SIGNALS, "_signals", "_run"}
+        about = json.loads(str(arrays["_signals"]))
+        assert {name: found["unit"] for name, found in about.items()} == {
+            name: signal.unit for name, signal in SIGNALS.items()
+        }
+        assert about["eta"]["symbol"] == SIGNALS["eta"].symbol
+        manifest = json.loads(json.loads(str(arrays["_run"]))["manifest"])
+        assert manifest["config"]["learner"]["tau"] == 40
         for name in SIGNALS:
             for k, signals in enumerate(records):
                 expected = np.asarray(getattr(signals, name))
@@ -81,6 +85,27 @@ def test_csv_reads_back_exactly(run):
     assert rows[0]["band_mean[1,0]"] == "nan"
 
 
+def test_a_csv_file_comes_with_what_its_columns_are(run):
+    folder, _ = run
+    export(folder, folder / "run.csv", "csv")
+    notes = json.loads((folder / "run.csv-metadata.json").read_text("utf-8"))
+    assert notes["url"] == "run.csv"
+    with open(folder / "run.csv", newline="") as file:
+        titles = next(csv.reader(file))
+    columns = notes["tableSchema"]["columns"]
+    assert [column["titles"] for column in columns] == titles
+    for title, column in zip(titles, columns, strict=True):
+        signal = SIGNALS[title.partition("[")[0]]
+        assert column["schema:unitText"] == signal.unit
+        assert column["schema:alternateName"] == signal.symbol
+    signals, run_notes = notes["notes"]
+    assert signals["signals"]["eta"]["equation"] == "2"
+    assert json.loads(run_notes["run"]["manifest"])["seed"] == 0
+    (folder / "run.csv").unlink()
+    with pytest.raises(UsageError, match=r"run.csv-metadata.json exists"):
+        export(folder, folder / "run.csv", "csv")
+
+
 def test_an_existing_file_is_kept(run):
     folder, _ = run
     (folder / "run.csv").write_text("mine")
@@ -90,21 +115,5 @@ def test_an_existing_file_is_kept(run):
     export(folder, folder / "run.csv", "csv", force=True)
     with pytest.raises(UsageError, match="xlsx"):
         export(folder, folder / "run.xlsx", "xlsx")
-    assert sorted(p.name for p in folder.iterdir()) == ["run.csv", "run.mcap"]
-
-
-def test_values_have_no_images(tmp_path):
-    record("oscillatory", tmp_path / "r", SceneConfig(kind="oscillatory"), frames=50)
-    with pytest.raises(UsageError, match="holds no images"):
-        export(tmp_path / "r", tmp_path / "images", "images")
-
-
-def test_a_recording_becomes_images(tmp_path):
-    pytest.importorskip("pybullet")
-    record("icub", tmp_path / "r", SceneConfig(), frames=5, views=["left"])
-    assert export(tmp_path / "r", tmp_path / "images", "images") == 5
-    files = sorted((tmp_path / "images" / "left").iterdir())
-    assert [f.name for f in files] == [f"{t:08d}.png" for t in range(5)]
-    with Image.open(files[0]) as image:
-        assert image.size == (128, 48)
-        assert image.mode == "L"
+    names = ["run.csv", "run.csv-metadata.json", "run.mcap"]
+    assert sorted(p.name for p in folder.iterdir()) == names

@@ -81,28 +81,35 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["parquet", "npz", "csv", "arrow", "images"]),
+    type=click.Choice(["parquet", "npz", "csv", "arrow", "images", "mp4", "lerobot"]),
     help="Form; by default what the file's name ends in.",
 )
-@options.out("The file to write, for images the folder.", required=True)
+@options.out("The file to write, for a recording the folder.", required=True)
+@click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
 @options.force
 @options.as_json
-def export_command(path: Path, form: str | None, out: Path, force: bool, as_json: bool) -> None:
-    """Write a run's signals as a table or arrays, a recording as images.
+def export_command(
+    path: Path, form: str | None, out: Path, lossless: bool, force: bool, as_json: bool
+) -> None:
+    """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
 
-    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz, images to a folder. CSV has
-    no room for the outputs frame by frame (y, y_frozen) and leaves them out.
+    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
+    outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
+    PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0.
     """
-    from replay.export import CSV_LEAVES_OUT, export
+    from replay.export import CSV_LEAVES_OUT, RECORDINGS, export
 
     form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, force=force)
+    rows = export(path, out, form, force=force, lossless=lossless)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)
+    if form in ("mp4", "lerobot") and not lossless:
+        click.echo("H.264 changes pixels a little: --lossless keeps them all", err=True)
     if as_json:
         options.print_json(
             {"schema": options.SCHEMA, "path": str(path), "file": str(out), "rows": rows}
         )
-    else:
-        click.echo(f"{rows} {'images' if form == 'images' else 'iterations'} written to {out}")
+        return
+    kind = "iterations" if form not in RECORDINGS else "images" if form == "images" else "frames"
+    click.echo(f"{rows} {kind} written to {out}")

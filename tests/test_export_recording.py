@@ -1,0 +1,317 @@
+"""A recording as images, videos and a LeRobot dataset, read back by others' programs."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from cdmisfa.blocks import Block, SourceSpec, freeze
+from cdmisfa.errors import CdmisfaError, UsageError
+from recorder.config import RecordConfig
+from recorder.viewlog import Identity, ViewLog
+from replay import film, folder_export, frames
+from replay.export import export
+
+FRAMES = 53
+FIRST = 7
+TRUTH = ("ball_x", "ball_y")
+
+
+def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0):
+    """A recording of white noise: its pixels (views, frames, height, width), its truth."""
+    folder.mkdir()
+    spec = SourceSpec(views, shape, "uint8", TRUTH, fps, 10**18, None)
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (len(views), FRAMES, *shape), dtype=np.uint8)
+    truth = rng.standard_normal((FRAMES, 2))
+    for stream, view in enumerate(views):
+        log = ViewLog(folder, view, Identity("test", 3, spec, {}), RecordConfig())
+        log.write(Block(stream, 0, freeze(pixels[stream].copy()), freeze(truth.copy())))
+        log.finish()
+    return pixels, truth
+
+
+@pytest.fixture(autouse=True)
+def _small_pieces(monkeypatch):
+    monkeypatch.setattr(frames, "PIECE", 20)
+
+
+def decoded(file):
+    """Frames of a video (n, height, width), when each is shown, and the stream's facts."""
+    av = pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
+    with av.open(str(file)) as container:
+        pictures = list(container.decode(video=0))
+        stream = container.streams.video[0]
+        facts = (stream.codec.canonical_name, stream.average_rate, container.metadata)
+        values = np.array([p.to_ndarray(format="gray") for p in pictures])
+        return values, [p.time for p in pictures], facts
+
+
+def test_values_have_no_images(oscillatory_recording, tmp_path):
+    for form in ("images", "mp4"):
+        with pytest.raises(UsageError, match="holds no images"):
+            export(oscillatory_recording, tmp_path / form, form)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_becomes_images(tmp_path):
+    pixels, _ = record_images(tmp_path / "r")
+    assert export(tmp_path / "r", tmp_path / "images", "images") == 2 * FRAMES
+    for stream, view in enumerate(("left", "right")):
+        files = sorted((tmp_path / "images" / view).iterdir())
+        assert [f.name for f in files] == [f"{t:08d}.png" for t in range(FRAMES)]
+        for t in (0, FIRST, FRAMES - 1):
+            with Image.open(files[t]) as image:
+                np.testing.assert_array_equal(np.asarray(image), pixels[stream, t])
+
+
+@pytest.mark.parametrize("shape", [(24, 40), (25, 41)], ids=["even", "odd"])
+def test_a_lossless_video_holds_every_pixel(shape, tmp_path):
+    pixels, _ = record_images(tmp_path / "r", shape, fps=30000 / 1001)
+    assert export(tmp_path / "r", tmp_path / "films", "mp4", lossless=True) == 2 * FRAMES
+    assert sorted(p.name for p in (tmp_path / "films").iterdir()) == ["left.mp4", "right.mp4"]
+    for stream, view in enumerate(("left", "right")):
+        found, times, (codec, rate, about) = decoded(tmp_path / "films" / f"{view}.mp4")
+        np.testing.assert_array_equal(found, pixels[stream])
+        assert (codec, str(rate)) == ("h264", "30000/1001")
+        np.testing.assert_allclose(times, np.arange(FRAMES) * 1001 / 30000, atol=1e-9)
+        comment = json.loads(about["comment"])
+        assert (comment["view"], comment["first_frame"]) == (view, 0)
+        assert comment["first_time_ns"] == 10**18
+
+
+def test_a_video_is_near_what_was_seen_and_smaller(tmp_path):
+    record_images(tmp_path / "r", views=("left",))
+    export(tmp_path / "r", tmp_path / "near.mp4", "mp4")
+    export(tmp_path / "r", tmp_path / "same.mp4", "mp4", lossless=True)
+    near, _, _ = decoded(tmp_path / "near.mp4")
+    same, _, _ = decoded(tmp_path / "same.mp4")
+    assert (tmp_path / "near.mp4").stat().st_size < (tmp_path / "same.mp4").stat().st_size
+    assert 0 < np.abs(near.astype(int) - same).mean() < 8  # of white noise, the worst case
+    # Which frame it is can still be told: none is missing, doubled or moved.
+    far = np.abs(near[:, None].astype(int) - same[None]).mean(axis=(2, 3))
+    np.testing.assert_array_equal(far.argmin(axis=1), np.arange(FRAMES))
+
+
+def test_rerun_reads_the_video(tmp_path):
+    from rerun.experimental import Mp4Reader
+
+    record_images(tmp_path / "r", views=("left",))
+    export(tmp_path / "r", tmp_path / "left.mp4", "mp4")
+    samples = sum(
+        chunk.num_rows
+        for chunk in Mp4Reader(str(tmp_path / "left.mp4")).stream()
+        if "VideoStream:sample" in chunk.to_record_batch().schema.names
+    )
+    assert samples == FRAMES
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """A LeRobot dataset, the pixels and the truth that are in it."""
+    pytest.importorskip("av", reason="PyAV is not installed: pip install 'cdmisfa[video]'")
+    folder = tmp_path_factory.mktemp("lerobot")
+    pixels, truth = record_images(folder / "r")
+    assert export(folder / "r", folder / "robot", "lerobot", lossless=True) == FRAMES
+    return folder / "robot", pixels, truth
+
+
+def test_a_dataset_has_the_published_layout(dataset):
+    folder, pixels, truth = dataset
+    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    videos = {f"videos/observation.images.{v}/chunk-000/file-000.mp4" for v in ("left", "right")}
+    assert files == videos | {
+        "README.md",
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+    }
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert (info["fps"], info["total_frames"], info["total_episodes"]) == (50, FRAMES, 1)
+    data = pq.read_table(folder / info["data_path"].format(chunk_index=0, file_index=0))
+    numbers = {k for k, f in info["features"].items() if f["dtype"] != "video"}
+    assert set(data.column_names) == numbers
+    for key in numbers:
+        feature, values = info["features"][key], data[key].combine_chunks()
+        width = feature["shape"][0]
+        kind = values.type if width == 1 else values.type.value_type
+        assert str(kind) == {"float32": "float"}.get(feature["dtype"], feature["dtype"])
+    known = np.array(data["observation.environment_state"].to_pylist(), dtype=np.float32)
+    np.testing.assert_array_equal(known, truth.astype(np.float32))
+    assert info["features"]["observation.environment_state"]["names"] == list(TRUTH)
+    for stream, view in enumerate(("left", "right")):
+        key = f"observation.images.{view}"
+        assert info["features"][key]["shape"] == [24, 40, 3]
+        file = info["video_path"].format(video_key=key, chunk_index=0, file_index=0)
+        found, times, _ = decoded(folder / file)
+        np.testing.assert_array_equal(found, pixels[stream])
+        # LeRobot refuses a frame that is further than 0.1 ms from its row's time.
+        np.testing.assert_allclose(times, data["timestamp"].to_numpy(), atol=1e-4)
+
+
+def test_a_dataset_s_statistics_are_those_of_its_numbers(dataset):
+    folder, pixels, truth = dataset
+    stats = json.loads((folder / "meta/stats.json").read_text())
+    known = truth.astype(np.float32).astype(np.float64)
+    found = stats["observation.environment_state"]
+    np.testing.assert_allclose(found["mean"], known.mean(axis=0))
+    np.testing.assert_allclose(found["std"], known.std(axis=0))
+    np.testing.assert_allclose(found["q90"], np.quantile(known, 0.9, axis=0))
+    image = stats["observation.images.right"]
+    expected = pixels[1] / 255
+    for name, value in (
+        ("mean", expected.mean()),
+        ("std", expected.std()),
+        ("min", expected.min()),
+        ("max", expected.max()),
+        ("q50", np.quantile(expected, 0.5, method="inverted_cdf")),
+    ):
+        np.testing.assert_allclose(image[name], np.full((3, 1, 1), value))
+    assert image["count"] == [FRAMES]
+    (episode,) = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert (episode["length"], episode["dataset_to_index"]) == (FRAMES, FRAMES)
+    assert episode["videos/observation.images.left/to_timestamp"] == FRAMES / 50
+    assert episode["stats/observation.images.right/mean"] == image["mean"]
+
+
+def test_rerun_opens_the_dataset(dataset):
+    from rerun.experimental import LeRobotReader
+
+    folder, _, truth = dataset
+    reader = LeRobotReader(str(folder))
+    assert reader.episodes() == [0]
+    samples, known, tasks = {"left": 0, "right": 0}, {}, set()
+    for chunk in reader.stream(0):
+        batch = chunk.to_record_batch()
+        names, view = batch.schema.names, chunk.entity_path.rpartition(".")[2]
+        if "VideoStream:sample" in names:
+            samples[view] += chunk.num_rows
+        if "TextDocument:text" in names:
+            tasks |= {text for row in batch["TextDocument:text"].to_pylist() for text in row}
+        if chunk.entity_path == "/observation.environment_state" and not chunk.is_static:
+            rows = batch["Scalars:scalars"].to_pylist()
+            known |= dict(zip(batch["frame_index"].to_pylist(), rows, strict=True))
+    assert samples == {"left": FRAMES, "right": FRAMES}
+    assert tasks == {"what test shows"}
+    np.testing.assert_array_equal([known[t] for t in range(FRAMES)], truth.astype(np.float32))
+
+
+def test_lerobot_itself_loads_the_dataset(dataset):
+    module = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset",
+        reason="lerobot is not installed: it asks for an older Rerun, so that it needs an "
+        "environment of its own (CONTRIBUTING.md)",
+        exc_type=ImportError,
+    )
+    folder, pixels, truth = dataset
+    loaded = module.LeRobotDataset("cdmisfa/test", root=folder, video_backend="pyav")
+    assert (len(loaded), loaded.fps, loaded.num_episodes) == (FRAMES, 50, 1)
+    for t in (0, FIRST, FRAMES - 1):
+        item = loaded[t]
+        assert item["task"] == "what test shows"
+        for stream, view in enumerate(("left", "right")):
+            seen = np.round(item[f"observation.images.{view}"].numpy() * 255)
+            np.testing.assert_array_equal(seen, np.stack([pixels[stream, t]] * 3))
+        known = item["observation.environment_state"].numpy()
+        np.testing.assert_array_equal(known, truth[t].astype(np.float32))
+
+
+def test_values_become_a_dataset_without_videos(oscillatory_recording, tmp_path):
+    from replay.recorded import RecordedSource
+
+    assert export(oscillatory_recording, tmp_path / "robot", "lerobot") == 2000
+    info = json.loads((tmp_path / "robot/meta/info.json").read_text())
+    assert info["video_path"] is None
+    data = pq.read_table(tmp_path / "robot/data/chunk-000/file-000.parquet")
+    source = RecordedSource(oscillatory_recording)
+    for stream, name in enumerate(source.spec.streams):
+        source.seek(0)
+        expected = source.take(stream, 2000).frames.astype(np.float32)
+        np.testing.assert_array_equal(data[f"observation.{name}"].to_pylist(), expected)
+    source.close()
+
+
+def test_lerobot_knows_whole_frame_rates_only(tmp_path):
+    record_images(tmp_path / "r", fps=29.97)
+    with pytest.raises(UsageError, match="convert --rate"):
+        export(tmp_path / "r", tmp_path / "robot", "lerobot")
+    assert not (tmp_path / "robot").exists()
+
+
+def test_what_is_there_is_kept(tmp_path):
+    record_images(tmp_path / "r", views=("left",))
+    out = tmp_path / "out"
+    export(tmp_path / "r", out, "images")
+    with pytest.raises(UsageError, match="--force"):
+        export(tmp_path / "r", out, "mp4")
+    export(tmp_path / "r", out, "mp4", force=True)
+    assert [p.name for p in out.iterdir()] == ["left.mp4"]
+    (out / "thesis.tex").write_text("mine")
+    with pytest.raises(UsageError, match=r"thesis\.tex"):
+        export(tmp_path / "r", out, "mp4", force=True)
+    assert (out / "thesis.tex").read_text() == "mine"
+
+
+def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
+    record_images(tmp_path / "r")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(film.Film, "add", full)
+    for form in ("mp4", "lerobot"):
+        with pytest.raises(CdmisfaError, match="No space left on device"):
+            export(tmp_path / "r", tmp_path / "out", form)
+    with pytest.raises(CdmisfaError, match="No space left on device"):
+        export(tmp_path / "r" / "left.mcap", tmp_path / "out.mp4", "mp4")
+    assert [p.name for p in tmp_path.iterdir()] == ["r"]
+
+
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    record_images(tmp_path / "r")
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[video\]'"):
+        export(tmp_path / "r", tmp_path / "out", "mp4")
+
+
+def test_wrong_requests_are_named(tmp_path):
+    record_images(tmp_path / "r")
+    with pytest.raises(UsageError, match="several views"):
+        export(tmp_path / "r", tmp_path / "one.mp4", "mp4")
+    with pytest.raises(UsageError, match="loses nothing"):
+        export(tmp_path / "r", tmp_path / "out", "images", lossless=True)
+
+
+def test_a_view_s_name_leads_nowhere_else():
+    names = ("../../x", "a/b", "a_b", ".hidden", "", "left")
+    spec = SourceSpec(names, (2, 2), "uint8", (), 50.0, 0, None)
+    found = frames.view_names(spec)
+    assert len(set(found)) == len(names)
+    assert not any("/" in name or name.startswith(".") for name in found)
+    assert found[-1] == "left"
+
+
+def test_only_exports_are_replaced(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "a.py").write_text("mine")
+    with pytest.raises(UsageError, match="holds other files"), folder_export.whole_folder(out):
+        pytest.fail("the folder is not written")
+
+
+def test_the_command_says_what_is_lost(cdmisfa, tmp_path):
+    record_images(tmp_path / "r")
+    said = cdmisfa("export", tmp_path / "r", "--to", "mp4", "-o", tmp_path / "films")
+    assert (said.code, said.out) == (0, f"{2 * FRAMES} frames written to {tmp_path / 'films'}\n")
+    assert said.err == "H.264 changes pixels a little: --lossless keeps them all\n"
+    words = ("export", tmp_path / "r", "--to", "lerobot", "-o", tmp_path / "robot", "--lossless")
+    said = cdmisfa(*words, "--json")
+    assert said.json["rows"] == FRAMES
+    assert said.err == ""
