@@ -100,6 +100,7 @@ class LogReader:
         self._cached = 0
         self._cache_bytes = CACHE_BYTES if cache_bytes is None else cache_bytes
         self._defined = 0
+        self._searched = False
         self._file = RandomFile(self.path)
         try:
             by_index = isinstance(self.path, Url) and not whole
@@ -417,6 +418,7 @@ class LogReader:
         self._cache.clear()
         self._failed.clear()
         self._cached = self._defined = 0
+        self._searched = False
 
     def _refuse(self, where: str, what: str) -> None:
         if not self.salvage:
@@ -491,13 +493,15 @@ class LogReader:
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
         definitions = self._structure.definitions
-        channel = definitions.channels.get(number)
-        if channel is None:
-            self._define()
+        for look in (None, self._define, self._search):
+            if look is not None:
+                look()
             channel = definitions.channels.get(number)
+            if channel and (not channel.schema_id or channel.schema_id in definitions.schemas):
+                return channel
         if channel is None:
             self._refuse(segment.name, f"it holds messages of channel {number}, never defined")
-        elif channel.schema_id and channel.schema_id not in definitions.schemas:
+        else:
             self._refuse(
                 segment.name, f"schema {channel.schema_id} of {channel.topic!r} is never defined"
             )
@@ -507,12 +511,26 @@ class LogReader:
         """Decode chunks until every channel that has messages is known."""
         known = self._structure.definitions.channels
         segments = self.segments
+        if self._defined == len(segments):
+            return
+        counted: set[int] = set()
         while self._defined < len(segments):
             segment = segments[self._defined]
             counts = segment.channel_counts()
             if counts is None or not counts.keys() <= known.keys():
                 self.table(segment)
+            counted.update(counts or ())
             self._defined += 1
+        schemas = {0, *self._structure.definitions.schemas}
+        if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
+            self._search()
+
+    def _search(self) -> None:
+        """Decode every chunk: a definition may stand in one that holds no message of it."""
+        if not self._searched:
+            self._searched = True
+            for segment in self.segments:
+                self.table(segment)
 
     def _merged(
         self, group: list[tuple[int, Segment]], low: int, high: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from pathlib import Path
 
 import mcap_files as files
@@ -101,6 +102,29 @@ def test_channels_only_within_chunks_are_found(tmp_path: Path) -> None:
     with LogReader(path) as reader:
         assert {c.topic for c in reader.channels.values()} == {"/a", "/b"}
         assert {s.name for s in reader.schemas.values()} == {"name"}
+
+
+@pytest.mark.parametrize("known", ["nothing", "a channel", "a channel without its schema"])
+def test_definitions_stand_in_chunks_without_their_messages(tmp_path: Path, known: str) -> None:
+    """A definition must only stand somewhere before the first message that needs it."""
+    one = files.record(files.CHANNEL, files.channel(1, 0, "/a"))
+    two = files.record(files.CHANNEL, files.channel(2, 7, "/b"))
+    seven = files.record(files.SCHEMA, files.schema(7))
+    texts = {"nothing": (b"", one + two + seven), "a channel": (one, two + seven)}
+    outside, inside = texts.get(known, (one + two, seven))
+    data = files.MAGIC + files.header() + outside
+    pairs = struct.pack("<HIQQ", 1, 16, 5, len(inside))
+    first = inside + files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"x"))
+    data += files.chunk(first, 5, 5) + files.record(files.MESSAGE_INDEX, pairs)
+    second = files.record(files.MESSAGE, files.message(2, 0, 3, 3, b"y"))
+    data += files.chunk(second, 3, 3)
+    data += files.record(files.MESSAGE_INDEX, struct.pack("<HIQQ", 2, 16, 3, 0))
+    path = tmp_path / "log.mcap"
+    path.write_bytes(files.finish(data))
+    assert [(m[0], m[4]) for m in read(path)] == [("/b", b"y"), ("/a", b"x")]
+    with LogReader(path) as reader:
+        assert {c.topic for c in reader.channels.values()} == {"/a", "/b"}
+        assert set(reader.schemas) == {7}
 
 
 def test_unknown_records_are_passed_over(tmp_path: Path) -> None:
