@@ -7,9 +7,9 @@ coordinates: x to the robot's back, y to its left.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Final, Literal
 
-from cdmisfa.config import positive, within
+from cdmisfa.config import as_table, positive, within
 from cdmisfa.errors import UsageError
 from cdmisfa.streams import START_NS
 
@@ -143,6 +143,19 @@ class SceneConfig:
         if self.seed is not None and self.seed < 0:
             raise UsageError(f"scene.seed is {self.seed}: it must be 0 or above")
         view_names(self.streams, "scene.streams")
+
+
+SCENE_KEYS: Final = {
+    "icub": ("kind", "seed", "robot", "eyes", "table", "object1", "object2", "object3"),
+    "oscillatory": ("kind", "seed", "streams"),
+}
+"""The keys `scene.*` that mean something for a kind of scene."""
+
+
+def scene_table(scene: SceneConfig) -> dict[str, Any]:
+    """A scene as plain JSON values: the keys of its kind, and no others."""
+    table = as_table(scene)
+    return {key: table[key] for key in SCENE_KEYS[scene.kind]}
 
 
 @dataclass(frozen=True, slots=True)

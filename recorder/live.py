@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.blocks import Block, SourceSpec, check_request, freeze
-from cdmisfa.config import as_table
-from recorder.config import RecordConfig, SceneConfig
+from recorder.config import RecordConfig, SceneConfig, scene_table
 from recorder.eyes import Eyes
 from recorder.messages import HeadPose
 from recorder.motions import Motions
@@ -73,7 +72,7 @@ class LiveSource:
 
     def describe(self) -> Mapping[str, Any]:
         """The scene's seed and everything it was built from."""
-        return {"kind": "icub", "seed": self._seed, "scene": as_table(self._scene)}
+        return {"kind": "icub", "seed": self._seed, "scene": scene_table(self._scene)}
 
     def close(self) -> None:
         """End the simulator."""

@@ -188,7 +188,7 @@ class TestRuns:
         config = json.loads((run / "run.json").read_text())["config"]
         assert config["learner"]["nu"] == 0.02
         assert config["learner"]["sigma"] == 0.0009
-        assert config["scene"]["kind"] == "oscillatory"
+        assert config["scene"].keys() == {"kind", "seed", "streams"}
 
     def test_own_preset(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
         preset = tmp_path / "mine.toml"
@@ -270,6 +270,17 @@ class TestErrors:
             (["learn", "oscillatory", "--set", "nu"], 2, ["section.key=value"]),
             (["learn", "oscillatory", "--set", "scene.kind=icub"], 2, ["scene.kind"]),
             (["learn", "oscillatory", "--preset", "icubs"], 2, ["did you mean icub?"]),
+            (["learn", "oscillatory", "--preset", "icub"], 2, ["for the scene icub"]),
+            (
+                ["record", "icub", "-o", "x", "--preset", "oscillatory"],
+                2,
+                ["for the scene oscillatory, this is icub"],
+            ),
+            (
+                ["record", "oscillatory", "-o", "x", "--set", "scene.eyes.width=9"],
+                2,
+                ["scene.eyes.width means nothing", "scene.streams"],
+            ),
             (["learn", "oscillatory", "--preset", "no.toml"], 2, ["no.toml"]),
             (["learn"], 2, ["SOURCE", "cdmisfa learn --help"]),
             (["learn", "oscillatory", "--sead", "1"], 2, ["--seed"]),

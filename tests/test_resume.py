@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Cdmisfa
 
 from cdmisfa.blocks import FrameSource
 from cdmisfa.config import LearnerConfig
@@ -314,3 +316,53 @@ def test_compiling_is_announced_only_when_it_will_happen(tmp_path: Path) -> None
 
     assert ask().split() == ["True", "False"]
     assert ask().split() == ["False", "False"]
+
+
+class TestWithoutItsSource:
+    """`cdmisfa learn --resume -o RUN` takes the source, and how it was opened, from the run."""
+
+    WORDS = ("--set", "learner.tau=25", "--seed", 4, "--loop", "--no-rerun", "--json")
+
+    def test_it_goes_on_as_it_was_begun(
+        self,
+        cdmisfa: Cdmisfa,
+        oscillatory_recording: Path,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        run = tmp_path / "a" / "run"
+        words = (oscillatory_recording, *self.WORDS)
+        begun = cdmisfa("learn", *words, "-o", run, "--max-iterations", 6)
+        assert begun.code == 0, begun.err
+        monkeypatch.chdir(run.parent)
+        gone_on = cdmisfa(
+            "learn", "--resume", "-o", "run", "--max-iterations", 30, "--no-rerun", "--json"
+        )
+        assert gone_on.code == 0, gone_on.err
+        whole = cdmisfa("learn", *words, "--max-iterations", 30).json
+        assert gone_on.json["signals_sha256"] == whole["signals_sha256"]
+        assert gone_on.json["source"] == whole["source"]
+        command = json.loads((run / "run.json").read_text())["command"]
+        assert (command["seed"], command["loop"]) == (4, True)
+
+    def test_after_kill_9_too(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+        run = tmp_path / "run"
+        cdmisfa("learn", "oscillatory", "-o", run, *self.WORDS[:2], "--max-iterations", 3)
+        (run / "run.json").unlink()
+        (run / "run.mcap").rename(run / "run.mcap.partial")
+        gone_on = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 5, "--json")
+        assert gone_on.json["iterations"] == 5
+        assert gone_on.json["frames"] == 125
+
+    def test_what_is_given_and_differs_is_refused(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+        run = tmp_path / "run"
+        words = ("-o", run, "--max-iterations", 3, "--no-rerun")
+        cdmisfa("learn", "oscillatory", *words)
+        refused = cdmisfa("learn", "--resume", *words, "--seed", 5)
+        assert (refused.code, "seed = 0, not 5" in refused.err) == (2, True)
+
+    def test_a_run_that_does_not_say(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+        go(OscillatorySource(), tmp_path / "run", 3)
+        refused = cdmisfa("learn", "--resume", "-o", tmp_path / "run")
+        assert (refused.code, "name its source" in refused.err) == (2, True)
+        assert cdmisfa("learn", "--resume", "-o", tmp_path / "none").code == 2

@@ -22,7 +22,7 @@ TICK = 0.1
 
 
 @click.command("learn")
-@click.argument("source", nargs=-1, required=True)
+@click.argument("source", nargs=-1)
 @options.out("Folder of the run; without it nothing is written.")
 @options.seed
 @options.preset
@@ -84,13 +84,18 @@ def learn_command(
 
     SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
     files of its views. The same seed gives the same signals, bit for bit, from each.
-    It may also be other people's logs of cameras: MCAP files, ROS bags, or a folder of
-    pictures for each stream.
+    It may also be other people's logs of cameras: MCAP files, ROS bags, or a video or a
+    folder of pictures for each stream. Logs may be URLs: s3://, http:// and https://.
+    With --resume it is that of the run, and need not be given.
     """
     if resume and out is None:
         raise click.UsageError("--resume needs -o RUN, the run to go on with")
     if resume and force:
         raise click.UsageError("--force starts anew and --resume goes on: use one of them")
+    if not source:
+        go_on(ctx, out if resume else None)
+        return
+    from cdmisfa.experiments.again import remember
     from cdmisfa.experiments.run import RunExhaustedError, learn
     from cdmisfa.experiments.sources import CameraOptions, open_source
 
@@ -126,6 +131,7 @@ def learn_command(
                 resume=resume,
                 live=live_view,
                 announce=announce,
+                command=None if out is None else remember(source, ctx.params, out),
             )
     except RunExhaustedError as error:
         show(error.result, as_json=as_json)
@@ -135,6 +141,23 @@ def learn_command(
     show(result, as_json=as_json)
     if stop():
         ctx.exit(stop.exit_code)
+
+
+def go_on(ctx: click.Context, run: Path | None) -> None:
+    """Learn on from the source of a run, as it was begun; options that are given win."""
+    from cdmisfa.experiments.again import recall
+
+    if run is None:
+        source = next(param for param in ctx.command.params if param.name == "source")
+        raise click.MissingParameter(ctx=ctx, param=source)
+    words, options_then = recall(run)
+    given = {
+        name
+        for name in options_then
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    }
+    kept = {name: value for name, value in options_then.items() if name not in given}
+    ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
 
 
 def announce(address: str) -> None:

@@ -35,6 +35,9 @@ KEPT = 2
 SET_ASIDE = "run.before.mcap.partial"
 """The log of a run that goes on, until the new one has taken over what counts."""
 
+COMMAND = "command"
+"""Key of a manifest: how the run was begun, which may differ when it goes on."""
+
 _HEAD = "checkpoint"
 _MODULES = "modules."
 _INTEGERS = ("index", "stream", "iteration")
@@ -172,14 +175,28 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path 
     from replay.runlog import RUN_FILE
 
     whole, aside = run / RUN_FILE, run / SET_ASIDE
-    found = next((p for p in (aside, partial_path(whole), whole) if p.is_file()), None)
-    if found is None:
-        raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to go on with")
+    found = log_to_go_on_with(run)
     if found == partial_path(whole) and not checkpoints(run) and not _has_header(found):
         return None
     refuse_difference(run, found, spec, manifest)
     os.replace(found, aside)
     return aside
+
+
+def log_to_go_on_with(run: Path) -> Path:
+    """The log of a run that was stopped, wherever it is.
+
+    Raises:
+        UsageError: there is no run.
+    """
+    from recorder.logfile import partial_path
+    from replay.runlog import RUN_FILE
+
+    whole = run / RUN_FILE
+    for found in (run / SET_ASIDE, partial_path(whole), whole):
+        if found.is_file():
+            return found
+    raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to go on with")
 
 
 def _has_header(log: Path) -> bool:
@@ -205,8 +222,9 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
         "signals": header.schema,
         **header.manifest,
         "spec": dataclasses.asdict(header.spec),
+        COMMAND: None,
     }
-    now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec)}
+    now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec), COMMAND: None}
     for key, old, new in differences(_json(before), _json(now)):
         raise UsageError(
             f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: go on with "

@@ -24,6 +24,7 @@ from cdmisfa.compiled import needs_compiling
 from cdmisfa.config import LearnerConfig, as_table
 from cdmisfa.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.checkpoint import (
+    COMMAND,
     SET_ASIDE,
     Checkpoint,
     checkpoints,
@@ -130,6 +131,7 @@ def learn(
     checkpoint_every: int = 200,
     live: bool = False,
     announce: Callable[[str], None] | None = None,
+    command: Mapping[str, Any] | None = None,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
 
@@ -150,6 +152,7 @@ def learn(
         checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
         live: also show the run in Rerun while it learns, to viewers on this machine.
         announce: called with the address of the live view.
+        command: how the run is begun, kept with it; see `cdmisfa.experiments.again`.
 
     Raises:
         UsageError: `out` exists and `force` is not set; or `resume` is, and `out` holds no
@@ -162,7 +165,7 @@ def learn(
     tables = {**(sections or {}), "learner": as_table(config)}
     exhausted: LogExhaustedError | None = None
     with (
-        _run_log(out, source, tables, seed, force, resume) as log,
+        _run_log(out, source, tables, seed, force, resume, command) as log,
         _live_view(live, announce, config, source, tables, seed) as shown,
     ):
         if log is not None and resume:
@@ -224,7 +227,7 @@ def learn(
             truth=source.spec.truth,
         )
         if out is not None:
-            _write_run(out, result, tables, rerun)
+            _write_run(out, result, tables, rerun, command)
     if exhausted is not None:
         kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {out}"
         message = f"{exhausted}{kept if out is not None else ''}"
@@ -262,6 +265,7 @@ def _run_log(
     seed: int,
     force: bool,
     resume: bool,
+    command: Mapping[str, Any] | None,
 ) -> Iterator[Any]:
     """The run's log, to be finished inside, and its folder held; None for no folder.
 
@@ -275,6 +279,8 @@ def _run_log(
     from replay.runlog import RunWriter
 
     manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
+    if command is not None:
+        manifest[COMMAND] = dict(command)
     if not resume:
         if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
             raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
@@ -370,7 +376,13 @@ def _say_if_compiling() -> None:
         print("compiling the learner, this first time only (some 10 to 30 s)", file=sys.stderr)
 
 
-def _write_run(out: Path, result: RunResult, tables: Mapping[str, Any], rerun: bool) -> None:
+def _write_run(
+    out: Path,
+    result: RunResult,
+    tables: Mapping[str, Any],
+    rerun: bool,
+    command: Mapping[str, Any] | None,
+) -> None:
     from replay.modules import save_modules
 
     save_modules(out / "modules.npz", result.modules)
@@ -385,6 +397,8 @@ def _write_run(out: Path, result: RunResult, tables: Mapping[str, Any], rerun: b
         "platform": {"system": platform.system(), "machine": platform.machine()},
         "result": result.as_json(),
     }
+    if command is not None:
+        document[COMMAND] = dict(command)
     write_json(out / "run.json", document)
     if rerun:
         from replay.view import build_view

@@ -12,13 +12,16 @@ from typing import TYPE_CHECKING, Any
 from cdmisfa.blocks import FrameSource, SourceSpec
 from cdmisfa.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.errors import UsageError
-from recorder.config import RecordConfig, SceneConfig
+from recorder.config import SCENE_KEYS, RecordConfig, SceneConfig, scene_table
 
 if TYPE_CHECKING:
     from replay.foreign import Align, ForeignSource
+    from replay.store import Location
 
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
+
+_SCENE_FIELDS = {name for keys in SCENE_KEYS.values() for name in keys}
 
 FRAME_SIZE = (48, 128)
 """Height and width of the paper's frames, which images of others are shrunk to."""
@@ -40,7 +43,7 @@ class Configuration:
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
-        return {"scene": as_table(self.scene), "record": as_table(self.record)}
+        return {"scene": scene_table(self.scene), "record": as_table(self.record)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +89,21 @@ def configure(
     def layers(section: str) -> tuple[Mapping[str, Any], ...]:
         return tables.get(section, {}), words.get(section, {})
 
+    for_kind = tables.get("scene", {}).get("kind", kind)
+    if for_kind != kind:
+        raise UsageError(
+            f"the preset {preset} is for the scene {for_kind}, this is {kind}: choose another "
+            "preset, or leave it out"
+        )
     if words.get("scene", {}).get("kind", kind) != kind:
         raise UsageError(f"scene.kind cannot be set: the source says that it is {kind}")
+    for key in (*tables.get("scene", {}), *words.get("scene", {})):
+        name = key.partition(".")[0]
+        if name in _SCENE_FIELDS and name not in SCENE_KEYS[kind]:
+            raise UsageError(
+                f"scene.{key} means nothing to the scene {kind}, which has "
+                f"{', '.join(f'scene.{own}' for own in SCENE_KEYS[kind])}"
+            )
     scene = build(SceneConfig, "scene", *layers("scene"), {"kind": kind})
     return Configuration(
         learner=build(LearnerConfig, "learner", *layers("learner")),
@@ -113,13 +129,19 @@ def configure_scene(
     return configure(name, preset, settings, seed)
 
 
-def preset_for(spec: SourceSpec, described: Mapping[str, Any]) -> str:
-    """The preset for a recording: that of its scene, else by what a frame is."""
+def preset_for(spec: SourceSpec, described: Mapping[str, Any], preset: str | None = None) -> str:
+    """The kind of scene, and so the preset, for a recording: that of its scene.
+
+    What shows another scene takes the kind of the `preset` chosen, else by what a frame is.
+    """
     from recorder.scenes import SCENES
 
     scene = str(described.get("scene", ""))
     if scene in SCENES:
         return scene
+    chosen = load_preset(preset).get("scene", {}).get("kind") if preset is not None else None
+    if chosen in SCENES:
+        return str(chosen)
     return "icub" if len(spec.frame_shape) == 2 else "oscillatory"
 
 
@@ -137,8 +159,8 @@ def open_source(
     """Open a live scene by its name, a recording, or other people's camera logs.
 
     Args:
-        words: the name of a scene, or paths: the folder of a recording or its views' files,
-            or MCAP logs, ROS bags or folders of pictures of others.
+        words: the name of a scene, or paths or URLs: the folder of a recording or its views'
+            files, or MCAP logs, ROS bags, videos or folders of pictures of others.
         preset: instead of the source's own.
         settings: `section.key=value` words.
         seed: of the scene, where `scene.seed` is not set.
@@ -166,9 +188,11 @@ def open_source(
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
         return open_scene(kind, configuration.scene, configuration.record), configuration
-    paths = [Path(word) for word in words]
+    from replay.store import Url, location
+
+    paths = [location(word) for word in words]
     for path in paths:
-        if not path.exists() and follow is None:
+        if not isinstance(path, Url) and not path.exists() and follow is None:
             raise UsageError(
                 f"{path}: no such file or folder, and no scene either: "
                 f"the scenes are {', '.join(SCENES)}"
@@ -177,11 +201,13 @@ def open_source(
     if follow is not None:
         from replay.follow import FollowedSource
 
+        if isinstance(paths[0], Url):
+            raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
         source = FollowedSource(paths[0], timeout=follow)
     else:
         source = open_log(paths, loop=loop, salvage=salvage, cameras=cameras)
     try:
-        kind = preset_for(source.spec, source.describe())
+        kind = preset_for(source.spec, source.describe(), preset)
         return source, configure(kind, preset, settings, seed)
     except BaseException:
         source.close()
@@ -189,7 +215,7 @@ def open_source(
 
 
 def open_log(
-    paths: Sequence[Path],
+    paths: Sequence[Location],
     *,
     loop: bool = False,
     salvage: bool = False,
@@ -221,13 +247,21 @@ def open_log(
     return open_cameras(paths, cameras, loop=loop, salvage=salvage)
 
 
-def _refuse_what_is_no_log(path: Path) -> None:
+def _refuse_what_is_no_log(path: Location) -> None:
     """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
     from replay.camera_logs import only_foreign
     from replay.files import starts_as_log
+    from replay.info import kind_of
+    from replay.reader import LogReader
     from replay.runlog import RUN_FILE, is_run
+    from replay.store import Url
 
-    if path.is_dir():
+    if isinstance(path, Url):
+        if path.folder:
+            return
+        with LogReader(path, salvage=True) as reader:
+            run = kind_of(reader) == "run"
+    elif path.is_dir():
         run = is_run(path)
     elif starts_as_log(path):
         run = path.name.startswith(RUN_FILE) and is_run(path)
@@ -243,7 +277,11 @@ def _refuse_what_is_no_log(path: Path) -> None:
 
 
 def open_cameras(
-    paths: Sequence[Path], cameras: CameraOptions, *, loop: bool = False, salvage: bool = False
+    paths: Sequence[str | Location],
+    cameras: CameraOptions,
+    *,
+    loop: bool = False,
+    salvage: bool = False,
 ) -> ForeignSource:
     """Open the camera logs of others as streams on one clock.
 

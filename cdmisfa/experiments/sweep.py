@@ -187,7 +187,7 @@ def plan(
         UsageError: an unknown key, a value that does not fit, or no such source.
     """
     words = (source,) if isinstance(source, str | Path) else tuple(source)
-    kind, identity = _identify(words, loop)
+    kind, identity = _identify(words, preset, loop)
     points = [
         dict(zip(grid, map(str, values), strict=True))
         for values in itertools.product(*grid.values())
@@ -229,14 +229,14 @@ def _seeded(
     return lambda seed: replace(base, scene=replace(base.scene, seed=seed))
 
 
-def _identify(words: tuple[str | Path, ...], loop: bool) -> tuple[str, Any]:
+def _identify(words: tuple[str | Path, ...], preset: str | None, loop: bool) -> tuple[str, Any]:
     """The scene's name, and what tells a recording's bytes from another's (None where live)."""
     if _is_live(words):
         return str(words[0]), None
     source, _ = open_source(words, loop=loop)
     try:
         described = dict(source.describe())
-        return preset_for(source.spec, described), described
+        return preset_for(source.spec, described, preset), described
     finally:
         source.close()
 
