@@ -94,9 +94,9 @@ class Column:
     def flush(self) -> None:
         """Hand over what waits."""
         if self._waiting:
-            iterations = np.concatenate(self._iterations) if self._iterations else None
-            times = self._clock.columns(np.concatenate(self._frames), iterations)
-            self.send(times, np.concatenate(self._values))
+            iterations = _joined(self._iterations) if self._iterations else None
+            times = self._clock.columns(_joined(self._frames), iterations)
+            self.send(times, _joined(self._values))
         self._frames, self._iterations, self._values = [], [], []
         self._waiting = self._bytes = 0
 
@@ -104,6 +104,10 @@ class Column:
         """Hand (n, ...) values over as rows of scalars."""
         table = np.array(values, dtype=np.float64).reshape(len(values), -1)
         self._recording.send_columns(self.path, times, rr.Scalars.columns(scalars=table))
+
+
+def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 class ImageColumn(Column):

@@ -23,6 +23,10 @@ CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 """Colours of things that are counted: streams, modules."""
 
 
+STEPS = 255
+"""Shades between white and a full colour: as many as eight bits can tell apart."""
+
+
 def colour(index: int) -> Rgb:
     """The colour of stream or module number `index`, from 0."""
     return CYCLE[index % len(CYCLE)]
@@ -44,8 +48,18 @@ def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:
         (height, width, 3) uint8.
     """
     largest = float(np.max(np.abs(weights), initial=0.0))
-    part = np.nan_to_num(weights / largest if largest > 0 else weights * 0.0)[..., None]
+    if not 0 < largest < np.inf:
+        return np.broadcast_to(_SHADES[STEPS], (*weights.shape, 3)).copy()
+    return _SHADES[np.rint(weights * (STEPS / largest)).astype(np.intp) + STEPS]
+
+
+def _shades() -> NDArray[np.uint8]:
+    """(2 STEPS + 1, 3) colours from blue over white to vermillion."""
+    part = np.linspace(-1.0, 1.0, 2 * STEPS + 1)[:, None]
     white = np.array([255.0, 255.0, 255.0])
     low, high = np.array(BLUE, dtype=float), np.array(VERMILLION, dtype=float)
     image = np.where(part < 0, white + (low - white) * -part, white + (high - white) * part)
     return np.asarray(np.round(image), dtype=np.uint8)
+
+
+_SHADES = _shades()

@@ -115,9 +115,10 @@ class RunView:
         shape, path = self.spec.frame_shape, "world/watched"
         if len(shape) == 2:
             kept = at % self._config.every == 0
-            if kept.any():
-                screen = self._column(path, self._screen)
-                screen.add(at[kept], self._iteration(at[kept]), frames[kept])
+            if not kept.all():
+                at, frames = at[kept], frames[kept]
+            if len(at):
+                self._column(path, self._screen).add(at, self._iteration(at), frames)
         else:
             names = [f"x{i + 1}" for i in range(int(np.prod(shape)))]
             line = self._line(path, names, 0)

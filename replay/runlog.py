@@ -45,7 +45,7 @@ EVENT_TOPIC = "/event"
 NEVER_NS = 2**62
 """More log time than any run has."""
 
-CHUNK_BYTES = 256 * 1024
+CHUNK_BYTES = 1024 * 1024
 """Size at which a chunk of the log is closed."""
 
 FLUSH_SECONDS = 1.0

@@ -81,10 +81,22 @@ def read_stretches(
     """
     kept = _Kept(log, header, every)
     with LogReader(log) as reader:
-        for entry in reader.messages(topics, ordered=False):
-            if kept.full(entry.channel.topic):
-                yield kept.stretch()
-            kept.add(entry.channel.topic, entry.log_time, entry.data)
+        wanted = {number: c.topic for number, c in reader.channels.items() if c.topic in topics}
+        for _, table in reader.tables(ordered=False):
+            data = memoryview(table.data.data)
+            for number, log_time, at, size in zip(
+                table.channel.tolist(),
+                table.log_time.tolist(),
+                table.at.tolist(),
+                table.size.tolist(),
+                strict=True,
+            ):
+                topic = wanted.get(number)
+                if topic is None:
+                    continue
+                if kept.full(topic):
+                    yield kept.stretch()
+                kept.add(topic, log_time, data[at : at + size])
         yield kept.stretch()
         if not reader.complete and not log.name.endswith(PARTIAL):
             raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")
@@ -118,13 +130,13 @@ class _Kept:
             return self._bytes >= 4 * MAX_BYTES
         return self._bytes >= MAX_BYTES or len(self._data[topic]) >= ITERATIONS
 
-    def add(self, topic: str, log_time: int, data: bytes) -> None:
+    def add(self, topic: str, log_time: int, data: memoryview) -> None:
         if topic == EVENT_TOPIC or (topic == WATCHED_TOPIC and self._images):
             t = self._header.frame_at(log_time)
             if topic == WATCHED_TOPIC and t % self._every:
                 return
             self._frames[topic].append(t)
-        self._data[topic].append(data)
+        self._data[topic].append(bytes(data))
         self._bytes += len(data)
 
     def stretch(self) -> Stretch:
@@ -157,7 +169,9 @@ class _Kept:
         if not data:
             return ()
         shape = self._header.spec.frame_shape
-        pixels = np.array([decode_image(entry, shape, self._log) for entry in data])
+        pixels = np.empty((len(data), *shape), dtype=np.uint8)
+        for place, entry in zip(pixels, data, strict=True):
+            place[:] = decode_image(entry, shape, self._log)
         return ((np.array(frames, dtype=np.int64), pixels),)
 
     def _matrices(
