@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -14,13 +14,14 @@ from recorder.config import RecordConfig
 from recorder.logfile import LogWriteError
 from recorder.messages import HeadPose
 from recorder.viewlog import (
+    FramesHeld,
     Identity,
     ViewLog,
     check_identity,
     earlier_logs,
+    frames_held,
     keep,
     kept_path,
-    whole_frames,
 )
 
 _BYTES: Final = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
@@ -76,6 +77,7 @@ class ViewParts:
         pose: of the head in this view, where there is a head.
         resume: go on after the frames that an earlier attempt left, up to this many;
             None to begin anew.
+        earlier: what the view's files hold, as far as that is known.
 
     Raises:
         UsageError: what is there is something else, or split in another way.
@@ -97,6 +99,7 @@ class ViewParts:
         split: Split | None = None,
         pose: HeadPose | None = None,
         resume: int | None = None,
+        earlier: Mapping[Path, FramesHeld] | None = None,
     ) -> None:
         self.view = view
         self.stream = identity.spec.streams.index(view)
@@ -107,13 +110,19 @@ class ViewParts:
         self._split = split
         self._length = split.frames(identity.spec.fps) if split else None
         self._pose = pose
-        self._first = 0
+        self._first = self._t = 0
         self._resume = resume
+        self._held = dict(earlier or {})
         self._earlier: tuple[Path, int] | None = None
         if resume is not None:
             self._earlier = self._to_continue(resume)
             self._refuse_later_parts()
         self._log: ViewLog | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether an earlier attempt finished the view, which is left as it is."""
+        return self._earlier == (self._path(), self._resume)
 
     def open(self) -> None:
         """Open the part to be written, with what an earlier attempt left of it.
@@ -121,6 +130,11 @@ class ViewParts:
         Raises:
             LogWriteError: the disk does not take it.
         """
+        if self._earlier is not None and self.complete:
+            self._t = self._earlier[1]
+            self.parts.append((self._path(), self._t - self._first))
+            kept_path(self._earlier[0]).unlink(missing_ok=True)
+            return
         try:
             for begun in self._later_parts():
                 begun.unlink()
@@ -136,7 +150,7 @@ class ViewParts:
     @property
     def t(self) -> int:
         """The next frame to be written."""
-        return self._writing.t
+        return self._t if self._log is None else self._log.t
 
     def write(self, block: Block) -> None:
         """Write the frames of a block, which must start at `t`.
@@ -152,7 +166,9 @@ class ViewParts:
 
     def finish(self) -> None:
         """Give the last part its index and its name, and forget what it was copied from."""
-        log = self._writing
+        if self._log is None:
+            return
+        log = self._log
         log.finish()
         kept_path(log.path).unlink(missing_ok=True)
         self.parts.append((log.path, log.t - self._first))
@@ -231,7 +247,7 @@ class ViewParts:
         self._refuse_other_split()
         while True:
             path = self._path()
-            found = {p: whole_frames(p, self.view, self._first) for p in earlier_logs(path)}
+            found = {p: self._whole(p) for p in earlier_logs(path)}
             best = max(found, key=lambda p: found[p], default=None)
             if best is None or found[best] <= self._first:
                 if path in found:
@@ -253,6 +269,12 @@ class ViewParts:
                 )
             self.parts.append(done)
             self._first = found[best]
+
+    def _whole(self, path: Path) -> int:
+        """Up to before which frame a file holds all of the part to go on with."""
+        if path not in self._held:
+            self._held[path] = frames_held(path, self.view)
+        return self._held[path].whole(self._first)
 
     def _goes_on(self, done: tuple[Path, int]) -> bool:
         """Whether another part follows a finished one."""

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +17,13 @@ from cdmisfa.blocks import FrameSource, SourceSpec
 from cdmisfa.config import as_table
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.folder import held
+from recorder.folder import answered, ask, asked, held
 from recorder.logfile import LogWriteError
 from recorder.messages import HeadPose
 from recorder.parts import Split, ViewParts, view_logs
 from recorder.rendering import render_here, render_in_processes, requests
 from recorder.scenes import open_scene
-from recorder.viewlog import Identity, last_end, sha256
+from recorder.viewlog import FramesHeld, Identity, frames_held, sha256
 
 MAX_JOBS = 256
 
@@ -82,14 +82,14 @@ def record(
         folder: made if it does not exist.
         scene: the world; a seed of None is 0.
         settings: the clock and the files.
-        frames: how many, of each view; by default `DEFAULT_FRAMES`, and where a longer
-            recording is resumed as many as it has.
+        frames: how many, of each view; by default `DEFAULT_FRAMES`, and where a recording is
+            resumed as many as it was asked to have.
         views: which views; by default all.
         jobs: processes that render.
         force: overwrite an earlier recording in the folder.
         resume: go on where an earlier attempt with the same arguments ended.
         split: write every view as parts of limited size or duration.
-        progress: called after every block.
+        progress: called after every block; never where there was nothing left to record.
 
     Raises:
         UsageError: the folder exists, or an argument is wrong.
@@ -121,8 +121,10 @@ def record(
             open_logs.enter_context(held(folder))
             if force:
                 remove_views(folder, names)
+            earlier: dict[str, dict[Path, FramesHeld]] = {}
             if resume:
-                frames = _length(folder, names, frames)
+                earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in names}
+                frames = _length(folder, earlier, frames)
             frames = frames or DEFAULT_FRAMES
             poses = _poses(source)
             logs = [
@@ -134,9 +136,12 @@ def record(
                     split=split,
                     pose=poses.get(name),
                     resume=frames if resume else None,
+                    earlier=earlier.get(name),
                 )
                 for name in names
             ]
+            unfinished = [log.view for log in logs if not log.complete]
+            _note(ask, folder, unfinished, frames)
             for log in logs:
                 open_logs.callback(log.abandon)
                 log.open()
@@ -144,7 +149,7 @@ def record(
             wanted = requests({log.stream: log.t for log in logs}, frames)
             blocks = (
                 render_here(source, wanted)
-                if jobs == 1
+                if jobs == 1 or not unfinished
                 else render_in_processes(kind, scene, settings, wanted, jobs)
             )
             with contextlib.closing(blocks):
@@ -156,6 +161,7 @@ def record(
                         raise _StoppedError(f"{folder} is not finished: go on with --resume")
             for log in logs:
                 log.finish()
+            _note(answered, folder, names)
     return [written(log.view, path, n) for log in logs for path, n in log.parts]
 
 
@@ -218,23 +224,43 @@ def remove_views(folder: Path, names: Sequence[str]) -> None:
         raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
 
 
-def _length(folder: Path, names: Sequence[str], frames: int | None) -> int:
+def _length(
+    folder: Path, earlier: Mapping[str, Mapping[Path, FramesHeld]], frames: int | None
+) -> int:
     """Frames of each view of a recording that is gone on with.
 
     Raises:
         UsageError: a file has more frames than asked for.
     """
     longest = 0
-    for name in names:
-        for path in view_logs(folder, name):
-            end = last_end(path, name)
-            if frames is not None and end > frames:
-                raise UsageError(
-                    f"{path} holds {end} frames, more than --frames {frames}: --resume shortens "
-                    f"nothing, give --frames {end} or more, or overwrite with --force"
-                )
-            longest = max(longest, end)
-    return frames or max(longest, DEFAULT_FRAMES)
+    for path, there in (item for files in earlier.values() for item in files.items()):
+        if frames is not None and there.end > frames:
+            raise UsageError(
+                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
+                f"nothing, give --frames {there.end} or more, or overwrite with --force"
+            )
+        longest = max(longest, there.end)
+    wanted = asked(folder, list(earlier))
+    return frames or max(longest, wanted or (longest if _finished(earlier) else DEFAULT_FRAMES))
+
+
+def _finished(earlier: Mapping[str, Mapping[Path, FramesHeld]]) -> bool:
+    """Whether every view has files, and all of them are finished."""
+    return all(
+        files and all(path.suffix == ".mcap" for path in files) for files in earlier.values()
+    )
+
+
+def _note(change: Callable[..., None], folder: Path, *what: Any) -> None:
+    """Change what a folder says it was asked for.
+
+    Raises:
+        LogWriteError: the disk does not take it.
+    """
+    try:
+        change(folder, *what)
+    except OSError as error:
+        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
 
 
 @contextlib.contextmanager

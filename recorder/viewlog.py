@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
@@ -214,21 +214,35 @@ class ViewLog:
         self._log.abandon()
 
 
-def whole_frames(path: Path, view: str, first: int = 0) -> int:
-    """Up to before which frame a log holds all from the first on, damaged or not."""
-    count = first
+class FramesHeld(NamedTuple):
+    """What an earlier log of a view holds.
+
+    Attributes:
+        first: its first frame.
+        stop: up to before which frame all from the first on are there.
+        end: one more than its last frame; 0 without any.
+    """
+
+    first: int
+    stop: int
+    end: int
+
+    def whole(self, first: int) -> int:
+        """Up to before which frame all from a given one on are there."""
+        return self.stop if self.end and self.first == first else first
+
+
+def frames_held(path: Path, view: str) -> FramesHeld:
+    """Read once through a log, damaged or not, for the frames of a view that it holds."""
+    first = stop = end = 0
     for channel, message in _messages(path):
         if channel.topic == view_topic(view):
-            if message.sequence != count:
-                break
-            count += 1
-    return count
-
-
-def last_end(path: Path, view: str) -> int:
-    """One more than the last frame of a view that a log holds; 0 without any."""
-    ends = (m.sequence + 1 for c, m in _messages(path) if c.topic == view_topic(view))
-    return max(ends, default=0)
+            if not end:
+                first = stop = message.sequence
+            if message.sequence == stop:
+                stop += 1
+            end = max(end, message.sequence + 1)
+    return FramesHeld(first, stop, end)
 
 
 def check_identity(path: Path, expected: Mapping[str, str]) -> None:

@@ -17,17 +17,22 @@ from mcap.reader import make_reader
 from cdmisfa.blocks import FrameSource
 from cdmisfa.errors import UsageError
 from cdmisfa.streams import OscillatorySource
-from recorder import recording
+from recorder import recording, viewlog
 from recorder.config import RecordConfig, SceneConfig
-from recorder.folder import held
+from recorder.folder import ASKED, held
 from recorder.logfile import LogWriteError, partial_path
+from recorder.parts import Split
 from recorder.recording import record
 from recorder.rendering import BLOCK, requests
 from recorder.scenes import open_scene
-from recorder.viewlog import METADATA, sha256, whole_frames
+from recorder.viewlog import METADATA, frames_held, sha256
 
 ROOT = Path(__file__).parent.parent
 STREAMS = ("x1", "x2", "x3")
+
+
+def whole_frames(path: Path, view: str) -> int:
+    return frames_held(path, view).whole(0)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -229,6 +234,7 @@ def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path)
     assert code == -signal.SIGKILL
     for view in STREAMS:
         assert whole_frames(partial_path(folder / f"{view}.mcap"), view) >= told - 50
+    assert json.loads((folder / ASKED).read_text()) == {"frames": dict.fromkeys(STREAMS, 1000000)}
     files = record("oscillatory", folder, frames=3000, resume=True)
     assert [f.frames for f in files] == [3000] * 3
     assert contents(folder) == contents(oscillatory)
@@ -241,6 +247,46 @@ def test_a_signal_leaves_everything_that_was_recorded(tmp_path, number):
     for view in STREAMS:
         assert whole_frames(partial_path(tmp_path / "a" / f"{view}.mcap"), view) >= told
     assert not list((tmp_path / "a").glob("*.mcap"))
+
+
+def test_resume_knows_how_long_it_was_to_be(tmp_path):
+    folder, whole = tmp_path / "a", tmp_path / "whole"
+    record("oscillatory", whole, frames=1300)
+
+    def stop_at(frame: int):
+        def progress(done: float) -> None:
+            if done >= frame:
+                raise RuntimeError("stop")
+
+        return progress
+
+    with pytest.raises(RuntimeError, match="stop"):
+        record("oscillatory", folder, frames=1300, progress=stop_at(200))
+    with pytest.raises(RuntimeError, match="stop"):
+        record("oscillatory", folder, resume=True, views=["x2"], progress=stop_at(600))
+    files = record("oscillatory", folder, resume=True)
+    assert [f.frames for f in files] == [1300] * 3
+    assert contents(folder) == contents(whole)
+
+
+@pytest.mark.parametrize("split", [None, Split(seconds=3), Split(size=10_000)])
+def test_a_complete_recording_is_left_as_it_is(tmp_path, monkeypatch, split):
+    folder, told = tmp_path / "a", []
+    first = record("oscillatory", folder, frames=400, split=split)
+    before = {path.name: path.stat().st_ino for path in folder.iterdir()}
+    reads: list[Path] = []
+    read = viewlog._messages
+    monkeypatch.setattr(viewlog, "_messages", lambda path: reads.append(path) or read(path))
+    again = record(
+        "oscillatory", folder, frames=400, split=split, resume=True, progress=told.append
+    )
+    assert again == first == record("oscillatory", folder, split=split, resume=True)
+    assert told == []
+    assert sorted(reads) == sorted([f.file for f in first] * 2)  # once each time
+    assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
+    (folder / first[-1].file.name).rename(folder / f"{first[-1].file.name}.partial")
+    assert record("oscillatory", folder, frames=400, split=split, resume=True) == first
+    assert first[0].file.stat().st_ino == before[first[0].file.name]
 
 
 def test_resume_goes_on_from_any_torn_byte(oscillatory, tmp_path):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @click.option(
     "--frames",
     type=click.IntRange(1),
-    help="Frames of each view; by default 1000, with --resume what a longer one has.",
+    help="Frames of each view; by default 1000, with --resume as many as first asked for.",
 )
 @options.seed
 @click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
@@ -81,6 +81,13 @@ def record_command(
     from recorder.recording import DEFAULT_FRAMES, record
 
     parts = None if split is None else Split.parse(split)
+    recorded = False
+
+    def report(done: float) -> None:
+        nonlocal recorded
+        recorded = True
+        shown.update(done, max(done, frames or DEFAULT_FRAMES))
+
     try:
         with bar("recording", "frames") as shown:
             files = record(
@@ -94,10 +101,12 @@ def record_command(
                 force=force,
                 resume=resume,
                 split=parts,
-                progress=lambda done: shown.update(done, max(done, frames or DEFAULT_FRAMES)),
+                progress=report,
             )
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(f"{out} is not finished: go on with --resume") from error
+    if resume and not recorded:
+        click.echo(f"{out} is complete: nothing was left to record", err=True)
     held = sum(file.frames for file in files if file.name == files[0].name)
     print_recording(out, held, files, as_json=as_json)
 
