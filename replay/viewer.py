@@ -28,6 +28,7 @@ from replay.columns import FRAME
 from replay.recorded import RecordedSource
 from replay.runlog import is_run, read_signals
 from replay.view import build_view
+from replay.webpage import serve_page
 
 DRIVERS = "/usr/share/vulkan/icd.d/*.json"
 """Where Linux keeps the descriptions of Vulkan drivers."""
@@ -127,8 +128,11 @@ def serve(
         CdmisfaError: the server ended with an error.
     """
     check_limit(memory_limit)
-    data_port, page_port = free_port(), port or free_port()
-    with _view_of(path, every, all_views) as view:
+    data_port, viewer_port, page_port = free_port(), free_port(), port or free_port()
+    with (
+        _view_of(path, every, all_views) as view,
+        serve_page(viewer_port, data_port, page_port),
+    ):
         proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
         print(f"http://127.0.0.1:{page_port}/?url={proxy}", file=sys.stderr, flush=True)
         run_program(
@@ -136,7 +140,7 @@ def serve(
                 "--serve-web",
                 *("--bind", "127.0.0.1"),
                 *("--port", str(data_port)),
-                *("--web-viewer-port", str(page_port)),
+                *("--web-viewer-port", str(viewer_port)),
                 *("--server-memory-limit", memory_limit),
                 str(view),
             ]
