@@ -1,0 +1,81 @@
+"""`cdmisfa record` as a command: what it prints, and how it ends when it is stopped."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+
+PNG = b"\x89PNG"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
+    folder = tmp_path / "rec"
+    words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000"]
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not list(folder.glob("x3.mcap.partial")):
+            assert time.monotonic() < deadline
+            assert recorder.poll() is None
+            time.sleep(0.02)
+        time.sleep(0.2)
+        recorder.send_signal(number)
+        error = recorder.communicate(timeout=60)[1]
+    finally:
+        recorder.kill()
+    assert recorder.returncode == code
+    line = f"cdmisfa: interrupted: {folder} is not finished: go on with --resume\n"
+    assert error.lstrip("\n") == line  # behind the terminal's ^C
+    assert not list(folder.glob("*.mcap"))
+
+
+def test_going_on_with_a_complete_recording_says_so(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ("record", "oscillatory", "-o", tmp_path / "rec", "--json")
+    first = cdmisfa(*words, "--frames", 120)
+    again = cdmisfa(*words, "--resume")
+    assert (again.code, again.json) == (0, first.json)
+    assert again.err == f"{tmp_path / 'rec'} is complete: nothing was left to record\n"
+    longer = cdmisfa(*words, "--resume", "--frames", 150)
+    assert (longer.json["frames"], longer.err) == (150, "")
+
+
+class TestScenePicture:
+    @pytest.fixture(autouse=True)
+    def _simulator(self) -> None:
+        pytest.importorskip("pybullet")
+
+    def test_alone(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        picture = tmp_path / "new" / "folder" / "scene.png"
+        drawn = cdmisfa("record", "icub", "--scene-picture", picture, "--json")
+        assert drawn.json == {"schema": 1, "picture": str(picture)}
+        assert drawn.err == f"picture {picture}\n"
+        assert picture.read_bytes().startswith(PNG)
+        before = picture.read_bytes()
+        refused = cdmisfa("record", "icub", "--scene-picture", picture)
+        assert (refused.code, "scene.png exists" in refused.err) == (2, True)
+        assert picture.read_bytes() == before
+
+    def test_beside_a_recording(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        picture, folder = tmp_path / "scene.png", tmp_path / "rec"
+        words = ("--view", "center", "--frames", 3, "--json")
+        done = cdmisfa("record", "icub", "-o", folder, "--scene-picture", picture, *words)
+        assert [view["name"] for view in done.json["views"]] == ["center"]
+        assert picture.read_bytes().startswith(PNG)
+
+    def test_a_folder_is_no_picture(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+        (tmp_path / "a.png").mkdir()
+        for path, force in [(tmp_path, ()), (tmp_path / "a.png", ("--force",))]:
+            refused = cdmisfa("record", "icub", "--scene-picture", path, *force)
+            assert refused.code != 0
+            assert refused.err.count("\n") == 1
+            assert str(path) in refused.err
+        assert list(tmp_path.iterdir()) == [tmp_path / "a.png"]
