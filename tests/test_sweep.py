@@ -24,7 +24,9 @@ import psutil
 import pytest
 from click.testing import CliRunner
 from engine_tasks import trace
+from pyarrow import parquet
 
+from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.cli.results import results_command
 from cdmisfa.cli.sweep import parse_grid, parse_seeds, sweep_command
 from cdmisfa.config import LearnerConfig
@@ -336,6 +338,36 @@ def test_dask_gives_the_same_rows_though_a_worker_is_killed(
     assert workers[1].poll() is None
     assert (report.computed, report.failed) == (16, ())
     assert rows_of(tmp_path / "dask") == local
+
+
+def reproduced(folder: Path, *words: str) -> list[dict[str, Any]]:
+    """Rows of a quick reproduction by the command."""
+    asked = ["reproduce", "stability", "--quick", "-o", str(folder), *words]
+    assert cdmisfa(asked) == 0
+    table = parquet.read_table(folder / "stability" / "rows.parquet")
+    rows: list[dict[str, Any]] = table.to_pylist()
+    return rows
+
+
+def test_a_reproduction_on_dask_is_the_one_made_here(
+    tmp_path: Path, cluster: tuple[str, list[subprocess.Popen[bytes]]]
+) -> None:
+    there = reproduced(tmp_path / "dask", "--engine", "dask", "--scheduler", cluster[0])
+    assert len(there) == 6
+    assert there == reproduced(tmp_path / "here")
+
+
+def test_ray_gives_what_is_computed_here_though_a_worker_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray", reason="ray is not installed: pip install 'cdmisfa[ray]'")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+    (tmp_path / "tasks").mkdir()
+    tasks = [(str(tmp_path / "tasks"), n, "once" if n == 2 else "") for n in range(6)]
+    assert dict(run_all(trace, tasks, engine="ray", jobs=2)) == {n: n * n for n in range(6)}
+    assert (tmp_path / "tasks" / "2").stat().st_size == 2
+    there = reproduced(tmp_path / "ray", "--engine", "ray", "--jobs", "2")
+    assert there == reproduced(tmp_path / "here")
 
 
 def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
