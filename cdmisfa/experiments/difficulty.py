@@ -239,7 +239,8 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
             mean, sd = panels.mean_sd(panels.stack(curves))
             at = (np.arange(len(mean)) + 1) * STEP
             colour = panels.COLOURS[stream]
-            panel.fill_between(at, mean - sd, mean + sd, color=colour, alpha=0.2, linewidth=0)
+            low, high = np.maximum(mean - sd, 0), np.minimum(mean + sd, 1)
+            panel.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
             panel.plot(at, mean, color=colour, linewidth=1, label=panels.STREAM_NAMES[stream])
         panel.axhline(THRESHOLD, color="grey", linestyle=":", linewidth=0.8)
         panel.set_xscale("log")

@@ -180,7 +180,7 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     drawn, axes = panels.figure(1, 3)
     values = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
     panels.per_stream(axes[0, 0], values, "c", "Q(s, stay) - Q(s, switch)")
-    panels.per_stream(axes[0, 1], [t.arrays["policy"] for t in trials], "d", "policy (0 stay)")
+    panels.policies(axes[0, 1], [t.arrays["policy"] for t in trials], "d", "policy, mean and SD")
     panels.eta_dot(axes[0, 2], [t.arrays["eta_dot"] for t in trials], learner_config().delta, "e")
     paths = panels.save(drawn, folder, "icub")
     outputs, axes = panels.figure(2, 2)

@@ -124,7 +124,7 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     )
     values = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
     panels.per_stream(axes[1, 0], values, "c", "Q(s, stay) - Q(s, switch)")
-    panels.per_stream(axes[1, 1], [t.arrays["policy"] for t in trials], "d", "policy (0 stay)")
+    panels.policies(axes[1, 1], [t.arrays["policy"] for t in trials], "d", "policy, mean and SD")
     paths = panels.save(drawn, folder, "oscillatory")
     bars, axes = panels.figure(1, 3, width=2.3)
     for i in range(3):

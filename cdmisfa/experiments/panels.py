@@ -20,6 +20,12 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 
 STREAM_NAMES = ("$s_1$", "$s_2$", "$s_3$")
 
+DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)))
+"""Lines that stay apart where they lie on each other; one for each stream."""
+
+MARKERS = (("o", 7), ("s", 5), ("^", 3))
+"""Marks and their sizes that stay apart where they lie on each other; one for each stream."""
+
 
 def figure(rows: int, columns: int, *, width: float = 3.4, height: float = 2.4) -> tuple[Any, Any]:
     """A figure of panels and its (rows, columns) axes.
@@ -127,6 +133,39 @@ def per_stream(
     label(axes, letter, "iteration", y)
 
 
+def policies(axes: Axes, curves: Sequence[NDArray[Any]], letter: str, y: str) -> None:
+    """Mean policy over iterations, a line a stream, and a band of one SD within what can be.
+
+    Args:
+        axes: panel.
+        curves: (N, S) of each trial, 0 stay and 1 switch.
+        letter: of the panel.
+        y: name of the axis.
+    """
+    mean, sd = mean_sd(stack(curves))
+    steps = np.arange(len(mean))
+    for s in range(mean.shape[1]):
+        colour, width = COLOURS[s % len(COLOURS)], (1.8, 1.4, 1.4)[s % 3]
+        low, high = np.clip(mean[:, s] - sd[:, s], 0, 1), np.clip(mean[:, s] + sd[:, s], 0, 1)
+        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+        axes.plot(
+            mean[:, s],
+            color=colour,
+            linewidth=width,
+            linestyle=DASHES[s % 3],
+            label=STREAM_NAMES[s],
+        )
+    axes.legend(fontsize=6, loc="center right")
+    label(axes, letter, "iteration", y)
+    stay_to_switch(axes)
+
+
+def stay_to_switch(axes: Axes) -> None:
+    """Name the two ends of a policy's axis."""
+    axes.set_ylim(-0.07, 1.07)
+    axes.set_yticks([0, 0.5, 1], ["stay", "0.5", "switch"])
+
+
 def policy_bars(axes: Axes, policies: Sequence[NDArray[Any]], letter: str, title: str) -> None:
     """Share of trials whose policy leaves each stream: 0 all stay, 1 all switch."""
     stacked = np.asarray(policies, dtype=float)
@@ -134,6 +173,5 @@ def policy_bars(axes: Axes, policies: Sequence[NDArray[Any]], letter: str, title
         axes.bar(s, stacked[:, s].mean(), color=COLOURS[s], width=0.7)
         axes.plot([s - 0.35, s + 0.35], [stacked[:, s].mean()] * 2, color=COLOURS[s], linewidth=2)
     axes.set_xticks(range(stacked.shape[1]), STREAM_NAMES[: stacked.shape[1]])
-    axes.set_ylim(-0.05, 1.05)
-    axes.set_yticks([0, 1], ["stay", "switch"])
+    stay_to_switch(axes)
     label(axes, letter, title, "policy, mean over trials")

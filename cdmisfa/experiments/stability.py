@@ -98,9 +98,7 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
         panels.per_stream(
             axes[row, 0], [one.arrays["R"]], "ac"[row], f"{algorithm}: R, stay entries", each=True
         )
-        panels.per_stream(
-            axes[row, 1], [one.arrays["policy"]], "bd"[row], f"{algorithm}: policy", each=True
-        )
+        panels.policies(axes[row, 1], [one.arrays["policy"]], "bd"[row], f"{algorithm}: policy")
         for panel in axes[row]:
             panel.axvline(one.row["exploration_ends"], color="grey", linestyle=":", linewidth=0.8)
     return panels.save(drawn, folder, "stability")
