@@ -132,14 +132,19 @@ def parts_of(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.mcap"), key=_by_number)
 
 
-def fingerprint(path: Location) -> dict[str, Any]:
+def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any]:
     """What tells a log from others: see `identity`; of a folder, names and contents count.
+
+    Args:
+        path: the log.
+        streams: of which one reads it, where it is behind a URL.
 
     Raises:
         CdmisfaError: a file cannot be read.
     """
     if isinstance(path, Url) or not path.is_dir():
-        return identity(path)
+        reads = (s.reader for s in streams if isinstance(s, McapImages) and s.path == path)
+        return identity(path, next(reads, None))
     whole = hashlib.sha256()
     for file in sorted(p for p in path.iterdir() if p.is_file()):
         whole.update(f"{file.name}\0{sha256(file)}\n".encode("utf-8", "surrogateescape"))

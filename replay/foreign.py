@@ -170,7 +170,8 @@ class ForeignSource:
     def describe(self) -> Mapping[str, Any]:
         """The logs with their SHA-256, the topics, and how they became frames."""
         if self._hashes is None:
-            self._hashes = [fingerprint(path) for path in self._files]
+            parts = [p for s in self._streams for p in getattr(s, "parts", [s])]
+            self._hashes = [fingerprint(path, parts) for path in self._files]
         return {
             "kind": "foreign",
             "files": self._hashes,

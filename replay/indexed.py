@@ -85,7 +85,7 @@ def indexed_segments(
         and len(spans.metadata) == statistics.metadata
         and len(spans.attachments) == statistics.attachments
         and sum(sum(c.values()) for c in counts) == statistics.messages
-        and known.issuperset(*counts)
+        and all(c.keys() <= known for c in counts)
     )
     return (segments, spans) if accounted else None
 

@@ -20,12 +20,15 @@ class JoinedImages:
     Args:
         path: what stands for all of them.
         parts: each has times, and the same topic.
+
+    Attributes:
+        parts: as given.
     """
 
     def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
         self.path = path
         self.recipe = parts[0].recipe
-        self._parts = list(parts)
+        self.parts = list(parts)
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")
         self.times = times[order]
@@ -36,12 +39,12 @@ class JoinedImages:
     @property
     def topic(self) -> str:
         """The topic that all parts share."""
-        return self._parts[0].topic
+        return self.parts[0].topic
 
     @property
     def warnings(self) -> Sequence[str]:
         """What was cut off or left out in a part, and gaps are the user's to see by times."""
-        return [warning for part in self._parts for warning in part.warnings]
+        return [warning for part in self.parts for warning in part.warnings]
 
     def frame(self, row: int) -> Bytes:
         """Decode an image into a frame, (height, width) uint8.
@@ -49,11 +52,11 @@ class JoinedImages:
         Raises:
             LogDamagedError: it is no image that is read.
         """
-        return self._parts[int(self._part_of[row])].frame(int(self._row_in[row]))
+        return self.parts[int(self._part_of[row])].frame(int(self._row_in[row]))
 
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""
-        for part in self._parts:
+        for part in self.parts:
             part.close()
 
 

@@ -78,7 +78,6 @@ class LogReader:
         *,
         salvage: bool = False,
         cache_bytes: int | None = None,
-        whole: bool = False,
     ) -> None:
         """Open a log and walk over its structure.
 
@@ -86,7 +85,6 @@ class LogReader:
             path: the file, or its URL.
             salvage: go on over damage.
             cache_bytes: decoded chunks that are kept.
-            whole: walk over all of a URL's bytes, too.
 
         Raises:
             UsageError: it cannot be opened.
@@ -103,7 +101,7 @@ class LogReader:
         self._searched = False
         self._file = RandomFile(self.path)
         try:
-            by_index = isinstance(self.path, Url) and not whole
+            by_index = isinstance(self.path, Url)
             self._structure = Structure(self._file, self._refuse, by_index=by_index)
             self._time_tail()
             self._check_data_crc()
@@ -290,7 +288,7 @@ class LogReader:
         if self.by_index:
             numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
             chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
-            self.expect([s for _, s in chosen])
+        self.expect([s for _, s in chosen])
         groups = _overlapping(chosen) if ordered else [[pair] for pair in chosen]
         for group in groups:
             if len(group) > 1:

@@ -148,7 +148,7 @@ class RecordedSource:
                 {
                     "name": view.facts.view,
                     "frames": view.count,
-                    **identity(view.path),
+                    **identity(view.path, view.reader),
                 }
                 for parts in self._views
                 for view in parts

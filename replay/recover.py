@@ -11,11 +11,12 @@ import numpy as np
 
 from cdmisfa.errors import LogDamagedError, UsageError
 from recorder.logfile import PARTIAL, LogFile
+from replay.fetch import fetched
 from replay.files import log_files
 from replay.info import ChannelSurvey
 from replay.reader import LogReader
 from replay.records import Channel, Schema
-from replay.store import Location, Url, location
+from replay.store import Location, location
 from replay.tables import MessageTable
 
 
@@ -32,7 +33,8 @@ def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dic
     """Write a complete, indexed log of everything in `src` that is readable.
 
     The new file is read again, with its checksums, and compared before this returns.
-    Of a folder each log is recovered into the folder `dst`.
+    Of a folder each log is recovered into the folder `dst`. What lies behind a URL is copied
+    first.
 
     Returns:
         `schema`, `out`, `complete` (nothing was lost), `channels` (topic, kept, lost,
@@ -45,18 +47,27 @@ def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dic
         LogDamagedError: not an MCAP file.
         LogWriteError: the disk does not take it.
     """
-    src, dst = location(src), Path(dst)
-    files = log_files(src)
-    many = src.folder if isinstance(src, Url) else src.is_dir()
-    if many and dst.exists() and not dst.is_dir():
+    place, dst = location(src), Path(dst)
+    with fetched(place) as copy:
+        report = _recover(copy, dst, force)
+    for lost in report["lost"]:
+        lost["where"] = lost["where"].replace(str(copy), str(place))
+    return report
+
+
+def _recover(src: Path, dst: Path, force: bool) -> dict[str, Any]:
+    files = [file for file in log_files(src) if isinstance(file, Path)]
+    if src.is_dir() and dst.exists() and not dst.is_dir():
         raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
     try:
-        (dst if many else dst.parent).mkdir(parents=True, exist_ok=True)
+        (dst if src.is_dir() else dst.parent).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{dst}: {error.strerror}") from None
-    targets = [dst / file.name.removesuffix(PARTIAL) for file in files] if many else [dst]
+    targets = [dst]
+    if src.is_dir():
+        targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
     for file, target in zip(files, targets, strict=True):
-        if isinstance(file, Path) and target.exists() and file.samefile(target):
+        if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
     reports = [_recover_file(f, t, force) for f, t in zip(files, targets, strict=True)]
     return {
@@ -69,8 +80,8 @@ def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dic
     }
 
 
-def _recover_file(src: Location, dst: Path, force: bool) -> dict[str, Any]:
-    with LogReader(src, salvage=True, whole=True) as reader:
+def _recover_file(src: Path, dst: Path, force: bool) -> dict[str, Any]:
+    with LogReader(src, salvage=True) as reader:
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             tallies, unverified = _copy(reader, log)

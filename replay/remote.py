@@ -79,11 +79,13 @@ class RemoteStore:
         self._url = url
         self._remote = _connect(url)
         self._parts: OrderedDict[int, bytes] = OrderedDict()
+        self._begins: list[int] = []
         self._held = 0
         self._spans: list[tuple[int, int]] = []
         self._starts: list[int] = []
         self._ahead: tuple[int, int, Future[Part]] | None = None
         self._reach, self._follows = _LEAST, -1
+        self._stride, self._awaited = EDGE_BYTES, -1
         self.size, self.tag = 0, ""
         first = self._wait(self._start(0, EDGE_BYTES), 0, EDGE_BYTES)
         self.size, self.tag = first.total, first.tag
@@ -119,6 +121,7 @@ class RemoteStore:
             self._ahead[2].cancel()
             self._ahead = None
         self._parts.clear()
+        self._begins.clear()
         self._held = 0
 
     def _choose(self, start: int, stop: int) -> tuple[int, int]:
@@ -126,7 +129,7 @@ class RemoteStore:
         number = bisect.bisect_right(self._starts, start) - 1
         if number >= 0 and stop <= self._spans[number][1]:
             return self._bundle(number)
-        if start == self._follows:
+        if 0 <= start - self._follows <= self._reach:
             self._reach = min(2 * self._reach, _MOST)
         else:
             self._reach = _LEAST
@@ -137,12 +140,17 @@ class RemoteStore:
         return start, stop
 
     def _bundle(self, number: int) -> tuple[int, int]:
-        """Expected spans from one on that touch, up to a limit."""
+        """Expected spans from one on that touch; more and more while they come in order."""
         start, stop = self._spans[number]
-        for begin, end in self._spans[number + 1 :]:
-            if begin != stop or end - start > _MOST:
+        in_order = start == self._awaited
+        self._stride = min(2 * self._stride, _MOST) if in_order else EDGE_BYTES
+        while number + 1 < len(self._spans) and stop - start < self._stride:
+            number += 1
+            if self._spans[number][0] != stop:
                 break
-            stop = end
+            stop = self._spans[number][1]
+        following = bisect.bisect_left(self._starts, stop)
+        self._awaited = self._starts[following] if following < len(self._starts) else -1
         return start, stop
 
     def _fetch(self, start: int, stop: int) -> bytes:
@@ -197,17 +205,27 @@ class RemoteStore:
         return part.data
 
     def _cached(self, offset: int, count: int) -> bytes | None:
-        for start, data in self._parts.items():
-            if start <= offset and offset + count <= start + len(data):
-                self._parts.move_to_end(start)
-                return data[offset - start : offset - start + count]
-        return None
+        place = bisect.bisect_right(self._begins, offset) - 1
+        if place < 0:
+            return None
+        start = self._begins[place]
+        data = self._parts[start]
+        if offset + count > start + len(data):
+            return None
+        self._parts.move_to_end(start)
+        return data[offset - start : offset - start + count]
 
     def _keep(self, start: int, data: bytes) -> None:
-        self._held += len(data) - len(self._parts.pop(start, b""))
+        if start in self._parts:
+            self._held -= len(self._parts.pop(start))
+        else:
+            bisect.insort(self._begins, start)
         self._parts[start] = data
+        self._held += len(data)
         while self._held > CACHE_BYTES and len(self._parts) > 1:
-            self._held -= len(self._parts.popitem(last=False)[1])
+            old, gone = self._parts.popitem(last=False)
+            self._begins.remove(old)
+            self._held -= len(gone)
 
 
 class _HttpRemote:

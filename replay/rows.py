@@ -152,7 +152,7 @@ class ChannelRows:
 
     def _confirm(self, number: int) -> None:
         """Check the log times of a chunk whose frames were numbered by the summary."""
-        facts = self._to_confirm.pop(number, None)
+        facts = self._to_confirm.get(number)
         if facts is None:
             return
         start = facts.first_frame + self._starts[number]
@@ -161,6 +161,7 @@ class ChannelRows:
             self._number([self._times(number)], self._starts[number], facts, before, False)
         except MalformedRecord as error:
             raise LogDamagedError(f"{self._reader.path}: {error}") from None
+        del self._to_confirm[number]
 
     def _number(
         self,

@@ -29,19 +29,22 @@ class Url:
     address: str
 
     def __str__(self) -> str:
+        if self.scheme == "s3":
+            return self.address
         parts = urlsplit(self.address)
         return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
 
     @property
     def scheme(self) -> str:
         """What stands before "://"."""
-        return urlsplit(self.address).scheme
+        return self.address.split("://", 1)[0]
 
     @property
     def name(self) -> str:
-        """The last part of its path."""
-        path = str(self).rstrip("/").split("://", 1)[1]
-        return unquote(path.rsplit("/", 1)[-1])
+        """The last part of its path, fit for a file."""
+        last = str(self).rstrip("/").split("://", 1)[1].rsplit("/", 1)[-1]
+        name = re.sub(r"[/\\\0]", "_", last if self.scheme == "s3" else unquote(last))
+        return "log" if name in ("", ".", "..") else name
 
     @property
     def stem(self) -> str:
@@ -85,7 +88,7 @@ def location(value: str | Path | Url) -> Location:
         whole = bool(urlsplit(url.address).netloc and urlsplit(url.address).path.strip("/"))
     except ValueError:
         whole = False
-    if not whole and not (scheme == "s3" and url.name):
+    if not whole and not (scheme == "s3" and url.address.removeprefix("s3://").strip("/")):
         raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
     return url
 

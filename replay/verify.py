@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.errors import LogDamagedError
+from replay.fetch import fetched
 from replay.files import log_files
 from replay.info import crc_state, kind_of, survey
 from replay.reader import Crc, LogReader
@@ -22,6 +23,8 @@ _BLOCK: Final = 256
 def verify(path: str | Location) -> dict[str, Any]:
     """Check a log, or all logs of a folder, by decoding everything in them.
 
+    What lies behind a URL is copied first, for all of it is needed more than once.
+
     Of a recording also: each view has every frame once; of a folder, that the views have the
     same frames and none is missing.
 
@@ -32,22 +35,28 @@ def verify(path: str | Location) -> dict[str, Any]:
     Raises:
         UsageError: no such log.
     """
+    place = location(path)
     problems: list[dict[str, str]] = []
     files: list[dict[str, str]] = []
     views: list[Location] = []
-    for file in log_files(path):
-        state, kind = _check_file(file, problems)
-        files.append({"file": str(file), "crc": state})
-        if kind == "recording":
-            views.append(file)
-    if views:
-        _check_views(views, problems, alone=log_files(path) == [location(path)])
-    return {"ok": not problems, "problems": problems, "files": files}
+    with fetched(place) as copy:
+        for file in log_files(copy):
+            state, kind = _check_file(file, problems)
+            files.append({"file": str(file), "crc": state})
+            if kind == "recording":
+                views.append(file)
+        if views:
+            _check_views(views, problems, alone=copy.is_file())
+    return {
+        "ok": not problems,
+        "problems": [p | {"where": p["where"].replace(str(copy), str(place))} for p in problems],
+        "files": [f | {"file": f["file"].replace(str(copy), str(place))} for f in files],
+    }
 
 
 def _check_file(path: Location, problems: list[dict[str, str]]) -> tuple[Crc, str]:
     try:
-        with LogReader(path, salvage=True, whole=True) as reader:
+        with LogReader(path, salvage=True) as reader:
             found = survey(reader)
             for number in found.keys() - reader.channels.keys():
                 _note(problems, path, f"holds messages of channel {number}, never defined")

@@ -75,6 +75,7 @@ class ViewFile:
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
         self.facts = view_facts(self.path, records[0].values)
+        self.reader.expect(self.reader.segments)
         image = self.facts.dtype == "uint8"
         self._truth_layout = layout = truth_layout(self.facts.truth)
         tags = truth_tags(self.facts.truth)
@@ -97,7 +98,6 @@ class ViewFile:
             self.ranges = intersection(
                 self.ranges, [(run.start, run.stop) for run in self._truth_runs]
             )
-        self.reader.expect(self.reader.segments)
         self._payload = self._find_payload() if self.ranges else Payload(0, 0, b"")
 
     @property

@@ -10,6 +10,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.cameras import camera_options, say_about
+from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.cli.record import print_recording
 from cdmisfa.errors import UsageError
@@ -19,41 +20,57 @@ if TYPE_CHECKING:
 
 
 @click.command("convert")
-@click.argument("source", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("source", nargs=-1, required=True)
 @options.out("Folder of the recording.", required=True)
 @camera_options
 @click.option("--salvage", is_flag=True, help="Go on over damaged parts of a log.")
+@click.option("--resume", is_flag=True, help="Go on where an earlier attempt was stopped.")
 @options.force
 @options.as_json
+@click.pass_context
 def convert_command(
-    source: tuple[Path, ...],
+    ctx: click.Context,
+    source: tuple[str, ...],
     out: Path,
     topics: tuple[str, ...],
     size: tuple[int, int] | None,
     align: Align | None,
     rate: float | None,
     salvage: bool,
+    resume: bool,
     force: bool,
     as_json: bool,
 ) -> None:
     """Write camera logs of others as a recording.
 
-    SOURCE is MCAP files, ROS bags, or a folder of pictures for each stream.
+    SOURCE is MCAP files or their URLs, ROS bags, or a video or a folder of pictures for each
+    stream. Interrupted, it goes on with --resume.
     """
-    from cdmisfa.experiments.convert import convert
+    from cdmisfa.experiments.convert import REMEDY, convert
     from cdmisfa.experiments.sources import CameraOptions, open_cameras
     from recorder.recording import refuse_existing
+    from replay.store import Url, location
 
-    for path in source:
-        if not path.exists():
-            raise UsageError(f"{path}: no such file or folder")
-    refuse_existing(out, force=force)
+    places = [location(word) for word in source]
+    for place in places:
+        if not isinstance(place, Url) and not place.exists():
+            raise UsageError(f"{place}: no such file or folder")
+    if not resume:
+        refuse_existing(out, force=force, remedy=REMEDY)
     cameras = CameraOptions(topics, size, align, rate)
-    with contextlib.closing(open_cameras(source, cameras, salvage=salvage)) as frames:
+    with contextlib.closing(open_cameras(places, cameras, salvage=salvage)) as frames:
         say_about(frames)
         length = frames.spec.length or 0
-        with bar("converting", "frames") as shown:
-            files = convert(
-                frames, out, force=force, progress=lambda done: shown.update(done, length)
-            )
+        with bar("converting", "frames") as shown, stoppable() as stop:
+
+            def advance(done: float) -> None:
+                shown.update(done, length)
+                if stop():
+                    raise KeyboardInterrupt
+
+            try:
+                files = convert(frames, out, force=force, resume=resume, progress=advance)
+            except KeyboardInterrupt:
+                click.echo(f"cdmisfa: {out} is not finished: go on with --resume", err=True)
+                ctx.exit(stop.exit_code)
     print_recording(out, length, files, as_json=as_json)

@@ -82,6 +82,25 @@ def path_argument(name: str) -> Callable[[Command], Command]:
     return click.argument(name, type=click.Path(path_type=Path))
 
 
+def place_argument(name: str) -> Callable[[Command], Command]:
+    """A path or a URL, as a text; whether it exists is for the library to say."""
+    return click.argument(name)
+
+
+def fetched_argument(name: str) -> Callable[[Command], Command]:
+    """A path; a log behind a URL is copied into a file for as long as the command runs."""
+    return click.argument(name, callback=_fetched)
+
+
+def _fetched(ctx: click.Context, param: click.Parameter, value: str) -> Path:
+    if "://" not in value:
+        return Path(value)
+    from replay.fetch import fetched
+    from replay.store import location
+
+    return ctx.with_resource(fetched(location(value)))
+
+
 def print_json(document: Mapping[str, Any]) -> None:
     """One JSON document on stdout; what JSON has no number for (NaN) becomes null."""
     click.echo(json.dumps(_plain(document), allow_nan=False))

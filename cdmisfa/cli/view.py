@@ -13,7 +13,7 @@ FILE = click.Path(path_type=Path)
 
 
 @click.command("view")
-@options.path_argument("run")
+@options.fetched_argument("run")
 @click.option("--save", type=FILE, metavar="F.rrd", help="Write the view to a file and end.")
 @click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
 @click.option("--screenshot", type=FILE, metavar="F.png", help="Draw the view without a screen.")
@@ -46,8 +46,9 @@ def view_command(
 ) -> None:
     """Open a run in the Rerun viewer, or save, serve or picture it.
 
-    RUN is the folder of a run, or its run.mcap, a recording, or an .rrd file. A sweep that
-    kept its logs is served as a table, one row per run, until interrupted.
+    RUN is the folder of a run, or its run.mcap, a recording, or an .rrd file; of a log behind
+    a URL a copy is made. A sweep that kept its logs is served as a table, one row per run,
+    until interrupted.
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
         raise click.UsageError("choose one of --save, --web and --screenshot")

@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from cdmisfa.blocks import SourceSpec
 from cdmisfa.errors import UsageError
 from recorder.config import RecordConfig
 from recorder.folder import held
+from recorder.parts import ViewParts
 from recorder.recording import (
     ViewRecording,
     make_folder,
@@ -20,11 +20,12 @@ from recorder.recording import (
     remove_views,
     written,
 )
-from recorder.viewlog import Identity, ViewLog
+from recorder.viewlog import Identity
 from replay.foreign import ForeignSource
 
 KIND: Final = "foreign"
 """What the recording states as its scene."""
+REMEDY: Final = "go on with --resume or overwrite with --force"
 _BLOCK: Final = 64
 
 
@@ -34,9 +35,12 @@ def convert(
     *,
     settings: RecordConfig | None = None,
     force: bool = False,
+    resume: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> list[ViewRecording]:
     """Write every stream of a source as a view of a recording.
+
+    The files do not depend on having been interrupted and resumed.
 
     The recording has the source's frames at its times and rate; the logs they came from, with
     their checksums and how images became frames, stand in its config.json.
@@ -46,38 +50,44 @@ def convert(
         folder: made if it does not exist.
         settings: how the files are written.
         force: overwrite an earlier recording in the folder.
+        resume: go on where an earlier attempt with the same source ended.
         progress: told after every block how many frames of all streams are written.
 
     Raises:
-        UsageError: the folder exists, or the source has no end.
+        UsageError: the folder exists, the source has no end, or what is to be gone on with
+            came from another one.
         LogDamagedError: an image cannot be read.
         LogWriteError: the disk does not take it.
     """
     if source.spec.length is None:
         raise UsageError("a source that loops has no end: convert it without looping")
-    refuse_existing(folder, force=force)
+    if force and resume:
+        raise UsageError("--force starts anew and --resume goes on: use one of them")
+    if not resume:
+        refuse_existing(folder, force=force, remedy=REMEDY)
     spec = replace(source.spec, streams=view_names(source.spec.streams))
     identity = Identity(KIND, 0, spec, {"source": dict(source.describe())})
     make_folder(folder)
-    logs: list[ViewLog] = []
-    done = 0
+    count = source.spec.length
     with ExitStack() as unfinished:
         unfinished.enter_context(held(folder))
         if force:
             remove_views(folder, spec.streams)
-        for view in spec.streams:
-            logs.append(ViewLog(folder, view, identity, settings or RecordConfig()))
-            unfinished.callback(logs[-1].abandon)
+        upto = count if resume else None
+        used = settings or RecordConfig()
+        logs = [ViewParts(folder, view, identity, used, resume=upto) for view in spec.streams]
         for log in logs:
-            source.seek(0)
-            for n in _cuts(spec):
-                log.write(source.take(log.stream, n))
-                done += n
+            unfinished.callback(log.abandon)
+            log.open()
+        for log in logs:
+            source.seek(log.t)
+            while log.t < count:
+                log.write(source.take(log.stream, min(_BLOCK, count - log.t)))
                 if progress is not None:
-                    progress(done / len(logs))
+                    progress(sum(each.t for each in logs) / len(logs))
         for log in logs:
             log.finish()
-    return [written(log.view, log.path, log.t) for log in logs]
+    return [written(log.view, path, n) for log in logs for path, n in log.parts]
 
 
 def view_names(topics: Sequence[str]) -> tuple[str, ...]:
@@ -88,9 +98,3 @@ def view_names(topics: Sequence[str]) -> tuple[str, ...]:
         taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
         names.append(f"{plain}-{taken + 1}" if taken else plain)
     return tuple(names)
-
-
-def _cuts(spec: SourceSpec) -> list[int]:
-    """Lengths of the blocks that make up the source."""
-    whole, rest = divmod(spec.length or 0, _BLOCK)
-    return [_BLOCK] * whole + [rest] * (rest > 0)

@@ -244,6 +244,8 @@ def open_log(
     if cameras == CameraOptions() and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError):
             return RecordedSource(paths, loop=loop, salvage=salvage)
+        for path in paths:
+            _refuse_remote_run(path)
     return open_cameras(paths, cameras, loop=loop, salvage=salvage)
 
 
@@ -251,17 +253,12 @@ def _refuse_what_is_no_log(path: Location) -> None:
     """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
     from replay.camera_logs import only_foreign
     from replay.files import starts_as_log
-    from replay.info import kind_of
-    from replay.reader import LogReader
     from replay.runlog import RUN_FILE, is_run
     from replay.store import Url
 
-    if isinstance(path, Url):
-        if path.folder:
-            return
-        with LogReader(path, salvage=True) as reader:
-            run = kind_of(reader) == "run"
-    elif path.is_dir():
+    if isinstance(path, Url):  # opened only once: see `_refuse_remote_run`
+        return
+    if path.is_dir():
         run = is_run(path)
     elif starts_as_log(path):
         run = path.name.startswith(RUN_FILE) and is_run(path)
@@ -270,10 +267,26 @@ def _refuse_what_is_no_log(path: Location) -> None:
     else:
         raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
     if run:
-        raise UsageError(
-            f"{path} is a run, not a recording: look at it with cdmisfa view {path}, "
-            "or learn from what it learned from"
-        )
+        raise _a_run(path)
+
+
+def _refuse_remote_run(path: Location) -> None:
+    """Refuse a run behind a URL, once it is known to be no recording."""
+    from replay.info import kind_of
+    from replay.reader import LogReader
+    from replay.store import Url
+
+    if isinstance(path, Url) and not path.folder:
+        with LogReader(path) as reader:
+            if kind_of(reader) == "run":
+                raise _a_run(path)
+
+
+def _a_run(path: Location) -> UsageError:
+    return UsageError(
+        f"{path} is a run, not a recording: look at it with cdmisfa view {path}, "
+        "or learn from what it learned from"
+    )
 
 
 def open_cameras(

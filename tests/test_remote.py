@@ -1,0 +1,338 @@
+"""Logs on a web server: the same signals from few bytes, and one line where it fails."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import write_cameras
+from conftest import Cdmisfa
+from mcap.writer import CompressionType, Writer
+from mcap_files import (
+    CHANNEL,
+    HEADER,
+    MAGIC,
+    MESSAGE,
+    channel,
+    finish,
+    message,
+    record,
+    text,
+    variant,
+    variants,
+)
+from web_server import Fault, WebServer, serving
+
+from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.foreign import ForeignSource
+from replay.reader import LogReader
+from replay.recorded import RecordedSource
+from replay.remote import RemoteError, RemoteStore
+from replay.store import Url, location
+
+pytest.importorskip("aiohttp")
+
+QUICK = ("--max-iterations", "6", "--json")
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[WebServer]:
+    with serving() as web:
+        yield web
+
+
+@pytest.fixture
+def web(server: WebServer) -> WebServer:
+    server.files, server.fault = {}, ""
+    server.reset()
+    return server
+
+
+@pytest.fixture
+def views(web: WebServer, oscillatory_recording: Path) -> list[str]:
+    """URLs of the recording's views."""
+    for file in sorted(oscillatory_recording.glob("*.mcap")):
+        web.files[f"/rec/{file.name}"] = file.read_bytes()
+    return [web.url(path) for path in web.files]
+
+
+def write_noise(path: Path, topics: tuple[str, ...], count: int, size: int) -> None:
+    """A log with chunks of one topic each in turn, that nothing can compress."""
+    random = np.random.default_rng(3)
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=5 * size, compression=CompressionType.NONE)
+        writer.start()
+        channels = [writer.register_channel(topic, "", 0) for topic in topics]
+        for i in range(count):
+            for number, channel in enumerate(channels):
+                for k in range(5):
+                    time = (5 * i + k) * 10_000_000 + number
+                    writer.add_message(channel, time, random.bytes(size), time)
+        writer.finish()
+
+
+def test_the_signals_are_those_of_the_files(
+    cdmisfa: Cdmisfa, views: list[str], oscillatory_recording: Path, tmp_path: Path
+) -> None:
+    near = cdmisfa("learn", oscillatory_recording, *QUICK)
+    far = cdmisfa("learn", *views, *QUICK, "-o", tmp_path / "run", "--no-rerun")
+    assert far.code == 0, far.err
+    assert far.json["signals_sha256"] == near.json["signals_sha256"]
+    view = far.json["source"]["views"][0]
+    assert (view["url"], len(view["index_sha256"])) == (views[0], 64)
+    assert view["bytes"] == (oscillatory_recording / view["file"]).stat().st_size
+    words = ("learn", *views, "-o", tmp_path / "run", "--resume", "--max-iterations", "9", "--json")
+    assert cdmisfa(*words).json["iterations"] == 9
+
+
+def test_every_frame_is_the_same(views: list[str], oscillatory_recording: Path) -> None:
+    far, near = RecordedSource(views), RecordedSource(oscillatory_recording)
+    assert far.spec == near.spec
+    for stream in range(3):
+        for t, n in ((0, 64), (700, 300), (1999, 1), (5, 10)):
+            far.seek(t)
+            near.seek(t)
+            one, two = far.take(stream, n), near.take(stream, n)
+            np.testing.assert_array_equal(one.frames, two.frames)
+            np.testing.assert_array_equal(one.truth, two.truth)
+    far.close()
+
+
+def test_what_is_in_a_log_is_said_from_few_bytes(
+    cdmisfa: Cdmisfa, web: WebServer, tmp_path: Path
+) -> None:
+    write_noise(tmp_path / "a.mcap", ("/left", "/right"), 1000, 5000)
+    web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
+    near = cdmisfa("info", tmp_path / "a.mcap", "--json").json
+    far = cdmisfa("info", web.url("/a.mcap"), "--json").json
+    assert far["channels"] == near["channels"]
+    assert (far["chunks"], far["complete"]) == (near["chunks"], True)
+    assert (far["crc"], near["crc"]) == ("unchecked", "ok")
+    assert len(web.files["/a.mcap"]) > 50_000_000
+    assert web.sent < 0.01 * len(web.files["/a.mcap"])
+
+
+def test_the_chunks_of_other_topics_are_left_where_they_are(web: WebServer, tmp_path: Path) -> None:
+    write_noise(tmp_path / "a.mcap", ("/left", "/right"), 100, 5000)
+    web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
+    with LogReader(web.url("/a.mcap")) as reader:
+        assert reader.by_index
+        edges, _ = web.sent, web.reset()
+        taken = [m.data for m in reader.messages({"/left"})]
+    with LogReader(tmp_path / "a.mcap") as reader:
+        assert taken == [m.data for m in reader.messages({"/left"})]
+    assert edges < 200_000
+    assert web.sent < 1.02 * sum(map(len, taken)) + 100_000
+
+
+def test_a_short_run_reads_only_the_beginning(web: WebServer, tmp_path: Path) -> None:
+    write_cameras(tmp_path / "a.mcap", {"/left": (20_000, 20), "/right": (20_000, 20)})
+    web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
+    near = ForeignSource(tmp_path / "a.mcap", ["/left"], size=(12, 16))
+    far = ForeignSource(web.url("/a.mcap"), ["/left"], size=(12, 16))
+    web.reset()
+    np.testing.assert_array_equal(far.take(0, 100).frames, near.take(0, 100).frames)
+    assert web.sent < 0.1 * len(web.files["/a.mcap"])
+    far.seek(15_000)
+    near.seek(15_000)
+    np.testing.assert_array_equal(far.take(0, 100).frames, near.take(0, 100).frames)
+    assert web.sent < 0.2 * len(web.files["/a.mcap"])
+    far.close()
+
+
+def test_every_variant_of_the_format_gives_the_same_messages(
+    web: WebServer, tmp_path: Path
+) -> None:
+    chosen = [v for i, v in enumerate(variants()) if i % 7 == 0]
+    for kind, features in chosen:
+        data = variant(kind, features, "zstd")
+        (tmp_path / "a.mcap").write_bytes(data)
+        web.files["/a.mcap"] = data
+        with LogReader(tmp_path / "a.mcap") as near, LogReader(web.url("/a.mcap")) as far:
+            assert list(far.messages()) == list(near.messages()), (kind, features)
+            assert far.metadata == near.metadata
+            assert far.attachments == near.attachments
+            assert far.complete == near.complete
+
+
+def test_cut_logs_are_read_as_far_as_they_go(
+    cdmisfa: Cdmisfa, web: WebServer, oscillatory_recording: Path, tmp_path: Path
+) -> None:
+    data = (oscillatory_recording / "x1.mcap").read_bytes()
+    web.files["/x1.mcap"] = data[: len(data) * 2 // 3]
+    (tmp_path / "x1.mcap").write_bytes(web.files["/x1.mcap"])
+    url = web.url("/x1.mcap")
+    near, far = (cdmisfa("info", p, "--json").json for p in (tmp_path / "x1.mcap", url))
+    assert far["channels"] == near["channels"]
+    assert not far["complete"]
+    assert cdmisfa("verify", url).code == 3
+    saved = cdmisfa("recover", url, "-o", tmp_path / "saved.mcap", "--json")
+    assert saved.code == 3
+    assert url in saved.json["lost"][0]["where"]
+    assert cdmisfa("verify", tmp_path / "saved.mcap").code == 0
+
+
+def test_damage_in_a_chunk_is_found_when_it_is_read(
+    cdmisfa: Cdmisfa, web: WebServer, views: list[str]
+) -> None:
+    with LogReader(views[0]) as reader:
+        segment = reader.segments[len(reader.segments) // 2]
+    broken = bytearray(web.files["/rec/x1.mcap"])
+    broken[segment.data_offset + segment.stored // 2] ^= 1
+    web.files["/rec/x1.mcap"] = bytes(broken)
+    with contextlib.closing(RecordedSource(views)) as source:
+        source.take(0, 10)
+        source.seek(0)
+        with pytest.raises(LogDamagedError, match=r"x1\.mcap: chunk at byte"):
+            source.take(0, 2000)
+    found = cdmisfa("verify", views[0], "--json")
+    assert found.code == 3
+    assert found.json["problems"][0]["where"].startswith(views[0])
+
+
+def test_a_summary_that_lies_about_a_chunk_is_caught(web: WebServer, tmp_path: Path) -> None:
+    write_noise(tmp_path / "a.mcap", ("/left",), 20, 500)
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    with LogReader(tmp_path / "a.mcap") as reader:
+        first = reader.segments[0]
+    place = data.index(int.to_bytes(first.offset, 8, "little"), first.stop)
+    data[place - 16] ^= 1  # when its first message was
+    data[-12:-8] = bytes(4)  # no checksum of the summary
+    web.files["/a.mcap"] = bytes(data)
+    with (
+        LogReader(web.url("/a.mcap")) as reader,
+        pytest.raises(LogDamagedError, match="not the chunk that the summary names"),
+    ):
+        list(reader.messages())
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("no ranges", "no parts of a file"),
+        ("short", "bytes"),
+        ("other part", "asked for the bytes 0 to"),
+        ("403", "403 Forbidden"),
+        ("packed", "packs it"),
+    ],
+)
+def test_a_server_that_misbehaves_is_one_line(
+    cdmisfa: Cdmisfa, web: WebServer, views: list[str], fault: Fault, words: str
+) -> None:
+    web.fault = fault
+    for command in ("info", "learn", "verify"):
+        done = cdmisfa(command, views[0])
+        assert done.code == 3, done
+        assert words in done.err
+        assert done.err.startswith(f"cdmisfa: {views[0]}: ")
+        assert done.err.count("\n") == 1
+
+
+def test_no_more_is_taken_than_was_asked_for(web: WebServer, views: list[str]) -> None:
+    web.fault = "endless"
+    store = RemoteStore(Url(views[0]))
+    assert store.read_at(0, 100) == bytes(100)
+    assert store._held <= 64 * 1024
+    store.close()
+
+
+def test_a_log_that_is_not_there_is_one_line(cdmisfa: Cdmisfa, web: WebServer) -> None:
+    for url, words in (
+        (web.url("/none.mcap"), "404 Not Found"),
+        ("http://127.0.0.1:9/a.mcap", "Cannot connect"),
+    ):
+        done = cdmisfa("learn", url)
+        assert (done.code, done.err.count("\n"), words in done.err) == (3, 1, True), done.err
+    web.files["/empty.mcap"] = b""
+    web.files["/text.mcap"] = b"no log at all"
+    for path in ("/empty.mcap", "/text.mcap"):
+        assert cdmisfa("info", web.url(path)).code == 3
+
+
+def test_a_passing_fault_is_tried_again(web: WebServer, views: list[str]) -> None:
+    with contextlib.closing(RecordedSource(views)) as source:
+        web.fault = "500 once"
+        assert len(source.take(1, 2000)) == 2000
+        assert web.fault == ""
+
+
+def test_a_file_that_changes_while_it_is_read_is_refused(web: WebServer, tmp_path: Path) -> None:
+    write_noise(tmp_path / "a.mcap", ("/left",), 200, 500)
+    data = (tmp_path / "a.mcap").read_bytes()
+    for changed in (data[:-1] + b"?", data + b"?"):
+        web.files["/a.mcap"] = data
+        with LogReader(web.url("/a.mcap")) as reader:
+            web.files["/a.mcap"] = changed
+            with pytest.raises(RemoteError, match="it changed while it was read"):
+                list(reader.messages())
+
+
+def test_memory_holds_a_bounded_part(web: WebServer) -> None:
+    web.files["/big"] = bytes(60_000_000)
+    store = RemoteStore(Url(web.url("/big")))
+    for at in range(0, store.size, 1 << 20):
+        assert len(store.read_at(at, 1 << 20)) == min(1 << 20, store.size - at)
+        assert store._held <= 17 << 20
+    store.close()
+
+
+def test_a_run_on_a_server_is_looked_at_and_not_learned_from(
+    cdmisfa: Cdmisfa, web: WebServer, oscillatory_run: Path, tmp_path: Path
+) -> None:
+    web.files["/runs/a/run.mcap"] = (oscillatory_run / "run.mcap").read_bytes()
+    url = web.url("/runs/a/run.mcap")
+    done = cdmisfa("learn", url)
+    assert (done.code, "is a run, not a recording" in done.err) == (2, True), done.err
+    assert cdmisfa("view", url, "--save", tmp_path / "a.rrd").code == 0
+    assert (tmp_path / "a.rrd").stat().st_size > 1000
+
+
+def test_camera_logs_on_a_server_are_converted(
+    cdmisfa: Cdmisfa, web: WebServer, tmp_path: Path
+) -> None:
+    write_cameras(tmp_path / "a.mcap", {"/left": (60, 20), "/right": (60, 20)})
+    web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
+    both = ("--topic", "/left", "--topic", "/right", "--size", "16x12")
+    words = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
+    near = cdmisfa("learn", tmp_path / "a.mcap", *both, *words)
+    done = cdmisfa("convert", web.url("/a.mcap"), *both, "-o", tmp_path / "rec")
+    assert done.code == 0, done.err
+    far = cdmisfa("learn", tmp_path / "rec", *words)
+    assert far.json["signals_sha256"] == near.json["signals_sha256"]
+
+
+def test_secrets_of_a_url_are_not_shown() -> None:
+    url = location("https://me:secret@host/rec/a%20b.mcap?X-Amz-Signature=feed")
+    assert isinstance(url, Url)
+    assert str(url) == "https://host/rec/a%20b.mcap"
+    assert (url.name, url.stem, url.suffix) == ("a b.mcap", "a b", ".mcap")
+    for name in ("https://host/..%2F..%2Fevil.mcap", "s3://bucket/a%2Fb/.."):
+        found = location(name)
+        assert "/" not in found.name
+        assert found.name != ".."
+
+
+def test_other_schemes_are_refused_by_name(cdmisfa: Cdmisfa) -> None:
+    done = cdmisfa("learn", "gs://bucket/a.mcap")
+    assert (done.code, "s3, http, https" in done.err) == (2, True)
+    with pytest.raises(UsageError, match="names no file"):
+        location("https://host")
+
+
+def test_without_the_packages_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(CdmisfaError, match=r"pip install 'cdmisfa\[cloud\]'"):
+        LogReader("https://127.0.0.1/a.mcap")
+
+
+def test_messages_outside_chunks_are_found_by_a_walk(web: WebServer) -> None:
+    data = MAGIC + record(HEADER, text("") + text("tests")) + record(CHANNEL, channel(schema_id=0))
+    data += record(MESSAGE, message(1, 0, 7, 7, b"x"))
+    web.files["/a.mcap"] = finish(data)
+    with LogReader(web.url("/a.mcap")) as reader:
+        assert not reader.by_index
+        assert [m.data for m in reader.messages()] == [b"x"]

@@ -1,0 +1,131 @@
+"""Logs in an S3 bucket, of a server on this machine."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import Cdmisfa
+
+pytest.importorskip("s3fs")
+moto_server = pytest.importorskip("moto.server")
+
+QUICK = ("--max-iterations", "4", "--json")
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture(scope="module")
+def filled(endpoint: str, oscillatory_recording: Path) -> str:
+    """A bucket with the recording below `rec`."""
+    with pytest.MonkeyPatch.context() as patch:
+        _use(patch, endpoint)
+        files = _files()
+        files.mkdir("logs")
+        for file in oscillatory_recording.glob("*.mcap"):
+            files.pipe(f"logs/rec/{file.name}", file.read_bytes())
+        files.pipe("logs/empty.mcap", b"")
+        files.pipe("logs/rec/notes.txt", b"no log")
+        _forget(files)
+    return endpoint
+
+
+@pytest.fixture
+def s3(filled: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    _use(monkeypatch, filled)
+    files = _files()
+    yield files
+    _forget(files)
+
+
+def _use(patch: pytest.MonkeyPatch, endpoint: str) -> None:
+    """Keep botocore to this machine, whatever the user has set up."""
+    for name in ("AWS_PROFILE", "AWS_SESSION_TOKEN", "HTTP_PROXY", "http_proxy"):
+        patch.delenv(name, raising=False)
+    for name, value in {
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ACCESS_KEY_ID": "nobody",
+        "AWS_SECRET_ACCESS_KEY": "nothing",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_CONFIG_FILE": "/nonexistent",
+        "AWS_SHARED_CREDENTIALS_FILE": "/nonexistent",
+        "AWS_EC2_METADATA_DISABLED": "true",
+    }.items():
+        patch.setenv(name, value)
+
+
+def _files() -> Any:
+    from replay.remote import _s3
+
+    return _s3()
+
+
+def _forget(files: Any) -> None:
+    """Close the connections now, while their loop runs."""
+    client = getattr(files, "_s3creator", None)
+    if client is not None:
+        end = client.__aexit__(None, None, None)
+        asyncio.run_coroutine_threadsafe(end, files.loop).result(10)
+    type(files).clear_instance_cache()
+
+
+def test_a_prefix_is_a_recording(
+    cdmisfa: Cdmisfa, s3: Any, oscillatory_recording: Path, tmp_path: Path
+) -> None:
+    near = cdmisfa("learn", oscillatory_recording, *QUICK)
+    far = cdmisfa("learn", "s3://logs/rec", *QUICK)
+    assert far.code == 0, far.err
+    assert far.json["signals_sha256"] == near.json["signals_sha256"]
+    assert far.json["source"]["views"][1]["url"] == "s3://logs/rec/x2.mcap"
+    info = cdmisfa("info", "s3://logs/rec/", "--json")
+    assert (
+        info.json["channels"] == cdmisfa("info", oscillatory_recording, "--json").json["channels"]
+    )
+    assert cdmisfa("verify", "s3://logs/rec").code == 0
+    assert cdmisfa("recover", "s3://logs/rec", "-o", tmp_path / "again").code == 0
+    assert cdmisfa("verify", tmp_path / "again").code == 0
+
+
+def test_what_is_not_there_is_one_line(cdmisfa: Cdmisfa, s3: Any) -> None:
+    for url, code, words in (
+        ("s3://logs/rec/x9.mcap", 3, "there is no such object"),
+        ("s3://nobucket/x1.mcap", 3, "s3://nobucket/x1.mcap: "),
+        ("s3://logs/none", 3, "there is no such object"),
+        ("s3://logs/empty.mcap", 3, "empty, nothing was written"),
+    ):
+        done = cdmisfa("info", url)
+        assert (done.code, done.err.count("\n"), words in done.err) == (code, 1, True), done.err
+
+
+def test_an_object_that_changes_is_refused(s3: Any, oscillatory_recording: Path) -> None:
+    from replay.reader import LogReader
+    from replay.remote import RemoteError
+
+    data = (oscillatory_recording / "x1.mcap").read_bytes()
+    s3.pipe("logs/changing.mcap", data)
+    with LogReader("s3://logs/changing.mcap") as reader:
+        assert reader.by_index
+        s3.pipe("logs/changing.mcap", data[:-1] + b"?")
+        with pytest.raises(RemoteError, match="it changed while it was read"):
+            list(reader.messages())
+
+
+def test_without_credentials_the_remedy_is_named(
+    cdmisfa: Cdmisfa, s3: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID")
+    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+    type(s3).clear_instance_cache()  # a new one looks for credentials again
+    done = cdmisfa("info", "s3://logs/rec/x1.mcap")
+    _forget(_files())
+    assert (done.code, "FSSPEC_S3_ANON" in done.err) == (3, True), done.err
