@@ -63,7 +63,7 @@ class LearnerConfig:
     min_variance: float = 0.1
     novel_share: float = 0.9
     patience: int = 1000
-    alpha: float = 0.05
+    alpha: float = 0.005
     roc_centres: int = 10
     roc_radius: float = 0.3
     roc_memory: int = 40

@@ -67,9 +67,14 @@ def test_a_block_is_known_to_the_first_module_that_is_near_under_its_label() -> 
     roc.cluster(centres, counts, 0, block(1.0), 0.3, 40.0)
     stack, seen = np.stack([centres, centres]), np.stack([counts, counts])
     outputs = np.stack([block(7.0), block(1.05)])
-    assert roc.known_to(stack, seen, 0, outputs, 0.1) == 2
-    assert roc.known_to(stack, seen, 0, outputs, 0.01) == 0
-    assert roc.known_to(stack, seen, 1, outputs, 0.1) == 0
+    error = np.empty(2)
+    assert roc.known_to(stack, seen, 0, outputs, 0.1, error) == 2
+    np.testing.assert_allclose(error, [6.0, 0.05])
+    assert roc.known_to(stack, seen, 0, outputs, 10.0, error) == 1
+    assert roc.known_to(stack, seen, 0, outputs, 0.01, error) == 0
+    np.testing.assert_allclose(error, [6.0, 0.05])
+    assert roc.known_to(stack, seen, 1, outputs, 0.1, error) == 0
+    assert np.isnan(error).all()
 
 
 def test_a_local_reward_changes_one_entry_and_the_norm() -> None:
@@ -92,6 +97,48 @@ def test_1_0_learns_modules_and_its_reward_function_has_norm_1() -> None:
     trial = run_trial(LearnerConfig(algorithm="1.0"), seed=0, max_iterations=3000)
     assert trial.modules
     assert trial.modules[0].counts.any()
+
+
+def test_the_clustering_errors_are_recorded_and_decide() -> None:
+    source = OscillatorySource()
+    config = LearnerConfig(algorithm="1.0", roc_error=0.3, eta_dot_window=20)
+    learner = CuriousLearner(config, source.spec, 5)
+    saved, after = [], []
+    while len(learner.modules) < 2:
+        count, novel_blocks = len(learner.modules), int(learner.agent.memory["novel_blocks"][0])
+        signals = learner.step(source.take(learner.stream, learner.tau))
+        assert signals.roc_error_frozen.shape == (count,)
+        assert math.isnan(signals.roc_error_inst) == (not signals.novel)
+        if signals.novel and not novel_blocks:
+            assert signals.roc_error == signals.roc_error_inst
+        if signals.saved:
+            assert signals.roc_error < 0.3
+            saved.append(signals.iteration)
+        if count:
+            near = signals.roc_error_frozen[0] < 0.3
+            assert signals.known_by == int(near)
+            after.append(near)
+    assert len(saved) == 2
+    assert 0 < sum(after) < len(after)
+
+
+def test_2_0_has_no_clustering_error() -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(
+        LearnerConfig(delta=1.0, tau=10, eta_dot_window=5, min_variance=0.0), source.spec, 0
+    )
+    for _ in range(100):
+        signals = learner.step(source.take(learner.stream, learner.tau))
+        assert math.isnan(signals.roc_error_inst)
+        assert math.isnan(signals.roc_error)
+        assert np.isnan(signals.roc_error_frozen).all()
+    assert len(signals.roc_error_frozen) > 0
+
+
+def test_1_0_can_learn_the_paper_s_modules_too() -> None:
+    config = LearnerConfig(algorithm="1.0")
+    trials = [run_trial(config, seed=seed, max_iterations=6000) for seed in range(1000, 1006)]
+    assert sum([m.stream for m in trial.modules] == [0, 1, 2] for trial in trials) >= 3
 
 
 def test_1_0_refuses_more_streams_than_its_table_has() -> None:
