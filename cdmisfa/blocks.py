@@ -13,7 +13,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.errors import UsageError
+
 NANOSECONDS = 1_000_000_000
+
+SLOWEST = 1e-6
+"""Frames a second of the slowest clock; the fastest has one a nanosecond, the unit of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +55,9 @@ class SourceSpec:
         fps: frames per second of the common clock.
         start_ns: log time of frame 0, in nanoseconds.
         length: number of frames, or None where the stream does not end.
+
+    Raises:
+        UsageError: there is no clock of so many frames a second.
     """
 
     streams: tuple[str, ...]
@@ -59,6 +67,13 @@ class SourceSpec:
     fps: float = 50.0
     start_ns: int = 0
     length: int | None = None
+
+    def __post_init__(self) -> None:
+        if not SLOWEST <= self.fps <= NANOSECONDS:
+            raise UsageError(
+                f"a source of {self.fps} frames a second has no clock: give it an fps in "
+                f"[{SLOWEST:g}, {NANOSECONDS:g}]"
+            )
 
     def time_ns(self, t: int) -> int:
         """Log time of frame t in nanoseconds: the start plus t frames, never the wall clock."""

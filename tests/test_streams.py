@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from source_contract import SourceContract
@@ -57,6 +59,12 @@ def test_streams_repeat_to_the_bit() -> None:
 def test_log_time_starts_where_it_is_told() -> None:
     assert OscillatorySource().spec.time_ns(50) == START_NS + 1_000_000_000
     assert OscillatorySource(fps=10.0, start_ns=5).spec.time_ns(1) == 100_000_005
+
+
+@pytest.mark.parametrize("fps", [0.0, -50.0, math.nan, math.inf, 1e-300, 2e9])
+def test_a_clock_that_does_not_run_is_refused(fps: float) -> None:
+    with pytest.raises(UsageError, match="frames a second has no clock: give it an fps in"):
+        OscillatorySource(fps=fps)
 
 
 def test_the_zero_stream_shows_nothing() -> None:
