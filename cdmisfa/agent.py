@@ -17,7 +17,7 @@ from cdmisfa.config import LearnerConfig
 from cdmisfa.errors import UsageError
 from cdmisfa.exploration import choose, decay, other_stream
 from cdmisfa.gate import NOVEL
-from cdmisfa.lspi import policy_iteration
+from cdmisfa.lspi import action_values, policy_iteration
 from cdmisfa.reward import add_reward, add_reward_locally, curiosity_reward, expert_reward
 from cdmisfa.roc import cluster
 from cdmisfa.signals import DENSE_STREAMS
@@ -61,6 +61,8 @@ OUTCOME = np.dtype(
         ("saved", "?"),
         ("share", "f8"),
         ("novel_blocks", "i8"),
+        ("roc_error", "f8"),
+        ("roc_error_inst", "f8"),
         ("xi", "f8"),
         ("xi_dot", "f8"),
         ("curiosity", "f8"),
@@ -83,7 +85,7 @@ class Agent(NamedTuple):
     memory: (1,) of `MEMORY`. Per output (J,): eta, eta_dot, eta_inst, gate_mean, gate_variance,
     the running E(ydot^2) derivative, the sums y_sum and square_sum over y_frames (1,) frames, and
     the recent moments recent_mean, recent_square. Per stream: stay_sum, switch_sum, policy (S,),
-    Q (S, 2), dense (S, 2, S) or (0, 2, 0). CD-MISFA 1.0 only, else empty: the clustering's
+    dense (S, 2, S) or (0, 2, 0). CD-MISFA 1.0 only, else empty: the clustering's
     centres (S, C, tau, J) and counts (S, C).
     """
 
@@ -103,7 +105,6 @@ class Agent(NamedTuple):
     switch_sum: Float
     dense: Float
     policy: Int
-    Q: Float
     centres: Float
     counts: Float
 
@@ -170,7 +171,6 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
         switch_sum=np.zeros(n_streams),
         dense=np.zeros((dense, 2, dense)),
         policy=np.zeros(n_streams, np.int64),
-        Q=np.zeros((n_streams, 2)),
         centres=np.zeros((*clusters, config.tau, outputs)),
         counts=np.zeros(clusters),
     )
@@ -210,7 +210,6 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
     agent.switch_sum[:] = 0.0
     agent.dense[:] = 0.0
     agent.policy[:] = 0
-    agent.Q[:] = 0.0
     agent.centres[:] = 0.0
     agent.counts[:] = 0.0
 
@@ -292,8 +291,8 @@ def ready_to_save(agent: Agent, rules: Rules) -> bool:
 
 
 @compiled
-def track_clusters(agent: Agent, rules: Rules, label: int, y: Float) -> None:
-    """CD-MISFA 1.0: take the block's output into the clusters and their running error."""
+def track_clusters(agent: Agent, rules: Rules, label: int, y: Float) -> float:
+    """CD-MISFA 1.0: take the block's output into the clusters; its error, also in the mean."""
     m = agent.memory[0]
     error = cluster(agent.centres, agent.counts, label, y, rules.roc_radius, rules.roc_memory)
     if math.isnan(m["roc_error"]):
@@ -302,6 +301,7 @@ def track_clusters(agent: Agent, rules: Rules, label: int, y: Float) -> None:
         m["roc_error"] += window_rate(rules.eta_dot_window, m["novel_blocks"]) * (
             error - m["roc_error"]
         )
+    return error
 
 
 @compiled
@@ -332,9 +332,20 @@ def estimate_reward(agent: Agent, rules: Rules, stream: int, reward: float) -> N
         )
         m["scale"] = m["rewards"]
     if m["scale"] > 0.0:
-        policy_iteration(
-            agent.stay_sum, agent.switch_sum, m["scale"], rules.gamma, agent.policy, agent.Q
-        )
+        policy_iteration(agent.stay_sum, agent.switch_sum, rules.gamma, agent.policy)
+
+
+@compiled
+def value_actions(agent: Agent, rules: Rules, Q: Float) -> None:
+    """Write the action values Q (S, 2) under the policy; 0 before the first reward.
+
+    The decision needs the policy only, so they are worked out where a record asks for them.
+    """
+    scale = agent.memory[0]["scale"]
+    if scale > 0.0:
+        action_values(agent.stay_sum, agent.switch_sum, scale, rules.gamma, agent.policy, Q)
+    else:
+        Q[:] = 0.0
 
 
 @compiled
@@ -372,6 +383,7 @@ def think(
     o["novel"] = novel
     o["known_by"] = known_by
     o["saved"] = False
+    o["roc_error_inst"] = math.nan
     o["xi"] = math.nan
     o["xi_dot"] = math.nan
     o["curiosity"] = math.nan
@@ -394,10 +406,11 @@ def think(
             track_output(agent, rules, j, y[:, j])
         agent.y_frames[0] += y.shape[0]
         if rules.tabular:
-            track_clusters(agent, rules, stream, y)
+            o["roc_error_inst"] = track_clusters(agent, rules, stream, y)
         o["saved"] = ready_to_save(agent, rules)
     o["share"] = m["share"]
     o["novel_blocks"] = m["novel_blocks"]
+    o["roc_error"] = m["roc_error"]
     if not o["saved"] and not math.isnan(o["reward"]):
         estimate_reward(agent, rules, stream, o["reward"])
     if o["saved"]:

@@ -17,6 +17,9 @@ Float = NDArray[np.float64]
 CONSTANT_VARIANCE = 1e-12
 """A block in which no input varies more than this carries nothing to learn."""
 
+ENOUGH = 4.0
+"""Twice what suffices, so that rounding cannot matter."""
+
 BAND = 2.0
 """Half width of a module's band of known slowness, in standard deviations (paper)."""
 
@@ -60,10 +63,11 @@ def is_constant(frames: NDArray[Any], scale: float) -> bool:
     for k in range(1, n):
         for i in range(inputs):
             if frames[k, i] != frames[0, i]:
+                # Two values d apart have a variance of at least d^2 / 2n, whatever the others are.
+                apart = (float(frames[k, i]) - float(frames[0, i])) * scale
+                if apart * apart > ENOUGH * n * CONSTANT_VARIANCE:
+                    return False
                 suspect = True
-                break
-        if suspect:
-            break
     if not suspect:
         return True
     for i in range(inputs):
@@ -131,6 +135,7 @@ def recognise(
     scale: float,
     y_frozen: Float,
     eta_inst: Float,
+    roc_error_frozen: Float,
 ) -> int:
     """The gate's verdict on a block: NOVEL, CONSTANT, or the module that knows it.
 
@@ -143,6 +148,7 @@ def recognise(
         scale: factor from a frame's values to the learner's.
         y_frozen: (M, n, J) written: outputs of the frozen modules.
         eta_inst: (M, J) written: their instantaneous slowness.
+        roc_error_frozen: (M,) written: their clustering error; NaN but for CD-MISFA 1.0.
     """
     modules, n, outputs = y_frozen.shape
     y = project(frozen.phi, frozen.offset, x)
@@ -151,6 +157,9 @@ def recognise(
             for j in range(outputs):
                 y_frozen[m, t, j] = y[t, m * outputs + j]
     known_by = verdict(y_frozen, frozen.band_mean, frozen.band_sd, eta_inst)
+    roc_error_frozen[:] = np.nan
     if frozen.counts.shape[1] > 0:
-        known_by = known_to(frozen.centres, frozen.counts, stream, y_frozen, roc_error)
+        known_by = known_to(
+            frozen.centres, frozen.counts, stream, y_frozen, roc_error, roc_error_frozen
+        )
     return CONSTANT if is_constant(frames, scale) else known_by

@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agent import OUTCOME, begin_abstraction, has_gap, mean_change, new_agent, rules, think
+from cdmisfa.agent import (
+    OUTCOME,
+    begin_abstraction,
+    has_gap,
+    mean_change,
+    new_agent,
+    rules,
+    think,
+    value_actions,
+)
 from cdmisfa.blocks import Block, SourceSpec
 from cdmisfa.config import LearnerConfig
 from cdmisfa.errors import CdmisfaError, UsageError
@@ -167,7 +176,7 @@ class CuriousLearner:
         x = quadratic(frames) if self.config.expansion == "quadratic" else frames
         outputs, count = self.config.outputs, len(self.modules)
         y_frozen = np.empty((count, len(block), outputs))
-        eta_frozen = np.empty((count, outputs))
+        eta_frozen, roc_error_frozen = np.empty((count, outputs)), np.empty(count)
         known_by = recognise(
             self.frozen,
             self.rules.roc_error,
@@ -177,6 +186,7 @@ class CuriousLearner:
             self.scale,
             y_frozen,
             eta_frozen,
+            roc_error_frozen,
         )
         y = np.full((len(block), outputs), np.nan)
         xi = np.nan
@@ -195,7 +205,7 @@ class CuriousLearner:
             block.t + len(block),
             self.policy_rng.random(3),
         )
-        signals = self._signals(block, y, y_frozen, eta_frozen, known_by)
+        signals = self._signals(block, y, y_frozen, eta_frozen, roc_error_frozen)
         if self.out["saved"][0]:
             self.save_abstraction()
         return signals
@@ -248,11 +258,12 @@ class CuriousLearner:
         }
 
     def _signals(
-        self, block: Block, y: Float, y_frozen: Float, eta_frozen: Float, known_by: int
+        self, block: Block, y: Float, y_frozen: Float, eta_frozen: Float, roc_error_frozen: Float
     ) -> BlockSignals:
         agent = self.agent
-        novel = known_by == 0
         out: dict[str, Any] = dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))
+        Q = np.empty((len(agent.policy), 2))
+        value_actions(agent, self.rules, Q)
         return BlockSignals(
             iteration=self.iteration - 1,
             t=block.t,
@@ -262,14 +273,15 @@ class CuriousLearner:
             eta=agent.eta.copy(),
             eta_dot=agent.eta_dot.copy(),
             variance=agent.recent_square - agent.recent_mean**2,
-            eta_inst=agent.eta_inst.copy() if novel else np.full(len(agent.eta), np.nan),
+            eta_inst=agent.eta_inst.copy() if out["novel"] else np.full(len(agent.eta), np.nan),
             gate_mean=agent.gate_mean.copy(),
             gate_sd=np.sqrt(agent.gate_variance),
             eta_inst_frozen=eta_frozen,
             band_mean=self.frozen.band_mean.copy(),
             band_sd=self.frozen.band_sd.copy(),
+            roc_error_frozen=roc_error_frozen,
             R=agent.dense / (agent.memory["scale"][0] or 1.0),
-            Q=agent.Q.copy(),
+            Q=Q,
             policy=agent.policy.copy(),
             **out,
         )

@@ -63,10 +63,8 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
 
 
 @compiled
-def improve(
-    stay: Float, switch: Float, total: float, gamma: float, scale: float, policy: Int, Q: Float
-) -> int:
-    """Value both actions under a policy and make it greedy for these values.
+def improve(stay: Float, switch: Float, total: float, gamma: float, policy: Int) -> int:
+    """Make a policy greedy for the values it has.
 
     With V(s) the value of s where it is left and where it stays, leaving is better under either
     policy where the first is greater.
@@ -76,55 +74,69 @@ def improve(
         switch: (S,) reward of switching, summed over the n-1 streams it may lead to.
         total: sum T of the values under the policy.
         gamma: discount factor.
-        scale: common factor of the values written.
         policy: (S,) read and written: 0 stay, 1 switch.
-        Q: (2 S,) written: for each stream the values of both actions under the policy as it
-            was read.
 
     Returns:
         How many streams changed their mind.
     """
     n = len(stay)
-    share, mean = gamma / (n - 1), scale / (n - 1)
-    damp, horizon = 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
-    arriving = share * total * scale
+    share, mean = gamma / (n - 1), 1.0 / (n - 1)
+    arriving, damp, horizon = share * total, 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
     changed = 0
     for s in range(np.uint64(n)):
-        reward = stay[s] * scale
-        keep = reward * horizon
-        arrive = switch[s] * mean + arriving
-        leave = arrive * damp
-        before = policy[s]
+        keep = stay[s] * horizon
+        leave = (switch[s] * mean + arriving) * damp
         better = np.int64(leave - keep > TIE * (abs(leave) + abs(keep)))
-        value = leave if before == 1 else keep
-        changed += better ^ before
+        changed += better ^ policy[s]
         policy[s] = better
-        Q[np.uint64(2) * s] = reward + gamma * value
-        Q[np.uint64(2) * s + np.uint64(1)] = arrive - share * value
     return changed
 
 
 @compiled
-def policy_iteration(
+def policy_iteration(stay_sum: Float, switch_sum: Float, gamma: float, policy: Int) -> None:
+    """Improve a policy until it is optimal for R; ties go to stay.
+
+    A common factor of R changes nothing, so the sums stand for it.
+
+    Args:
+        stay_sum: (S,) R's stay entries, times any number above 0.
+        switch_sum: (S,) sum of R's switch entries from each stream, times the same.
+        gamma: discount factor.
+        policy: (S,) read and written: 0 stay, 1 switch.
+    """
+    if len(stay_sum) == 1:
+        policy[0] = 0
+        return
+    for _ in range(MAX_SWEEPS):
+        total = value_sum(stay_sum, switch_sum, policy, gamma)
+        if improve(stay_sum, switch_sum, total, gamma, policy) == 0:
+            return
+
+
+@compiled
+def action_values(
     stay_sum: Float, switch_sum: Float, count: float, gamma: float, policy: Int, Q: Float
 ) -> None:
-    """Improve a policy until it is optimal for R; ties go to stay.
+    """Values of both actions in every stream, under a policy that needs none to be chosen.
 
     Args:
         stay_sum: (S,) R's stay entries times `count`.
         switch_sum: (S,) sum of R's switch entries from each stream, times `count`.
         count: common divisor of R; the number t of rewards in the sums.
         gamma: discount factor.
-        policy: (S,) read and written: 0 stay, 1 switch.
-        Q: (S, 2) written: action values under the policy.
+        policy: (S,) 0 stay, 1 switch.
+        Q: (S, 2) written.
     """
-    if len(stay_sum) == 1:
-        policy[0] = 0
-        Q[0, 0] = stay_sum[0] / count / (1.0 - gamma)
-        Q[0, 1] = Q[0, 0]
+    n = len(stay_sum)
+    if n == 1:
+        Q[0] = stay_sum[0] / count / (1.0 - gamma)
         return
-    pairs = Q.reshape(-1)
-    for _ in range(MAX_SWEEPS):
-        total = value_sum(stay_sum, switch_sum, policy, gamma)
-        if improve(stay_sum, switch_sum, total, gamma, 1.0 / count, policy, pairs) == 0:
-            return
+    share = gamma / (n - 1)
+    arriving = share * value_sum(stay_sum, switch_sum, policy, gamma) / count
+    damp, horizon = 1.0 / (1.0 + share), 1.0 / (1.0 - gamma)
+    for s in range(n):
+        reward = stay_sum[s] / count
+        arrive = switch_sum[s] / count / (n - 1) + arriving
+        value = arrive * damp if policy[s] == 1 else reward * horizon
+        Q[s, 0] = reward + gamma * value
+        Q[s, 1] = arrive - share * value

@@ -87,7 +87,9 @@ def cluster(
 
 
 @compiled
-def known_to(centres: Float, counts: Float, label: int, y_frozen: Float, threshold: float) -> int:
+def known_to(
+    centres: Float, counts: Float, label: int, y_frozen: Float, threshold: float, error: Float
+) -> int:
     """First frozen module (from 1) whose error on a block is below the threshold, or 0.
 
     Args:
@@ -96,9 +98,12 @@ def known_to(centres: Float, counts: Float, label: int, y_frozen: Float, thresho
         label: the block's stream.
         y_frozen: (M, n, J) outputs of the frozen modules on the block.
         threshold: error below which an abstraction is saved and a block is known.
+        error: (M,) written: error of each module, NaN where it has no centre under the label.
     """
+    known_by = 0
     for m in range(len(counts)):
-        winner, error = nearest(centres[m, label], counts[m, label], y_frozen[m])
-        if winner >= 0 and error < threshold:
-            return m + 1
-    return 0
+        winner, distance = nearest(centres[m, label], counts[m, label], y_frozen[m])
+        error[m] = distance if winner >= 0 else math.nan
+        if error[m] < threshold and known_by == 0:
+            known_by = m + 1
+    return known_by

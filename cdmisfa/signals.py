@@ -2,7 +2,7 @@
 
 Every consumer walks over its fields: the schema of run.mcap, Rerun's entities and
 layout, the columns of an export, the table of signals in the docs. Adding a signal
-is adding one field here and raising `SCHEMA_VERSION`.
+is raising `SCHEMA_VERSION` and adding one field here that is there `since` then.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 Show = Literal["line", "lane", "heat", "text", "hidden"]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""
 
 
@@ -36,6 +36,7 @@ class Signal:
         dtype: numpy name of the element type.
         show: how a viewer shows it.
         about: one sentence for a reader.
+        since: the first `SCHEMA_VERSION` with it.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Signal:
     dtype: str
     show: Show
     about: str
+    since: int = 1
 
 
 def _signal(
@@ -57,6 +59,7 @@ def _signal(
     dims: str = "",
     dtype: str = "float64",
     show: Show = "line",
+    since: int = 1,
 ) -> Any:
     return dataclasses.field(
         metadata={
@@ -67,6 +70,7 @@ def _signal(
             "dtype": dtype,
             "show": show,
             "about": about,
+            "since": since,
         }
     )
 
@@ -155,6 +159,24 @@ class BlockSignals:
         unit="1/frame",
         dims="MJ",
     )
+    roc_error_inst: float = _signal(
+        "",
+        "Clustering error of the block: distance of the output from its cluster's centre, "
+        "CD-MISFA 1.0 only.",
+        since=2,
+    )
+    roc_error: float = _signal(
+        "",
+        "Running mean of the clustering error; the abstraction is saved below a threshold, "
+        "CD-MISFA 1.0 only.",
+        since=2,
+    )
+    roc_error_frozen: Float = _signal(
+        "",
+        "Clustering error of each frozen module; known below the threshold, CD-MISFA 1.0 only.",
+        dims="M",
+        since=2,
+    )
     xi: float = _signal(
         "⟨ξ⟩", "Mean change of the abstraction's weights over the block.", equation="5"
     )
@@ -187,9 +209,18 @@ def signal_table() -> tuple[Signal, ...]:
 SIGNALS: Mapping[str, Signal] = {s.name: s for s in signal_table()}
 
 
-def values(signals: BlockSignals) -> Iterator[tuple[Signal, NDArray[Any]]]:
-    """Each signal with its value as an array of the documented type and number of dimensions."""
+def values(
+    signals: BlockSignals, version: int = SCHEMA_VERSION
+) -> Iterator[tuple[Signal, NDArray[Any]]]:
+    """Each signal with its value as an array of the documented type and number of dimensions.
+
+    Args:
+        signals: the record.
+        version: leave out signals that came later than with this version.
+    """
     for signal in SIGNALS.values():
+        if signal.since > version:
+            continue
         yield signal, np.asarray(getattr(signals, signal.name), dtype=signal.dtype)
 
 
@@ -215,10 +246,10 @@ class SignalsHash:
         return self._hash.hexdigest()
 
 
-def canonical_bytes(signals: BlockSignals) -> bytes:
-    """The bytes that stand for a record wherever runs are compared."""
+def canonical_bytes(signals: BlockSignals, version: int = SCHEMA_VERSION) -> bytes:
+    """The bytes that stand for a record, as a version has it, wherever runs are compared."""
     parts: list[bytes] = []
-    for _, value in values(signals):
+    for _, value in values(signals, version):
         parts.append(np.array(value.shape, dtype="<i8").tobytes())
         if value.dtype.kind == "f":
             value = np.where(np.isnan(value), np.nan, value)

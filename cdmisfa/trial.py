@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agent import OUTCOME, Agent, Rules, has_gap, mean_change, think
+from cdmisfa.agent import OUTCOME, Agent, Rules, has_gap, mean_change, think, value_actions
 from cdmisfa.compiled import compiled
 from cdmisfa.config import LearnerConfig
 from cdmisfa.expansion import quadratic
@@ -140,7 +140,7 @@ def run_iterations(
     memory = agent.memory[0]
     modules, outputs = frozen.band_mean.shape
     y_frozen = np.empty((modules, tau, outputs))
-    eta_frozen = np.empty((modules, outputs))
+    eta_frozen, roc_error_frozen = np.empty((modules, outputs)), np.empty(modules)
     xi_block = np.empty(tau)
     y = np.full((tau, outputs), np.nan)
     for k in range(len(uniforms)):
@@ -150,7 +150,15 @@ def run_iterations(
         shown = frames[stream, start : start + tau]
         block = x[stream, start : start + tau]
         known_by = recognise(
-            frozen, rules.roc_error, stream, shown, block, 1.0, y_frozen, eta_frozen
+            frozen,
+            rules.roc_error,
+            stream,
+            shown,
+            block,
+            1.0,
+            y_frozen,
+            eta_frozen,
+            roc_error_frozen,
         )
         xi = np.nan
         if known_by == NOVEL:
@@ -165,7 +173,7 @@ def run_iterations(
             for s in range(len(agent.policy)):
                 R[k, s] = agent.stay_sum[s] / scale
                 policy[k, s] = agent.policy[s]
-                Q[k, s] = agent.Q[s]
+            value_actions(agent, rules, Q[k])
         if out[0]["saved"] or memory["idle"] > patience or memory["epsilon"] < swap_below:
             return k + 1
     return len(uniforms)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.signals import BlockSignals, canonical_bytes, values
-from replay.runlog import read_signals
+from replay.runlog import read_header, read_signals
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,11 +19,13 @@ class Difference:
     """The first place where two runs differ.
 
     Attributes:
-        iteration: of the record, from 0.
+        iteration: of the record, from 0; -1 where the two are of different versions of the
+            record and what both hold is the same.
         signal: name of its first signal that differs, or "" where one run has ended.
         place: index of the first element that differs; () for a scalar or a shape.
         first: the value in the first run, as text.
         second: the value in the second run, as text.
+        versions: of the two runs' records, where they are not the same one.
     """
 
     iteration: int
@@ -31,8 +33,16 @@ class Difference:
     place: tuple[int, ...]
     first: str
     second: str
+    versions: tuple[int, int] | None = None
 
     def __str__(self) -> str:
+        if self.versions is None:
+            return self._place()
+        a, b = self.versions
+        shared = "all the same, bit for bit" if self.iteration < 0 else self._place()
+        return f"signals of version {a} against {b}; of those in both: {shared}"
+
+    def _place(self) -> str:
         if not self.signal:
             return f"iteration {self.iteration}: {self.first} against {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
@@ -47,16 +57,30 @@ class Difference:
             "place": list(self.place),
             "first": self.first,
             "second": self.second,
+            "versions": None if self.versions is None else list(self.versions),
         }
 
 
 def compare(first: Path, second: Path) -> Difference | None:
     """The first difference between two runs' signals, or None where every bit is the same.
 
+    Runs of different versions of the record differ by that; the first difference is then
+    sought among the signals that both hold.
+
     Raises:
         UsageError: one of them is no run.
         LogDamagedError: one of them cannot be read.
     """
+    versions = read_header(first).schema, read_header(second).schema
+    found = _first_difference(first, second, min(versions))
+    if versions[0] == versions[1]:
+        return found
+    found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
+    return replace(found, versions=versions)
+
+
+def _first_difference(first: Path, second: Path, version: int) -> Difference | None:
+    """The first difference among the signals of a version of the record."""
     pairs = zip_longest(read_signals(first), read_signals(second))
     for iteration, (a, b) in enumerate(pairs):
         if a is None or b is None:
@@ -64,13 +88,13 @@ def compare(first: Path, second: Path) -> Difference | None:
             return Difference(
                 iteration, "", (), ended if a is None else more, ended if b is None else more
             )
-        if canonical_bytes(a) != canonical_bytes(b):
-            return _difference(iteration, a, b)
+        if canonical_bytes(a, version) != canonical_bytes(b, version):
+            return _difference(iteration, a, b, version)
     return None
 
 
-def _difference(iteration: int, a: BlockSignals, b: BlockSignals) -> Difference:
-    for (signal, x), (_, y) in zip(values(a), values(b), strict=True):
+def _difference(iteration: int, a: BlockSignals, b: BlockSignals, version: int) -> Difference:
+    for (signal, x), (_, y) in zip(values(a, version), values(b, version), strict=True):
         if x.shape != y.shape:
             return Difference(
                 iteration, signal.name, (), f"of shape {x.shape}", f"of shape {y.shape}"

@@ -136,6 +136,8 @@ def table_text(rows: Sequence[Row]) -> str:
 def _shortly(difference: Difference | None) -> str:
     if difference is None:
         return "identical"
+    if difference.iteration < 0:
+        return f"{difference.first} against {difference.second}, else identical"
     return f"differs from iteration {difference.iteration}, first in {difference.signal}"
 
 

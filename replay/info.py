@@ -19,6 +19,7 @@ from replay.reader import Crc, LogReader
 from replay.records import MalformedRecord
 from replay.runlog import METADATA as RUN_METADATA
 from replay.runlog import RUN_FILE
+from replay.signals_message import missing
 from replay.store import Location, location
 from replay.structure import Segment
 
@@ -55,7 +56,8 @@ def describe(path: str | Location) -> dict[str, Any]:
         `schema`, `path`, `kind` ("recording", "run" or "foreign"), `channels` (topic,
         encoding, schema, messages, start_ns, end_ns, file), `chunks`, `complete`, `crc`
         ("ok", "absent", "bad" or "unchecked"), `problems` (where, what), `seed` and, of a
-        run's folder, `ended` (why); None where nothing says so.
+        run's folder, `ended` (why); None where nothing says so. `signals` of a run: the
+        `version` of its record and the signals `missing` in it, which are read as NaN.
 
     Raises:
         UsageError: no such log.
@@ -78,6 +80,7 @@ def describe(path: str | Location) -> dict[str, Any]:
         "metadata": {d["file"]: d["metadata"] for d in documents},
         "seed": _seed(documents),
         "ended": _ended(path) if isinstance(path, Path) else None,
+        "signals": _signals(documents),
     }
 
 
@@ -90,6 +93,15 @@ def _seed(documents: Sequence[Mapping[str, Any]]) -> int | None:
                 manifest = json.loads(values.get("manifest", "{}"))
                 seeds.add(int(values.get("seed", manifest.get("seed"))))
     return seeds.pop() if len(seeds) == 1 else None
+
+
+def _signals(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Which version of the record a run was written with, and what that lacks."""
+    for document in documents:
+        text = document["metadata"].get(RUN_METADATA, {}).get("schema", "")
+        if text.isascii() and text.isdigit() and len(text) < 10:
+            return {"version": int(text), "missing": list(missing(int(text)))}
+    return None
 
 
 def _ended(path: Path) -> str | None:

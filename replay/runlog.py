@@ -70,6 +70,11 @@ class RunHeader:
     manifest: Mapping[str, Any]
     watched_every: int
 
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Signals that this log lacks, being older: they are read as NaN."""
+        return signals_message.missing(self.schema)
+
     def setting(self, section: str, key: str, default: Any = None) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`."""
         config = self.manifest.get("config")
@@ -305,36 +310,46 @@ def read_header(path: Path) -> RunHeader:
     """
     log = run_log(path)
     found = _metadata(log)
+    schema = _schema(log, found)
     try:
         spec = json.loads(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
-        header = RunHeader(
-            schema=int(found["schema"]),
+        return RunHeader(
+            schema=schema,
             spec=SourceSpec(**spec),
             manifest=json.loads(found["manifest"]),
             watched_every=int(found["watched_every"]),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {METADATA} is broken ({error})") from error
-    if header.schema > SCHEMA_VERSION:
+
+
+def _schema(log: Path, found: Mapping[str, str]) -> int:
+    """The version of the record, asked first: all else may look different in a later one."""
+    text = found.get("schema", "")
+    version = int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
+    if version < 1:
+        raise LogDamagedError(f"{log}: its metadata {METADATA} is broken (schema {text[:20]!r})")
+    if version > SCHEMA_VERSION:
         raise UsageError(
-            f"{log} was written with version {header.schema} of the signals, this is version "
+            f"{log} was written with version {version} of the signals, this is version "
             f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
         )
-    return header
+    return version
 
 
 def read_signals(path: Path) -> Iterator[BlockSignals]:
-    """Every iteration's record, in order.
+    """Every iteration's record, in order; NaN where an older log lacks a signal.
 
     Raises:
-        UsageError: there is no such run.
+        UsageError: there is no such run, or it is of a later version of this software.
         LogDamagedError: a record is damaged, or a finished file is cut short.
     """
     log = run_log(path)
+    version = read_header(log).schema
     for _, data in _messages(log, SIGNALS_TOPIC):
-        yield signals_message.decode(data, f"{log} {SIGNALS_TOPIC}")
+        yield signals_message.decode(data, f"{log} {SIGNALS_TOPIC}", version)
 
 
 def count_iterations(path: Path) -> int:

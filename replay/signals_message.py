@@ -2,7 +2,8 @@
 
 Every number has a fixed width, so a record that is read is, bit for bit, the record
 that was written. The sizes of all arrays stand in one more field: an empty array
-keeps its shape.
+keeps its shape. A field's number never changes: those of a later version of the
+record follow all of the versions before.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message, message_fa
 from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
-from cdmisfa.signals import SIGNALS, BlockSignals, Signal
+from cdmisfa.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
 from recorder.messages import varint
 
 MESSAGE = "cdmisfa.BlockSignals"
 """Full name of the message in the log's schema."""
 
 SHAPES = "shapes"
-"""Field with the sizes of every dimension of every array, arrays in the record's order."""
+"""Field with the sizes of every dimension of every array, the oldest arrays first."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _TYPES = {"float64": _FIELD.TYPE_DOUBLE, "int64": _FIELD.TYPE_SFIXED64, "bool": _FIELD.TYPE_BOOL}
@@ -31,9 +32,12 @@ _CODES = {"float64": "d", "int64": "q", "bool": "?"}
 _WIRE = {"float64": 1, "int64": 1, "bool": 0}
 _LENGTH_DELIMITED = 2
 
-_SCALARS = tuple(s for s in SIGNALS.values() if not s.dims)
-_ARRAYS = tuple(s for s in SIGNALS.values() if s.dims)
-_NUMBER = {name: number for number, name in enumerate((*SIGNALS, SHAPES), start=1)}
+_BY_AGE = sorted(SIGNALS.values(), key=lambda s: s.since)
+_SCALARS = tuple(s for s in _BY_AGE if not s.dims)
+_ARRAYS = tuple(s for s in _BY_AGE if s.dims)
+_FIRST = tuple(s.name for s in _BY_AGE if s.since == 1)
+_LATER = tuple(s.name for s in _BY_AGE if s.since > 1)
+_NUMBER = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
 
 
 def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
@@ -42,7 +46,7 @@ def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
         name="cdmisfa/block_signals.proto", package="cdmisfa", syntax="proto3"
     )
     definition = file.message_type.add(name="BlockSignals")
-    for signal in SIGNALS.values():
+    for signal in _BY_AGE:
         definition.field.add(
             name=signal.name,
             number=_NUMBER[signal.name],
@@ -89,12 +93,18 @@ def encode(signals: BlockSignals) -> bytes:
     return b"".join(parts)
 
 
-def decode(data: bytes, where: str = "record") -> BlockSignals:
-    """The record in the bytes of a message.
+def missing(version: int) -> tuple[str, ...]:
+    """Names of the signals that a version of the record lacks."""
+    return tuple(s.name for s in SIGNALS.values() if s.since > version)
+
+
+def decode(data: bytes, where: str = "record", version: int = SCHEMA_VERSION) -> BlockSignals:
+    """The record in the bytes of a message; NaN where its version lacks a signal.
 
     Args:
-        data: what `encode` made.
+        data: what `encode` of that version made.
         where: what to name in an error.
+        version: of the record.
 
     Raises:
         LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
@@ -104,10 +114,20 @@ def decode(data: bytes, where: str = "record") -> BlockSignals:
     except message.DecodeError as error:
         raise LogDamagedError(f"{where}: not a {MESSAGE} message, see cdmisfa verify") from error
     sizes = iter(getattr(decoded, SHAPES))
-    fields: dict[str, Any] = {s.name: getattr(decoded, s.name) for s in _SCALARS}
+    fields: dict[str, Any] = {
+        s.name: getattr(decoded, s.name) if s.since <= version else math.nan for s in _SCALARS
+    }
+    known: dict[str, int] = {}
     for signal in _ARRAYS:
-        shape = tuple(size for _, size in zip(signal.dims, sizes, strict=False))
-        fields[signal.name] = _array(getattr(decoded, signal.name), shape, signal, where)
+        if signal.since <= version:
+            shape = tuple(size for _, size in zip(signal.dims, sizes, strict=False))
+            fields[signal.name] = _array(getattr(decoded, signal.name), shape, signal, where)
+            known.update(zip(signal.dims, shape, strict=True))
+        else:
+            shape = tuple(known[letter] for letter in signal.dims)
+            if math.prod(shape) > len(data):
+                raise LogDamagedError(f"{where}: sizes without values, see cdmisfa verify")
+            fields[signal.name] = np.full(shape, math.nan)
     return BlockSignals(**fields)
 
 

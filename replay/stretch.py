@@ -161,7 +161,8 @@ class _Kept:
 
     def _records(self, data: list[bytes]) -> tuple[SignalColumns, ...]:
         where = f"{self._log} {SIGNALS_TOPIC}"
-        found = columns_of_messages(data, lambda entry: signals_message.decode(entry, where))
+        version = self._header.schema
+        found = columns_of_messages(data, lambda d: signals_message.decode(d, where, version))
         streams = len(self._header.spec.streams)
         return tuple(_checked(columns, streams, where) for columns in found)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdmisfa.lspi import policy_iteration, value_sum
+from cdmisfa.lspi import action_values, policy_iteration, value_sum
 
 ACTIONS = 2
 
@@ -40,7 +40,8 @@ def solve(
     n = len(stay)
     policy = np.zeros(n, np.int64) if start is None else start.copy()
     Q = np.full((n, ACTIONS), np.nan)
-    policy_iteration(stay, switch, count, gamma, policy, Q)
+    policy_iteration(stay, switch, gamma, policy)
+    action_values(stay, switch, count, gamma, policy, Q)
     return policy, Q
 
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,34 @@ def test_the_log_opens_without_us_and_tells_its_units(tmp_path):
     assert (schema.name, schema.encoding) == ("cdmisfa.BlockSignals", "protobuf")
     assert "η̇".encode() in schema.data
     assert b"unit 1/frame" in schema.data
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("fps", 0.0, "has no clock"),
+        ("fps", "often", "not supported"),
+        ("streams", 3, "not iterable"),
+        ("colour", 1, "unexpected keyword"),
+    ],
+)
+def test_a_header_that_no_source_has_is_damage(tmp_path, monkeypatch, key, value, words):
+    path = tmp_path / "run.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr("replay.runlog.asdict", lambda spec: asdict(spec) | {key: value})
+        write_run(path, VECTOR, 2)
+    with pytest.raises(LogDamagedError, match=f"its metadata cdmisfa.run is broken .*{words}"):
+        list(read_signals(path))
+
+
+@pytest.mark.parametrize("version", ["0", "-1", "two", "9" * 5000])
+def test_a_version_that_is_none_is_damage(tmp_path, monkeypatch, version):
+    path = tmp_path / "run.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr("replay.runlog.SCHEMA_VERSION", version)
+        write_run(path, VECTOR, 2)
+    with pytest.raises(LogDamagedError, match=r"metadata cdmisfa\.run is broken"):
+        list(read_signals(path))
 
 
 def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):

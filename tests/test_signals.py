@@ -29,6 +29,14 @@ GOLDEN = {
     "band_mean:float64:MJ band_sd:float64:MJ xi:float64: xi_dot:float64: curiosity:float64: "
     "expert:float64: reward:float64: R:float64:SAS Q:float64:SA policy:int64:S "
     "epsilon:float64: explored:bool: action:int64: next_stream:int64:",
+    2: "iteration:int64: t:int64: log_time:int64: stream:int64: module:int64: novel:bool: "
+    "known_by:int64: saved:bool: share:float64: novel_blocks:int64: y:float64:TJ "
+    "y_frozen:float64:MTJ eta:float64:J eta_dot:float64:J variance:float64:J "
+    "eta_inst:float64:J gate_mean:float64:J gate_sd:float64:J eta_inst_frozen:float64:MJ "
+    "band_mean:float64:MJ band_sd:float64:MJ roc_error_inst:float64: roc_error:float64: "
+    "roc_error_frozen:float64:M xi:float64: xi_dot:float64: curiosity:float64: "
+    "expert:float64: reward:float64: R:float64:SAS Q:float64:SA policy:int64:S "
+    "epsilon:float64: explored:bool: action:int64: next_stream:int64:",
 }
 """What each version of the record consists of; old entries are never changed."""
 
@@ -53,6 +61,16 @@ def test_changing_the_fields_means_raising_the_version() -> None:
     now = " ".join(f"{s.name}:{s.dtype}:{s.dims}" for s in signal_table())
     assert max(GOLDEN) == SCHEMA_VERSION, "add the new version's fields to GOLDEN"
     assert now == GOLDEN[SCHEMA_VERSION], "the fields changed: raise SCHEMA_VERSION, extend GOLDEN"
+
+
+@pytest.mark.parametrize("version", list(GOLDEN))
+def test_since_says_what_each_version_holds(version: int) -> None:
+    held = " ".join(f"{s.name}:{s.dtype}:{s.dims}" for s in signal_table() if s.since <= version)
+    assert held == GOLDEN[version]
+
+
+def test_a_later_signal_can_be_missing() -> None:
+    assert {s.dtype for s in signal_table() if s.since > 1} == {"float64"}
 
 
 def test_every_signal_is_described() -> None:

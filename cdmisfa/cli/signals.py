@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import click
 
@@ -22,7 +23,7 @@ def signals_command(markdown: bool, as_json: bool) -> None:
             {"schema": options.SCHEMA, "signals_version": SCHEMA_VERSION, "signals": signals}
         )
         return
-    columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "about")
+    columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
     rows = [[signal[column] for column in columns] for signal in signals]
     if markdown:
         click.echo(_page(SCHEMA_VERSION, columns, rows))
@@ -30,9 +31,9 @@ def signals_command(markdown: bool, as_json: bool) -> None:
         options.print_table(columns, rows)
 
 
-def _page(version: int, columns: tuple[str, ...], rows: list[list[str]]) -> str:
-    def line(cells: list[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
+    def line(cells: list[Any]) -> str:
+        return "| " + " | ".join(str(cell).replace("|", r"\|") for cell in cells) + " |"
 
     return "\n".join(
         [
@@ -44,7 +45,8 @@ def _page(version: int, columns: tuple[str, ...], rows: list[list[str]]) -> str:
             "",
             "Letters of `dims`: T frames of the block, J outputs of an abstraction, M frozen",
             "modules, S streams, A actions (stay, switch); nothing is a scalar. `equation` is the",
-            "paper's number. `show` is how the viewer shows it.",
+            "paper's number. `show` is how the viewer shows it. `since` is the first version of",
+            "the record with it: in a run of an older one it is NaN.",
             "",
             line(list(columns)),
             line(["---"] * len(columns)),

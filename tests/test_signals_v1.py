@@ -1,0 +1,142 @@
+"""A run of the first version of the record opens like any other, what it lacks is NaN.
+
+`data/signals_v1` holds 8 iterations of CD-MISFA 1.0 written by that version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from cdmisfa.blocks import Block
+from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.experiments.checkpoint import refuse_difference
+from cdmisfa.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
+from replay import signals_message
+from replay.compare import compare
+from replay.runlog import RunWriter, read_header, read_phi, read_signals, read_truth, read_watched
+
+OLD = Path(__file__).parent / "data" / "signals_v1"
+SIGNALS_SHA256 = "b86ab92af6b8ba255cb239dd54c187a1adbdccc9b43f096a348ad4f83bd85a2f"
+"""What the version that wrote it said of its signals."""
+
+LACKS = ("roc_error_inst", "roc_error", "roc_error_frozen")
+
+
+def test_every_bit_of_the_old_signals_is_read() -> None:
+    digest = hashlib.sha256()
+    for signals in read_signals(OLD):
+        digest.update(canonical_bytes(signals, 1))
+    assert digest.hexdigest() == SIGNALS_SHA256
+
+
+def test_what_it_lacks_is_nan_in_its_shape() -> None:
+    assert read_header(OLD).missing == LACKS
+    records = list(read_signals(OLD))
+    assert [len(s.roc_error_frozen) for s in records] == [len(s.y_frozen) for s in records]
+    assert sorted({len(s.y_frozen) for s in records}) == [0, 1]
+    for record in records:
+        for name in LACKS:
+            value = np.asarray(getattr(record, name))
+            assert value.dtype == np.float64
+            assert value.ndim == len(SIGNALS[name].dims)
+            assert np.isnan(value).all()
+
+
+def test_info_says_so(cdmisfa) -> None:
+    assert "signals of version 1: roc_error_inst, roc_error, " in cdmisfa("info", OLD).out
+    signals = cdmisfa("info", OLD, "--json").json["signals"]
+    assert signals == {"version": 1, "missing": list(LACKS)}
+
+
+def test_it_can_be_shown_exported_and_drawn(cdmisfa, tmp_path) -> None:
+    for words in (
+        ("view", OLD, "--save", tmp_path / "old.rrd"),
+        ("export", OLD, "-o", tmp_path / "old.parquet"),
+        ("plot", OLD, "-o", tmp_path / "figures"),
+    ):
+        assert cdmisfa(*words).code == 0, words
+    assert (tmp_path / "old.rrd").stat().st_size > 10_000
+    assert list((tmp_path / "figures").iterdir())
+    table = pq.read_table(tmp_path / "old.parquet")
+    assert table.num_rows == 8
+    assert np.isnan(table["roc_error"].to_numpy()).all()
+    assert not np.isnan(table["epsilon"].to_numpy()).any()
+
+
+def written(folder: Path, records: list[BlockSignals]) -> Path:
+    """The same run, as this version writes it."""
+    header = read_header(OLD)
+    watched = [frames for _, frames in read_watched(OLD)]
+    truth = [values for _, values in read_truth(OLD)]
+    phi = next(values for _, values in read_phi(OLD))
+    folder.mkdir()
+    with RunWriter(folder / "run.mcap", header.spec, header.manifest) as writer:
+        for signals, x, world in zip(records, watched, truth, strict=True):
+            writer.block(signals, Block(signals.stream, signals.t, x, world), phi)
+    return folder
+
+
+def test_two_versions_differ_by_that_and_nothing_else(cdmisfa, tmp_path) -> None:
+    new = written(tmp_path / "new", list(read_signals(OLD)))
+    difference = compare(OLD, new)
+    assert difference is not None
+    assert str(difference) == (
+        f"signals of version 1 against {SCHEMA_VERSION}; of those in both: all the same, "
+        "bit for bit"
+    )
+    assert difference.as_json()["versions"] == [1, SCHEMA_VERSION]
+    assert compare(OLD, OLD) is None
+    assert compare(new, new) is None
+    said = cdmisfa("compare", OLD, new)
+    assert (said.code, said.out) == (4, f"{difference}\n")
+    table = cdmisfa("compare", OLD, new, OLD, "--save", tmp_path / "both.rrd")
+    assert table.code == 0
+    assert "of those in both: all the same" in table.out
+
+
+def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
+    records = list(read_signals(OLD))
+    records[5] = replace(records[5], epsilon=0.5)
+    new = written(tmp_path / "new", records)
+    difference = compare(OLD, new)
+    assert difference is not None
+    assert (difference.iteration, difference.signal) == (5, "epsilon")
+    assert difference.versions == (1, SCHEMA_VERSION)
+    assert str(difference).startswith("signals of version 1 against 2; of those in both: iteration")
+
+
+@pytest.mark.parametrize("command", ["view", "plot", "compare"])
+def test_a_later_version_is_refused_in_one_line(cdmisfa, tmp_path, monkeypatch, command) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr("replay.runlog.SCHEMA_VERSION", 9)
+        newer = written(tmp_path / "newer", list(read_signals(OLD)))
+    more = {"view": ["--save", tmp_path / "x.rrd"], "plot": [], "compare": [OLD]}[command]
+    refused = cdmisfa(command, newer, *more)
+    error = refused.err
+    assert refused.code == 2
+    assert "was written with version 9 of the signals" in error
+    assert "install a newer cdmisfa" in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_a_run_does_not_go_on_in_another_version() -> None:
+    header = read_header(OLD)
+    with pytest.raises(UsageError, match=f"signals = 1, not {SCHEMA_VERSION}: "):
+        refuse_difference(OLD, OLD / "run.mcap", header.spec, header.manifest)
+
+
+def test_sizes_without_values_allocate_nothing() -> None:
+    rows = 2**31
+    records = list(read_signals(OLD))
+    empty = {"y_frozen": (rows, 0, 0), "eta_inst_frozen": (rows, 0)}
+    empty |= {"band_mean": (rows, 0), "band_sd": (rows, 0)}
+    fields = {name: np.empty(shape) for name, shape in empty.items()}
+    hostile = replace(records[0], **fields, roc_error_frozen=np.empty(0))
+    with pytest.raises(LogDamagedError, match="sizes without values"):
+        signals_message.decode(signals_message.encode(hostile), version=1)
