@@ -43,8 +43,9 @@ class JoinedImages:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """What was cut off or left out in a part, and gaps are the user's to see by times."""
-        return [warning for part in self.parts for warning in part.warnings]
+        """What was cut off or left out in a part, and that there are parts."""
+        joined = f"{self.path}: {self.topic} is joined from {len(self.parts)} logs, by time"
+        return [joined, *(warning for part in self.parts for warning in part.warnings)]
 
     def frame(self, row: int) -> Bytes:
         """Decode an image into a frame, (height, width) uint8.
@@ -68,7 +69,7 @@ def open_joined(
     *,
     salvage: bool = False,
 ) -> ImageStream:
-    """Open the images on a topic of a log in parts; a part may have none.
+    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
 
     Raises:
         UsageError: no part has images on the topic, or they have several topics.
@@ -82,7 +83,7 @@ def open_joined(
                 parts.append(McapImages(file, topic, size, salvage=salvage))
             except UsageError as error:
                 refusal = refusal or error
-        if not parts and refusal is not None:
+        if refusal is not None and (topic is None or not parts):
             raise refusal
         topics = {part.topic for part in parts}
         if len(topics) > 1:

@@ -90,7 +90,7 @@ class VideoImages:
                 self._frames = self._container.decode(self._stream)
             found = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
             self._next = row + 1
-            if found is None or found.pts != stamp:
+            if found is None or found.pts != stamp or found.is_corrupt:
                 self._next = _NOWHERE
                 raise LogDamagedError(f"{where}: the video is broken, no frame can be decoded")
             try:
@@ -114,6 +114,7 @@ class VideoImages:
         self._stream = stream = self._container.streams.video[0]
         stream.thread_type = "NONE"
         stream.codec_context.thread_count = 1
+        stream.codec_context.options = {"err_detect": "explode"}  # rather than made up pixels
         pixels = stream.codec_context.width * stream.codec_context.height
         if not 0 < pixels <= MAX_PIXELS:
             raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")

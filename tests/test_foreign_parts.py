@@ -1,0 +1,142 @@
+"""Camera logs in parts are one stream; a conversion that was stopped goes on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import Writer
+
+from cdmisfa.errors import UsageError
+from replay.foreign import ForeignSource
+
+SIZE = (HEIGHT, WIDTH)
+BOTH = ("--topic", "/left", "--topic", "/right", "--size", f"{WIDTH}x{HEIGHT}")
+
+
+def write_part(path: Path, rows: range, topics: tuple[str, ...] = ("/left", "/right")) -> None:
+    """Some of the images of each topic, 20 ms apart from the first of all on."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2048)
+        writer.start("ros2")
+        schema = writer.register_schema("foxglove.RawImage", "protobuf", b"")
+        for seed, topic in enumerate(topics):
+            channel = writer.register_channel(topic, "protobuf", schema)
+            for i, image in enumerate(pictures(rows.stop, seed)):
+                if i in rows:
+                    message = RawImage(
+                        width=WIDTH,
+                        height=HEIGHT,
+                        step=WIDTH,
+                        encoding="mono8",
+                        data=image.tobytes(),
+                    )
+                    stamp = (1000 + 20 * i) * 1_000_000
+                    writer.add_message(channel, stamp, message.SerializeToString(), stamp)
+        writer.finish()
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> list[Path]:
+    """Twelve parts of ten images of each topic, in the folder of a rosbag2."""
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    files = [folder / f"bag_{i}.mcap" for i in range(12)]
+    for i, file in enumerate(files):
+        write_part(file, range(10 * i, 10 * i + 10))
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    return files
+
+
+def test_the_parts_of_a_bag_are_one_stream(parts: list[Path]) -> None:
+    source = ForeignSource(parts[0].parent, ["/right", "/left"], size=SIZE)
+    assert (source.spec.length, source.spec.fps) == (120, 50.0)
+    np.testing.assert_array_equal(source.take(1, 120).frames, list(pictures(120, 0)))
+    source.seek(35)
+    np.testing.assert_array_equal(source.take(0, 50).frames, list(pictures(120, 1))[35:85])
+    assert "joined from 12 logs" in source.warnings[0]
+    assert len(source.describe()["files"][0]["sha256"]) == 64
+    source.close()
+
+
+def test_files_that_follow_one_another_are_parts_of_one_topic(parts: list[Path]) -> None:
+    named = [parts[i] for i in (2, 0, 1)]
+    source = ForeignSource(named, ["/left"], size=SIZE)
+    assert source.spec.streams == ("/left",)
+    np.testing.assert_array_equal(source.take(0, 30).frames, list(pictures(30, 0)))
+    apart = ForeignSource(named, ["/left"], size=SIZE, align="index")
+    assert len(apart.spec.streams) == 3
+
+
+def test_files_at_the_same_time_stay_streams(parts: list[Path]) -> None:
+    write_part(parts[0].parent / "other.mcap", range(5, 15))
+    both = [parts[0], parts[0].parent / "other.mcap"]
+    with pytest.raises(UsageError, match="--align"):
+        ForeignSource(both, ["/left"], size=SIZE)
+    assert len(ForeignSource(both, ["/left"], size=SIZE, align="time").spec.streams) == 2
+
+
+def test_a_part_may_lack_a_topic(parts: list[Path]) -> None:
+    write_part(parts[3], range(30, 40), ("/left",))
+    source = ForeignSource(parts[0].parent, ["/right"], size=SIZE, align="time", rate=50)
+    assert source.alignment["/right"] == {"messages": 110, "repeated": 10, "dropped": 0}
+    with pytest.raises(UsageError, match="no topic /up"):
+        ForeignSource(parts[0].parent, ["/up"], size=SIZE)
+    with pytest.raises(UsageError, match="name one --topic"):
+        ForeignSource(parts[0].parent, size=SIZE)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_killed_conversion_goes_on(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    write_cameras(tmp_path / "a.mcap", {"/left": (6000, 20), "/right": (6000, 20)})
+    words = ("convert", tmp_path / "a.mcap", *BOTH, "-o")
+    assert cdmisfa(*words, tmp_path / "whole").code == 0
+    folder = tmp_path / "rec"
+    command = [sys.executable, "-m", "cdmisfa", *map(str, words), str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    try:
+        _wait_for(folder / "left.mcap.partial", 20_000)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert not (folder / "left.mcap").exists()
+    refused = cdmisfa(*words, folder)
+    assert (refused.code, "--resume" in refused.err) == (2, True)
+    other = cdmisfa(*words, folder, "--resume", "--rate", "25", "--align", "time")
+    assert (other.code, "cannot be continued" in other.err) == (2, True), other.err
+    done = cdmisfa(*words, folder, "--resume")
+    assert done.code == 0, done.err
+    assert files_of(folder) == files_of(tmp_path / "whole")
+    assert cdmisfa(*words, folder, "--resume").code == 0
+    assert files_of(folder) == files_of(tmp_path / "whole")
+
+
+def test_a_stopped_conversion_says_how_to_go_on(tmp_path: Path) -> None:
+    write_cameras(tmp_path / "a.mcap", {"/left": (8000, 20), "/right": (8000, 20)})
+    words = ["convert", tmp_path / "a.mcap", *BOTH, "-o", tmp_path / "rec"]
+    command = [sys.executable, "-m", "cdmisfa", *map(str, words)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    _wait_for(tmp_path / "rec" / "left.mcap.partial", 20_000)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 143, said
+    assert said.rstrip().endswith("rec is not finished: go on with --resume")
+
+
+def _wait_for(path: Path, size: int) -> None:
+    end = time.monotonic() + 60
+    while not path.exists() or path.stat().st_size < size:
+        assert time.monotonic() < end, f"{path} did not come"
+        time.sleep(0.01)

@@ -1,0 +1,173 @@
+"""Videos are streams of frames like folders of pictures, always of the same bits."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH, pictures
+from conftest import Cdmisfa
+from source_contract import SourceContract
+
+from cdmisfa.blocks import FrameSource
+from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.foreign import ForeignSource
+from replay.video import VideoImages
+
+av = pytest.importorskip("av")
+
+SIZE = (HEIGHT, WIDTH)
+QUICK = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
+
+
+def write_video(
+    path: Path,
+    images: Iterable[np.ndarray],
+    *,
+    codec: str = "ffv1",
+    pixels: str = "gray",
+    fps: int = 25,
+    first: int = 0,
+    drop: frozenset[int] = frozenset(),
+) -> list[np.ndarray]:
+    """Four pixels for each of an image's; `first` and `drop` move and leave out frames."""
+    written = []
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=fps)
+        stream.width, stream.height, stream.pix_fmt = 4 * WIDTH, 4 * HEIGHT, pixels
+        stream.codec_context.time_base = Fraction(1, fps)
+        for i, image in enumerate(images):
+            if i in drop:
+                continue
+            frame = av.VideoFrame.from_ndarray(image.repeat(4, 0).repeat(4, 1), format="gray")
+            frame.pts = first + i
+            written.append(image)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return written
+
+
+class TestVideo(SourceContract):
+    ends = True
+
+    @pytest.fixture(autouse=True)
+    def _video(self, tmp_path: Path) -> None:
+        self.paths = [tmp_path / "left.mp4", tmp_path / "right.mp4"]
+        for seed, path in enumerate(self.paths):
+            write_video(path, pictures(120, seed), codec="libx264", pixels="yuv420p")
+
+    def open(self) -> FrameSource:
+        return ForeignSource(self.paths, size=SIZE)
+
+
+def test_a_lossless_video_gives_its_very_pixels(tmp_path: Path) -> None:
+    images = write_video(tmp_path / "a.mkv", pictures(40))
+    source = ForeignSource(tmp_path / "a.mkv", size=SIZE)
+    assert (source.spec.fps, source.spec.length, source.spec.streams) == (25.0, 40, ("a",))
+    np.testing.assert_array_equal(source.take(0, 40).frames, images)
+    for t in (39, 3, 4, 0, 25):
+        source.seek(t)
+        np.testing.assert_array_equal(source.take(0, 1).frames[0], images[t])
+
+
+@pytest.mark.parametrize(
+    ("ending", "codec", "pixels"),
+    [
+        ("mp4", "libx264", "yuv420p"),
+        ("mp4", "mpeg4", "yuv420p"),
+        ("avi", "mjpeg", "yuvj420p"),
+        ("webm", "libvpx-vp9", "yuv420p"),
+        ("mkv", "ffv1", "bgr0"),
+    ],
+)
+def test_other_codecs_come_close_in_any_order(
+    tmp_path: Path, ending: str, codec: str, pixels: str
+) -> None:
+    path = tmp_path / f"a.{ending}"
+    images = np.array(write_video(path, pictures(60), codec=codec, pixels=pixels), float)
+    video = VideoImages(path, None, SIZE)
+    once = [video.frame(row) for row in range(60)]
+    assert abs(np.array(once) - images).mean() < 8
+    other = VideoImages(path, None, SIZE)
+    for row in (59, 0, 31, 30, 7, 8):
+        np.testing.assert_array_equal(other.frame(row), once[row])
+    again = VideoImages(path, None, SIZE)
+    digest = [
+        hashlib.sha256(b"".join(v.frame(r) for r in range(60))).hexdigest() for v in (video, again)
+    ]
+    assert digest[0] == digest[1]
+    for each in (video, other, again):
+        each.close()
+
+
+def test_limited_luma_becomes_the_full_range(tmp_path: Path) -> None:
+    flat = [np.full(SIZE, value, np.uint8) for value in (0, 64, 128, 200, 255)]
+    write_video(tmp_path / "a.mkv", flat, pixels="yuv420p")
+    frames = ForeignSource(tmp_path / "a.mkv", size=SIZE).take(0, 5).frames
+    assert abs(frames[:, 0, 0].astype(int) - [0, 64, 128, 200, 255]).max() <= 1
+
+
+def test_times_are_those_of_the_video(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mkv", pictures(50), drop=frozenset({20, 21}))
+    write_video(tmp_path / "b.mkv", pictures(50), first=5)
+    both = [tmp_path / "a.mkv", tmp_path / "b.mkv"]
+    with pytest.raises(UsageError, match="--align time"):
+        ForeignSource(both, size=SIZE)
+    source = ForeignSource(both, size=SIZE, align="time")
+    assert (source.spec.length, source.spec.start_ns) == (45, 200_000_000)
+    assert source.alignment["a"] == {"messages": 48, "repeated": 2, "dropped": 5}
+    a, expected = source.take(0, 45).frames, list(pictures(50))
+    np.testing.assert_array_equal(a[14], expected[19])
+    np.testing.assert_array_equal(a[16], expected[19])
+    np.testing.assert_array_equal(a[17], expected[22])
+
+
+def test_what_is_no_video_is_one_line(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write_video(path, pictures(60), codec="libx264", pixels="yuv420p")
+    whole = path.read_bytes()
+    for data in (b"", b"no video", whole[: len(whole) // 2], bytes(5000)):
+        path.write_bytes(data)
+        for command in (("learn",), ("convert", "-o", tmp_path / "rec")):
+            done = cdmisfa(command[0], path, *command[1:])
+            assert (done.code, done.err.count("\n")) == (3, 1), done.err
+            assert done.err.startswith(f"cdmisfa: {path}: ")
+
+
+def test_damage_within_a_video_is_found_where_ffmpeg_sees_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    write_video(path, pictures(60), codec="libx264", pixels="yuv420p")
+    data = bytearray(path.read_bytes())
+    random = np.random.default_rng(2)
+    for at in random.integers(1000, len(data) - 500, 40):
+        data[at] ^= 255
+    path.write_bytes(bytes(data))
+    with pytest.raises(LogDamagedError, match=r"a\.mkv: (at|FFmpeg)"):
+        ForeignSource(path, size=SIZE).take(0, 60)
+
+
+def test_videos_are_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    for seed, name in enumerate(("left", "right")):
+        write_video(tmp_path / f"{name}.mp4", pictures(60, seed), codec="libx264", pixels="yuv420p")
+    words = (tmp_path / "left.mp4", tmp_path / "right.mp4", "--size", "16x12")
+    learned = cdmisfa("learn", *words, *QUICK)
+    assert learned.code == 0, learned.err
+    assert "left: 60 images" in learned.err
+    source = learned.json["source"]
+    assert "luma" in source["recipe"]
+    assert [len(file["sha256"]) for file in source["files"]] == [64, 64]
+    assert cdmisfa("convert", *words, "-o", tmp_path / "rec").code == 0
+    again = cdmisfa("learn", tmp_path / "rec", *QUICK)
+    assert again.json["signals_sha256"] == learned.json["signals_sha256"]
+
+
+def test_without_pyav_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "a.mkv", pictures(3))
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(CdmisfaError, match=r"pip install 'cdmisfa\[video\]'"):
+        ForeignSource(tmp_path / "a.mkv", size=SIZE)
