@@ -1,0 +1,148 @@
+"""Other people's readers see our recordings as they are, and we see what their writers write."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.reader import make_reader
+from PIL import Image
+
+from cdmisfa.experiments.convert import convert
+from replay.foreign import ForeignSource
+from replay.reader import LogReader
+
+COUNT = 200
+SIZE = (HEIGHT, WIDTH)
+EXPECTED = np.stack(list(pictures(COUNT)))
+IMAGE_TEXT = """std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+COMPRESSED_TEXT = """std_msgs/Header header
+string format
+uint8[] data
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+"""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One view of images, as the recorder writes it."""
+    folder = tmp_path_factory.mktemp("peers")
+    write_cameras(folder / "a.mcap", {"/cam": (COUNT, 20)})
+    source = ForeignSource(folder / "a.mcap", size=SIZE)
+    (written,) = convert(source, folder / "rec")
+    source.close()
+    return written.file
+
+
+def pixels(data: bytes) -> np.ndarray:
+    return np.frombuffer(RawImage.FromString(data).data, np.uint8).reshape(SIZE)
+
+
+def png(image: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def stamp(i: int) -> int:
+    return 10**18 + 20_000_000 * i
+
+
+def test_mcaps_own_reader_sees_every_message(recording: Path) -> None:
+    with recording.open("rb") as file:
+        theirs = [(m.log_time, m.data) for _, _, m in make_reader(file, True).iter_messages()]
+    with LogReader(recording) as reader:
+        assert theirs == [(m.log_time, m.data) for m in reader.messages()]
+    np.testing.assert_array_equal([pixels(data) for _, data in theirs], EXPECTED)
+
+
+def test_small_mcap_sees_every_message(recording: Path) -> None:
+    small_mcap = pytest.importorskip("small_mcap")
+    with recording.open("rb") as file:
+        found = small_mcap.read_message(file, validate_crc=True)
+        theirs = [(channel.topic, m.log_time, bytes(m.data)) for _, channel, m in found]
+    with LogReader(recording) as reader:
+        assert theirs == [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
+
+
+def test_rerun_shows_images_as_images(recording: Path) -> None:
+    chunk = pytest.importorskip("rerun.chunk")
+    buffers: list[Any] = []
+    for piece in chunk.McapReader(str(recording)).stream():
+        batch = piece.to_record_batch()
+        if "Image:buffer" in batch.schema.names:
+            buffers += batch.column("Image:buffer").to_pylist()
+    frames = [np.array(buffer[0], np.uint8).reshape(SIZE) for buffer in buffers]
+    np.testing.assert_array_equal(frames, EXPECTED)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", None])
+@pytest.mark.parametrize("kind", ["RawImage", "CompressedImage"])
+def test_logs_of_the_foxglove_sdk_are_streams(
+    tmp_path: Path, kind: str, compression: str | None
+) -> None:
+    foxglove = pytest.importorskip("foxglove")
+    from foxglove import channels, messages
+    from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+
+    chosen = {"zstd": MCAPCompression.Zstd, "lz4": MCAPCompression.Lz4, None: None}[compression]
+    options = MCAPWriteOptions(compression=chosen, chunk_size=8192)
+    context = foxglove.Context()
+    channel = getattr(channels, f"{kind}Channel")("/cam", context=context)
+    with foxglove.open_mcap(tmp_path / "a.mcap", context=context, writer_options=options):
+        for i, image in enumerate(EXPECTED):
+            if kind == "RawImage":
+                message = messages.RawImage(
+                    width=WIDTH, height=HEIGHT, step=WIDTH, encoding="mono8", data=image.tobytes()
+                )
+            else:
+                message = messages.CompressedImage(data=png(image), format="png")
+            channel.log(message, log_time=stamp(i))
+    _check(tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("kind", ["Image", "CompressedImage"])
+def test_logs_of_mcap_ros2_are_streams(tmp_path: Path, kind: str) -> None:
+    mcap_ros2 = pytest.importorskip("mcap_ros2.writer")
+    text = IMAGE_TEXT if kind == "Image" else COMPRESSED_TEXT
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = mcap_ros2.Writer(file, chunk_size=8192)
+        schema = writer.register_msgdef(f"sensor_msgs/msg/{kind}", text)
+        for i, image in enumerate(EXPECTED):
+            message: dict[str, Any] = {
+                "header": {"stamp": {"sec": 1, "nanosec": i}, "frame_id": "cam"}
+            }
+            if kind == "Image":
+                message |= {"height": HEIGHT, "width": WIDTH, "encoding": "mono8"}
+                message |= {"is_bigendian": 0, "step": WIDTH, "data": image.tobytes()}
+            else:
+                message |= {"format": "mono8; png compressed mono8", "data": png(image)}
+            writer.write_message("/cam", schema, message, stamp(i), stamp(i), i)
+        writer.finish()
+    _check(tmp_path / "a.mcap")
+
+
+def _check(path: Path) -> None:
+    source = ForeignSource(path, ["/cam"], size=SIZE)
+    assert (source.spec.fps, source.spec.length, source.spec.start_ns) == (50.0, COUNT, stamp(0))
+    np.testing.assert_array_equal(source.take(0, COUNT).frames, EXPECTED)
+    source.close()
