@@ -13,10 +13,10 @@ from cdmisfa.errors import LogDamagedError
 
 
 @click.command("info")
-@options.path_argument("path")
+@options.place_argument("path")
 @options.as_json
 @click.pass_context
-def info_command(ctx: click.Context, path: Path, as_json: bool) -> None:
+def info_command(ctx: click.Context, path: str, as_json: bool) -> None:
     """Say what is in a recording, a run or any MCAP file.
 
     Exits with 3 when a checksum is wrong.
@@ -32,7 +32,7 @@ def info_command(ctx: click.Context, path: Path, as_json: bool) -> None:
         ctx.exit(LogDamagedError.exit_code)
 
 
-def _print_info(path: Path, document: dict[str, Any]) -> None:
+def _print_info(path: str, document: dict[str, Any]) -> None:
     state = "complete" if document["complete"] else "cut short"
     words = [document["kind"], state, f"checksums {document['crc']}"]
     if document["seed"] is not None:
@@ -66,10 +66,10 @@ def _clock(ns: int | None) -> str:
 
 
 @click.command("verify")
-@options.path_argument("path")
+@options.place_argument("path")
 @options.as_json
 @click.pass_context
-def verify_command(ctx: click.Context, path: Path, as_json: bool) -> None:
+def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
     """Check that a log is whole: structure, checksums, no gaps.
 
     Exits with 3 when anything is wrong.
@@ -90,12 +90,12 @@ def verify_command(ctx: click.Context, path: Path, as_json: bool) -> None:
 
 
 @click.command("recover")
-@options.path_argument("path")
+@options.place_argument("path")
 @options.out("The whole log to write.", required=True)
 @options.force
 @options.as_json
 @click.pass_context
-def recover_command(ctx: click.Context, path: Path, out: Path, force: bool, as_json: bool) -> None:
+def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_json: bool) -> None:
     """Save what can be read of a damaged log as a whole one.
 
     Exits with 3 when something could not be saved.
