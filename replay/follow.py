@@ -55,6 +55,7 @@ class FollowedSource:
         self._path = Path(path)
         self._timeout = timeout
         self._t = 0
+        self._taken = False
         self._seen: object = None
         self._source: RecordedSource | None = None
         self._wait(lambda: self._source is not None, "frame 0")
@@ -89,6 +90,7 @@ class FollowedSource:
         self._now.seek(self._t)
         block = self._now.take(stream, n)
         self._t += n
+        self._taken = True
         return block
 
     def seek(self, t: int) -> None:
@@ -103,13 +105,14 @@ class FollowedSource:
         self._t = t
 
     def describe(self) -> Mapping[str, Any]:
-        """What was recorded; files that still grow have no checksum."""
-        return {
-            "kind": "recording",
-            **self._now.scene(),
-            "followed": True,
-            "views": [{"name": name} for name in self._spec.streams],
-        }
+        """What was recorded, and once frames were taken, the files that they were taken from.
+
+        A file that still grows is named by its first `bytes`, and their SHA-256.
+        """
+        views: list[dict[str, Any]] = [{"name": name} for name in self._spec.streams]
+        if self._taken:
+            views = self._now.describe_files()
+        return {"kind": "recording", **self._now.scene(), "followed": True, "views": views}
 
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""
@@ -163,10 +166,10 @@ class FollowedSource:
         return self._source.frames if self._source is not None else 0
 
     def _look(self) -> CdmisfaError | None:
-        """Open the files again where they changed.
+        """Take in what was added to the files.
 
         Returns:
-            Why they cannot be opened (yet).
+            Why it cannot be (yet).
         """
         try:
             seen = [
@@ -176,12 +179,13 @@ class FollowedSource:
             ]
             if seen == self._seen and self._source is not None:
                 return None
-            source = RecordedSource(self._path)
+            if self._source is None:
+                self._source = RecordedSource(self._path)
+            else:
+                self._source.refresh()
         except (UsageError, LogDamagedError) as error:
             return error
         except OSError:  # renamed between two looks
             return None
         self._seen = seen
-        self.close()
-        self._source = source
         return None

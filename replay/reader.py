@@ -10,6 +10,7 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self
 
@@ -378,8 +379,15 @@ class LogReader:
         for segment in self.segments:
             self.table(segment)
 
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return self._file.is_at(path)
+
     def refresh(self) -> bool:
         """Look for what a recorder wrote since; whether the file grew.
+
+        What was read before is not read again, but for one pass over a file that got its end,
+        whose checksum says whether all of it is as it was.
 
         Raises:
             LogDamagedError: what was written is damaged.
@@ -387,11 +395,13 @@ class LogReader:
         if self.complete or not self._file.grow():
             return False
         try:
-            self._structure = Structure(self._file, self._refuse)
+            kept = self._structure.go_on()
         except MalformedRecord as error:
             raise LogDamagedError(f"{self.path}: {error}") from None
-        self._forget()
+        self._forget({segment.offset for segment in self._structure.segments[:kept]})
+        self._defined = min(self._defined, kept)
         self._time_tail()
+        self._check_data_crc()
         return True
 
     def close(self) -> None:
@@ -412,10 +422,12 @@ class LogReader:
 
     # Inside
 
-    def _forget(self) -> None:
-        self._cache.clear()
-        self._failed.clear()
-        self._cached = self._defined = 0
+    def _forget(self, but: Collection[int] = ()) -> None:
+        """Let go of the chunks that were decoded, but those at some places of the file."""
+        for key in self._cache.keys() - set(but):
+            self._cached -= len(self._cache.pop(key).data)
+        self._failed &= set(but)
+        self._defined = self._defined if but else 0
         self._searched = False
 
     def _refuse(self, where: str, what: str) -> None:

@@ -6,6 +6,7 @@ import bisect
 import itertools
 import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -59,6 +60,7 @@ class RecordedSource:
         """
         self.warnings: tuple[str, ...] = ()
         self._loop = loop
+        self._paths = paths
         self._files = [path for path in log_files(paths) if not _only_begun(path)]
         self._hashes: list[dict[str, Any]] | None = None
         self._views: list[list[ViewFile]] = []
@@ -72,6 +74,38 @@ class RecordedSource:
             for view in opened:
                 view.close()
             raise
+        self._t = self._first
+
+    def refresh(self) -> None:
+        """Take in what a recorder wrote since: more frames, and further parts of a view.
+
+        What is there already is not read again, unless a file was replaced.
+
+        Raises:
+            UsageError: no such recording any more.
+            LogDamagedError: what was written is damaged.
+        """
+        before = {view.path.name.removesuffix(PARTIAL): view for v in self._views for view in v}
+        opened: list[ViewFile] = []
+        added: list[ViewFile] = []
+        try:
+            for path in log_files(self._paths):
+                view = before.get(path.name.removesuffix(PARTIAL))
+                if view is not None and isinstance(path, Path) and view.is_at(path):
+                    view.refresh(path)
+                    opened.append(view)
+                elif not _only_begun(path):
+                    added.append(ViewFile(path, cache_bytes=CACHE_BYTES))
+            views = _arrange(opened + added, salvage=False)
+        except BaseException:
+            for view in added:
+                view.close()
+            raise
+        for view in before.values():
+            if view not in opened:
+                view.close()
+        self._files, self._hashes, self._views = [v.path for v in opened + added], None, views
+        self._set_clock()
 
     @property
     def spec(self) -> SourceSpec:
@@ -162,6 +196,20 @@ class RecordedSource:
             "views": self._hashes,
         }
 
+    def describe_files(self) -> list[dict[str, Any]]:
+        """The views' files as far as they are known, with the SHA-256 of these bytes."""
+        return [
+            {
+                "name": view.facts.view,
+                "frames": view.count,
+                "file": view.path.name,
+                "bytes": view.reader.size,
+                "sha256": view.reader.digest(),
+            }
+            for parts in self._views
+            for view in parts
+        ]
+
     def scene(self) -> Mapping[str, str]:
         """What was recorded: the scene, its seed and the checksum of its configuration."""
         values = self._views[0][0].facts.values
@@ -208,7 +256,6 @@ class RecordedSource:
                 f"{self._name()}: {left_out} frames are missing in a view and left out in all"
             )
         self.warnings = tuple(warnings)
-        self._t = self._first
         self._spec = SourceSpec(
             tuple(f.view for f in facts),
             facts[0].frame_shape,

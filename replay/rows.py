@@ -104,13 +104,9 @@ class ChannelRows:
         self._decoded: OrderedDict[int, Rows] = OrderedDict()
         self._segments: list[Segment] = []
         self._to_confirm: dict[int, ViewFacts] = {}
-        counts: list[int] = []
-        for segment in reader.segments:
-            count = self._count(segment)
-            if count:
-                self._segments.append(segment)
-                counts.append(count)
-        self._starts = list(itertools.accumulate(counts, initial=0))
+        self._starts = [0]
+        self._taken: list[Segment] = []
+        self._take_segments()
 
     def runs(self, facts: ViewFacts, *, salvage: bool) -> list[Run]:
         """Number the messages by their log time.
@@ -125,10 +121,40 @@ class ChannelRows:
         """
         if self._reader.by_index and not salvage:
             return self._stated_runs(facts)
-        found: list[Run] = []
-        row = 0
+        return self._runs_from(0, facts, salvage)
+
+    def extended(self, facts: ViewFacts) -> list[Run]:
+        """Number the messages of a file that its recorder has made longer; as `runs`.
+
+        Raises:
+            LogDamagedError: as `runs`, without `salvage`.
+        """
+        return self._runs_from(self._take_segments(), facts, False)
+
+    def _take_segments(self) -> int:
+        """Take in the chunks that hold messages; how many of those before are as they were."""
+        segments = self._reader.segments
+        if self._taken and self._taken[-1] is not segments[len(self._taken) - 1]:
+            last = self._taken.pop()
+            if self._segments and self._segments[-1] is last:
+                self._segments.pop()
+                self._starts.pop()
+                self._decoded.pop(len(self._segments), None)
+        kept = len(self._segments)
+        for segment in segments[len(self._taken) :]:
+            count = self._count(segment)
+            if count:
+                self._segments.append(segment)
+                self._starts.append(self._starts[-1] + count)
+        self._taken = segments[:]
+        return kept
+
+    def _runs_from(self, first: int, facts: ViewFacts, salvage: bool) -> list[Run]:
+        """Number the messages, those in the chunks before the `first`th without a look at them."""
+        row = self._starts[first]
+        found = [Run(facts.first_frame, facts.first_frame + row, 0)] if row else []
         batch: list[NDArray[np.uint64]] = []
-        for number in range(len(self._segments)):
+        for number in range(first, len(self._segments)):
             damaged = salvage and self._reader.table(self._segments[number]) is None
             if damaged or len(batch) >= _BATCH:
                 self._number(batch, row, facts, found, salvage)

@@ -152,6 +152,13 @@ class FileStore:
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:
         """Leave reading ahead to the operating system."""
 
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        try:
+            return os.path.samestat(os.stat(path), os.fstat(self._descriptor()))
+        except OSError:
+            return False
+
     def grow(self) -> bool:
         """Look at the file's size again; whether it grew."""
         before, self.size = self.size, os.fstat(self._descriptor()).st_size
@@ -203,6 +210,10 @@ class RandomFile:
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:
         """Say which spans, from and up to before, will be read, one after the other."""
         self._store.expect(spans)
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return isinstance(self._store, FileStore) and self._store.is_at(path)
 
     def grow(self) -> bool:
         """Look at the file's size again; whether it grew."""

@@ -220,6 +220,28 @@ class Structure:
         if not by_index or not self._take_index():
             self._walk_data()
 
+    def go_on(self) -> int:
+        """Walk over what was appended to a file that had no end yet.
+
+        Returns:
+            How many of the segments before are as they were.
+
+        Raises:
+            LogDamagedError: what was appended is damaged.
+        """
+        if self._last_chunk is not None:
+            # Its message indexes need not all have been there.
+            self._at = self.segments.pop().offset
+            self._last_chunk = None
+        if self.data_crc is not None:
+            self._at, self.data_crc = self.data_end, None
+        kept = len(self.segments)
+        self.tail, self.missing, self._limit = None, "", None
+        self.statistics, self._chunk_offsets, self._has_indexes = None, [], False
+        self._read_end()
+        self._walk_data()
+        return kept
+
     def load_attachments(self) -> None:
         """Read the attachments that the summary names, and check them."""
         spans, self._attachment_spans = self._attachment_spans, []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import operator
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,15 +91,32 @@ class ViewFile:
         self._truth = (
             self._channel(TRUTH_TOPIC, TRUTH_SCHEMA, self._truths) if self.facts.truth else None
         )
-        self._frame_runs = self._frames.runs(self.facts, salvage=salvage)
-        self._truth_runs: list[Run] = []
-        self.ranges = [(run.start, run.stop) for run in self._frame_runs]
+        truth = self._truth.runs(self.facts, salvage=salvage) if self._truth is not None else []
+        self._number(self._frames.runs(self.facts, salvage=salvage), truth)
+
+    def _number(self, frames: list[Run], truth: list[Run]) -> None:
+        """Find the frames that have their ground truth."""
+        self._frame_runs, self._truth_runs = frames, truth
+        self.ranges = [(run.start, run.stop) for run in frames]
         if self._truth is not None:
-            self._truth_runs = self._truth.runs(self.facts, salvage=salvage)
-            self.ranges = intersection(
-                self.ranges, [(run.start, run.stop) for run in self._truth_runs]
-            )
+            self.ranges = intersection(self.ranges, [(run.start, run.stop) for run in truth])
         self._payload = self._find_payload() if self.ranges else Payload(0, 0, b"")
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return self.reader.is_at(path)
+
+    def refresh(self, path: Path) -> None:
+        """Take in the frames that a recorder wrote since; it may have renamed the file.
+
+        Raises:
+            LogDamagedError: what was written is damaged.
+        """
+        self.path = self.reader.path = path
+        if self.reader.refresh():
+            self._scanner = None
+            truth = self._truth.extended(self.facts) if self._truth is not None else []
+            self._number(self._frames.extended(self.facts), truth)
 
     @property
     def count(self) -> int:

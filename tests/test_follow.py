@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -18,8 +20,10 @@ from source_contract import SourceContract, same
 from cdmisfa.blocks import FrameSource
 from cdmisfa.errors import LogExhaustedError, UsageError
 from cdmisfa.streams import OscillatorySource
+from recorder.parts import Split
 from recorder.recording import record
 from replay.follow import FollowedSource
+from replay.store import FileStore
 
 FRAMES = 600
 RECORDER = """
@@ -103,6 +107,84 @@ def test_learning_while_it_is_recorded_gives_the_live_signals(
     live = cdmisfa("learn", "oscillatory", *quick)
     assert followed.json["signals_sha256"] == live.json["signals_sha256"]
     assert followed.json["source"]["followed"] is True
+
+
+def test_a_followed_run_is_that_on_the_finished_recording(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    quick = ("--set", "learner.tau=20", "--max-iterations", "30", "--json")
+    folder = tmp_path / "rec"
+    with recorder(folder) as process:
+        followed = cdmisfa(
+            "learn", folder, "--follow", "-o", tmp_path / "run", "--no-rerun", *quick
+        )
+        process.wait()
+    assert followed.code == 0, followed.err
+    later = cdmisfa("learn", folder, *quick)
+    assert followed.json["signals_sha256"] == later.json["signals_sha256"]
+    source = json.loads((tmp_path / "run" / "run.json").read_text())["source"]
+    for view, whole in zip(source["views"], later.json["source"]["views"], strict=True):
+        raw = (folder / whole["file"]).read_bytes()
+        assert view["name"] == whole["name"]
+        assert view["sha256"] == hashlib.sha256(raw[: view["bytes"]]).hexdigest()
+        assert view["frames"] <= whole["frames"] == FRAMES
+    assert source["config_sha256"] == later.json["source"]["config_sha256"]
+
+
+@pytest.mark.parametrize("split", [None, "2s"])
+def test_nothing_is_read_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, split: str | None
+) -> None:
+    """Whatever the recorder's pace: the bytes read grow with the recording, not with the looks."""
+    read: list[int] = []
+    read_at = FileStore.read_at
+
+    def counted(self: FileStore, offset: int, count: int) -> bytes:
+        data = read_at(self, offset, count)
+        read.append(len(data))
+        return data
+
+    monkeypatch.setattr(FileStore, "read_at", counted)
+    folder = tmp_path / "rec"
+    source: list[FollowedSource] = []
+    live = OscillatorySource()
+
+    def look(done: float) -> None:
+        if not source and done >= 50:
+            source.append(FollowedSource(folder, timeout=30))
+        if source and done >= source[0].t + 60:
+            same(source[0].take(1, 10), live.take(1, 10))
+
+    parts = None if split is None else Split.parse(split)
+    record("oscillatory", folder, frames=3000, split=parts, progress=look)
+    followed = source[0]
+    while followed.t < 3000:
+        same(followed.take(1, 10), live.take(1, 10))
+    assert followed.finished
+    sizes = sum(path.stat().st_size for path in folder.iterdir())
+    # Its structure, its log times, its frames, and its checksum at the end.
+    assert sum(read) < 5 * sizes
+    named = followed.describe()["views"]
+    assert sum(view["frames"] for view in named) == 9000
+    for view in named:
+        assert view["sha256"] == hashlib.sha256((folder / view["file"]).read_bytes()).hexdigest()
+    followed.close()
+
+
+def test_a_resumed_recorder_is_followed_on(tmp_path: Path) -> None:
+    """Going on with a recording replaces its unfinished files by others."""
+    live = OscillatorySource()
+
+    def stop(done: float) -> None:
+        if done >= 200:
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        record("oscillatory", tmp_path / "rec", frames=400, progress=stop)
+    source = FollowedSource(tmp_path / "rec", timeout=30)
+    same(source.take(0, 150), live.take(0, 150))
+    record("oscillatory", tmp_path / "rec", resume=True)
+    same(source.take(2, 250), live.take(2, 250))
+    assert source.finished
+    source.close()
 
 
 def test_a_stopped_run_goes_on_following(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
