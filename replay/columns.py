@@ -25,6 +25,9 @@ ITERATION = "iteration"
 LOG_TIME = "message_log_time"
 """Timeline of the log time: the name Rerun's own MCAP loader gives it."""
 
+TIMELINE_SIGNALS = ("iteration", "t", "log_time")
+"""Signals that are not lines but the timelines themselves."""
+
 MAX_BYTES = 4 * 1024 * 1024
 """Most bytes of a column that wait."""
 

@@ -11,7 +11,18 @@ from numpy.typing import NDArray
 
 from replay.columns import Clock
 from replay.labels import label, part
-from replay.palette import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, Rgb, colour, packed
+from replay.palette import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    Rgb,
+    colour,
+    packed_all,
+)
 from replay.signal_columns import SignalColumns
 
 STAY, SWITCH = "stay", "switch"
@@ -91,7 +102,7 @@ class Lanes:
             rr.StateConfiguration(
                 values=list(chosen),
                 labels=list(chosen),
-                colors=np.array([packed(c) for c in chosen.values()], dtype=np.uint32),
+                colors=packed_all(list(chosen.values())),
             ),
             static=True,
         )

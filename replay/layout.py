@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import rerun as rr
 import rerun.blueprint as rrb
 
-from replay.columns import FRAME
+from cdmisfa.signals import SIGNALS
+from replay.columns import FRAME, TIMELINE_SIGNALS
 from replay.labels import label, part
 from replay.outline import Outline
 
@@ -14,6 +17,13 @@ MOST_MODULES = 6
 
 LEGEND = rrb.PlotLegend(visible=True, corner=rrb.Corner2D.RightTop)
 HEAT = rrb.TensorScalarMapping(colormap="viridis")
+FIT = rrb.components.ViewFit.Fill
+
+LANE = 35
+"""Height of a lane, beside plots of 100 to 200."""
+
+MOST_LANES = 14
+"""Lanes that get their full height; more are scrolled."""
 
 Span = tuple[float, float]
 
@@ -80,7 +90,12 @@ class RunLayout:
             origin="/",
             contents=["/signals/**"],
             name="Table",
-            query=rrb.archetypes.DataframeQuery(timeline="iteration", apply_latest_at=True),
+            query=rrb.archetypes.DataframeQuery(
+                timeline="iteration",
+                apply_latest_at=True,
+                select=[FRAME, *(_values(entity) for entity in self._entities())],
+                entity_order=self._entities(),
+            ),
         )
         return blueprint(
             self._overview(),
@@ -93,6 +108,16 @@ class RunLayout:
             name="Run",
         )
 
+    def _entities(self) -> list[str]:
+        """Entities of the table's columns: the signals in the record's order."""
+        modules = range(1, max(self._outline.modules, 1) + 1)
+        found: list[str] = []
+        for signal in SIGNALS.values():
+            if signal.name not in TIMELINE_SIGNALS and signal.show != "heat":
+                parts = [f"/{i}" for i in modules] if signal.dims.startswith("M") else [""]
+                found += [f"/signals/{signal.name}{part}" for part in parts]
+        return found
+
     def _overview(self) -> rrb.Container:
         sees = rrb.Vertical(
             self._watched("What it sees"),
@@ -104,9 +129,12 @@ class RunLayout:
             self._lanes(
                 "What it does, and decides: the policy in each stream", "/lanes/**", "/policy/**"
             ),
+            self._lines(
+                "Where it looks: share of the last 50 blocks", ["/decision/attention"], (0.0, 1.05)
+            ),
             self._convergence("What it feels: a module is saved when η̇ falls below δ"),
             self._lines("What it expects: reward R for staying", ["/decision/R_stay/**"]),
-            row_shares=[5 + min(len(self._spec.streams), 6), 5, 4],
+            row_shares=[_heights(5 + len(self._spec.streams)), 125, 190, 125],
         )
         return rrb.Horizontal(sees, story, column_shares=[2, 5], name="Overview")
 
@@ -159,15 +187,16 @@ class RunLayout:
                 self._outline.span(*rewards),
             ),
             self._lines("Exploration ε", ["/signals/epsilon"], (0.0, 1.25)),
-            row_shares=[5 + min(len(self._spec.streams), 6), 4, 4, 4, 3],
+            row_shares=[_heights(2 + len(self._spec.streams)), 130, 130, 130, 100],
         )
         heat = rrb.Vertical(
             _reward(0, "R for staying: from stream (down) to stream (across)"),
             _reward(1, "R for switching: from stream (down) to stream (across)"),
             rrb.TensorView(
-                origin="/signals/Q",
-                name="Q: stream (down), stay and switch (across)",
+                origin="/decision/Q_beside_mean",
+                name="Q less its mean: stream (down), stay and switch (across)",
                 scalar_mapping=HEAT,
+                view_fit=FIT,
             ),
         )
         return rrb.Horizontal(curves, heat, column_shares=[5, 2], name="Decision")
@@ -184,7 +213,13 @@ class RunLayout:
             for i in range(1, min(self._outline.modules, MOST_MODULES) + 1)
         ]
         truth = [self._lines("What the world knows", ["/world/truth"])] if self._spec.truth else []
-        learned = rrb.TextLogView(origin="/events", name="Events")
+        learned = rrb.TextLogView(
+            origin="/events",
+            name="Events",
+            columns=rrb.archetypes.TextLogColumns(
+                timeline_columns=["frame", "iteration"], text_log_columns=["loglevel", "body"]
+            ),
+        )
         return rrb.Vertical(*rows, *truth, learned, name="Modules")
 
     def _views(self) -> rrb.Container:
@@ -225,7 +260,7 @@ class RunLayout:
     def _weights(self, path: str, name: str) -> rrb.View:
         if self._images:
             return rrb.Spatial2DView(origin=path, name=name)
-        return rrb.BarChartView(origin=path, name=name)
+        return rrb.BarChartView(origin=path, name=name, plot_legend=rrb.PlotLegend(visible=False))
 
     def _convergence(self, name: str) -> rrb.View:
         """Eta-dot with delta well above the floor, and the saves."""
@@ -245,6 +280,16 @@ class RunLayout:
         return lines(name, contents, self._axis, span)
 
 
+def _values(entity: str) -> Any:
+    """The column of an entity's numbers, without those of its style."""
+    return rrb.components.ComponentColumnSelector(entity_path=entity, component="Scalars:scalars")
+
+
+def _heights(lanes: int) -> int:
+    """Height of a panel of lanes, with its title and axis."""
+    return 60 + LANE * min(lanes, MOST_LANES)
+
+
 def _reward(action: int, name: str) -> rrb.View:
     selection = rrb.TensorSliceSelection(
         width=2,
@@ -252,5 +297,9 @@ def _reward(action: int, name: str) -> rrb.View:
         indices=[rr.TensorDimensionIndexSelection(dimension=1, index=action)],
     )
     return rrb.TensorView(
-        origin="/signals/R", name=name, scalar_mapping=HEAT, slice_selection=selection
+        origin="/signals/R",
+        name=name,
+        scalar_mapping=HEAT,
+        slice_selection=selection,
+        view_fit=FIT,
     )

@@ -168,6 +168,7 @@ def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
         modules=min(streams, MOST_MODULES),
         visits=np.zeros(streams, dtype=np.int64),
         saved=(),
+        last=None,
         policy=(),
         lines={name: np.empty(0) for name in LINES},
     )

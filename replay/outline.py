@@ -33,6 +33,23 @@ class Saved:
 
 
 @dataclass(frozen=True, slots=True)
+class Phase:
+    """The time in which one abstraction was learned.
+
+    Attributes:
+        module: its number.
+        blocks: of the phase.
+        novel: how many of them the gate let through.
+        visits: (S,) how many of them were of each stream.
+    """
+
+    module: int
+    blocks: int
+    novel: int
+    visits: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
 class Outline:
     """A run in short.
 
@@ -45,6 +62,7 @@ class Outline:
         modules: most frozen modules in any iteration.
         visits: (S,) frames each stream was watched.
         saved: the saves, in order.
+        last: the time since the last save.
         policy: the last policy.
         lines: for each name of `LINES` its values, (n,) or (n J,).
     """
@@ -57,6 +75,7 @@ class Outline:
     modules: int
     visits: NDArray[np.int64]
     saved: tuple[Saved, ...]
+    last: Phase | None
     policy: tuple[int, ...]
     lines: dict[str, Float]
 
@@ -111,6 +130,7 @@ class Tally:
         self._saved: list[Saved] = []
         self._iterations = self._modules = self._tau = self._outputs = 0
         self._policy: tuple[int, ...] = ()
+        self._last: Phase | None = None
 
     def add(self, columns: SignalColumns) -> None:
         """Take the next records in."""
@@ -122,6 +142,20 @@ class Tally:
         self._saved += [_save_of(columns, i) for i in np.flatnonzero(columns["saved"]).tolist()]
         self._iterations += len(columns)
         self._policy = tuple(columns["policy"][-1].tolist())
+        self._last = self._phase(columns)
+
+    def _phase(self, columns: SignalColumns) -> Phase:
+        """The last abstraction's phase, as far as it has come."""
+        module = int(columns["module"][-1])
+        own = columns["module"] == module
+        before = self._last if self._last is not None and self._last.module == module else None
+        visits = np.bincount(columns["stream"][own], minlength=len(self._visits))
+        return Phase(
+            module,
+            int(own.sum()) + (before.blocks if before else 0),
+            int(columns["novel"][own].sum()) + (before.novel if before else 0),
+            visits + (before.visits if before else 0),
+        )
 
     def outline(self) -> Outline:
         """What was taken in, in short."""
@@ -134,6 +168,7 @@ class Tally:
             modules=self._modules,
             visits=self._visits.copy(),
             saved=tuple(self._saved),
+            last=self._last,
             policy=self._policy,
             lines={name: _joined(parts) for name, parts in self._lines.items()},
         )

@@ -5,6 +5,8 @@ Source: Okabe and Ito, Color Universal Design (2008).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,6 +38,11 @@ def packed(rgb: Rgb) -> int:
     """A colour as 0xRRGGBBAA, opaque."""
     red, green, blue = rgb
     return red << 24 | green << 16 | blue << 8 | 0xFF
+
+
+def packed_all(colours: Sequence[Rgb]) -> NDArray[np.uint32]:
+    """Colours as the viewer takes several of them without doubt."""
+    return np.array([packed(rgb) for rgb in colours], dtype=np.uint32)
 
 
 def shade(weights: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -21,6 +21,7 @@ from replay.files import log_files
 from replay.labels import label, part
 from replay.layout import blueprint, lines, whole
 from replay.outline import Outline
+from replay.palette import colour, packed_all
 from replay.reader import LogReader
 from replay.recorded import RecordedSource
 from replay.runlog import read_signals
@@ -86,7 +87,8 @@ def write_views(
     truth = Column(recording, clock, "world/truth", config.rows)
     if spec.truth and tau is None:
         names = [label(name) for name in spec.truth]
-        recording.log("world/truth", rr.SeriesLines(names=names), static=True)
+        shades = packed_all([colour(i) for i in range(len(names))])
+        recording.log("world/truth", rr.SeriesLines(names=names, colors=shades), static=True)
     for t in range(first, first + count, BLOCK):
         frames = np.arange(t, min(t + BLOCK, first + count))
         keep = frames % config.every == 0 if images else np.ones(len(frames), dtype=bool)
@@ -184,7 +186,8 @@ def _column(
         column.declare(*shape)
         return column
     names = [f"x{i + 1}" for i in range(int(np.prod(shape)))]
-    recording.log(path, rr.SeriesLines(names=names), static=True)
+    shades = packed_all([colour(i) for i in range(len(names))])
+    recording.log(path, rr.SeriesLines(names=names, colors=shades), static=True)
     return Column(recording, clock, path, config.rows)
 
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from cdmisfa.modules import Module
 from cdmisfa.signals import SIGNALS, Signal
-from replay.columns import Clock, Column, ImageColumn, TensorColumn
+from replay.columns import TIMELINE_SIGNALS, Clock, Column, ImageColumn, TensorColumn
 from replay.config import ViewConfig
 from replay.labels import label, part
 from replay.lanes import Lanes
 from replay.outline import Outline, delta_of
-from replay.palette import GREY, VERMILLION, colour, packed, shade
+from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, packed_all, shade
 from replay.runlog import RunHeader
 from replay.signal_columns import SignalColumns
 from replay.stretch import Stretch
@@ -29,11 +29,14 @@ from replay.stretch import Stretch
 AXES = {"S": "stream", "A": "action", "J": "output"}
 """Names of tensors' dimensions; the second S of a tensor is the next stream."""
 
-TIMELINE_SIGNALS = ("iteration", "t", "log_time")
-"""Signals that are not lines but the timelines themselves."""
-
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2}
 """Colours of signals that are drawn beside another one."""
+
+SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
+"""Signals whose name is their symbol, spelled out."""
+
+RECENT = 50
+"""Blocks over which the share of each stream is taken."""
 
 SPARSE = 10
 """With more streams than are shown one by one, tensors are kept every so many iterations."""
@@ -70,6 +73,7 @@ class RunView:
         self._columns: dict[str, Column] = {}
         self._streams = streams
         self._tau = 1
+        self._recent = np.zeros((0, len(streams)), dtype=bool)
         self._lanes = Lanes(recording, self._clock, self.spec.streams, self._streams)
 
     def take(self, stretch: Stretch) -> None:
@@ -105,6 +109,7 @@ class RunView:
         """Take the records of consecutive iterations."""
         self._tau = max(columns.tau, 1)
         self._signals(columns)
+        self._attention(columns)
         self._decision(columns)
         self._gate(columns)
         self._saved(columns)
@@ -161,6 +166,9 @@ class RunView:
             value, path = columns[signal.name], f"signals/{signal.name}"
             if signal.show == "heat":
                 self._tensor(signal, path, columns, value)
+                if signal.name == "Q":  # what stream and action change is small beside the mean
+                    beside = value - value.mean(axis=(1, 2), keepdims=True)
+                    self._tensor(signal, "decision/Q_beside_mean", columns, beside)
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
                     labels = _labels(signal, i + 1, outputs)
@@ -188,6 +196,19 @@ class RunView:
                 lambda: TensorColumn(self._recording, self._clock, path, self._config.rows, names),
             )
             column.add(columns.frames[kept], columns.iterations[kept], value[kept])
+
+    def _attention(self, columns: SignalColumns) -> None:
+        """How much of the recent blocks each shown stream was watched."""
+        watched = columns["stream"][:, None] == np.array(self._streams)
+        all_of_them = np.concatenate([self._recent, watched])
+        sums = np.cumsum(all_of_them, axis=0)
+        end = np.arange(len(self._recent), len(all_of_them))
+        before = end - RECENT
+        shares = sums[end] - np.where(before[:, None] < 0, 0, sums[np.maximum(before, 0)])
+        self._recent = all_of_them[-RECENT:]
+        names = [self.spec.streams[s] for s in self._streams]
+        line = self._line("decision/attention", names, 0, rgbs=[colour(s) for s in self._streams])
+        line.add(*columns.times(), shares / np.minimum(end + 1, RECENT)[:, None])
 
     def _decision(self, columns: SignalColumns) -> None:
         """Reward and value of each shown stream, as lines in the streams' colours."""
@@ -242,7 +263,7 @@ class RunView:
         if len(shape) == 2 and phi.shape[1] == shape[0] * shape[1]:
             return rr.Image(shade(phi.reshape(-1, shape[1])))
         if phi.size <= 256:
-            return rr.BarChart(phi.reshape(-1).copy())
+            return rr.BarChart(phi.reshape(-1).copy(), color=packed(SKY))
         return rr.Tensor(phi.copy(), dim_names=("output", "input"))
 
     def _iteration(self, t: Frames) -> Frames:
@@ -260,19 +281,20 @@ class RunView:
         labels: Sequence[str] | None,
         number: int,
         *,
-        rgb: tuple[int, int, int] | None = None,
+        rgb: Rgb | None = None,
+        rgbs: Sequence[Rgb] | None = None,
         width: float = 1.5,
     ) -> Column:
         """The column of a line, its names and colours said once."""
 
         def declare() -> Column:
             if labels is not None:
-                shades = [rgb or colour(number + i) for i in range(len(labels))]
+                shades = rgbs or [rgb or colour(number + i) for i in range(len(labels))]
                 if len(set(labels)) == 1:
-                    shades = [rgb or colour(number)] * len(labels)
+                    shades = [shades[0]] * len(labels)
                 style = rr.SeriesLines(
                     names=[label(text) for text in labels],
-                    colors=[packed(c) for c in shades],
+                    colors=packed_all(shades),
                     widths=[width] * len(labels),
                 )
                 self._recording.log(path, style, static=True)
@@ -289,9 +311,14 @@ class RunView:
 def _labels(signal: Signal, module: int, outputs: int) -> list[str]:
     """Names of a signal's lines: its symbol and unit, its module, its outputs."""
     name = signal.name.replace("_", " ")
-    symbol = "" if signal.symbol in ("", name) else f"{signal.symbol} "
+    if module:
+        symbol = signal.symbol.replace("_i", f"_{module}")
+        text = symbol if signal.name in SPELLED else f"{symbol} {name} module {module}".strip()
+    elif signal.name in SPELLED or signal.symbol == name:
+        text = signal.symbol
+    else:
+        text = f"{signal.symbol} {name}".strip()
     unit = "" if signal.unit in ("", "1") else f" [{signal.unit}]"
-    who = f" module {module}" if module else ""
     if "J" not in signal.dims or outputs == 1:
-        return [f"{symbol}{name}{who}{unit}"]
-    return [f"{symbol}{name}{who} output {j + 1}{unit}" for j in range(outputs)]
+        return [f"{text}{unit}"]
+    return [f"{text} output {j + 1}{unit}" for j in range(outputs)]

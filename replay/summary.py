@@ -7,8 +7,14 @@ from replay.outline import Outline
 ACTIONS = ("stay", "switch")
 
 
-def summary_text(outline: Outline, name: str) -> str:
-    """What was learned, when, and where the robot stayed for it, as Markdown."""
+def summary_text(outline: Outline, name: str, ended: str = "") -> str:
+    """What was learned, when, and where the robot stayed for it, as Markdown.
+
+    Args:
+        outline: the run in short.
+        name: of the run.
+        ended: why it ended, where that is known.
+    """
     spec = outline.header.spec
     lines = [f"## {name}", _opening(outline), ""]
     if outline.saved:
@@ -23,6 +29,8 @@ def summary_text(outline: Outline, name: str) -> str:
                 f"| {policy_text(save.policy, spec.streams)} |"
             )
         lines.append("")
+    for text in (_unfinished(outline), ended):
+        lines += [text, ""] if text else []
     lines += ["| stream | watched |", "|---|---|"]
     for s in outline.streams(16):
         share = outline.visits[s] / max(outline.frames, 1)
@@ -40,6 +48,19 @@ def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
     if len(stays) == len(streams):
         return "stay everywhere"
     return f"stay on {', '.join(stays)}" if stays else "switch everywhere"
+
+
+def _unfinished(outline: Outline) -> str:
+    """What became of the abstraction that was not saved."""
+    last = outline.last
+    if last is None or any(save.module == last.module for save in outline.saved):
+        return ""
+    most = int(last.visits.argmax())
+    return (
+        f"Module {last.module} was not saved: {last.novel / last.blocks:.0%} of its "
+        f"{last.blocks:,} blocks were novel, and {last.visits[most] / last.blocks:.0%} of them "
+        f"were of {outline.names()[most]}."
+    )
 
 
 def _opening(outline: Outline) -> str:

@@ -31,6 +31,9 @@ from replay.summary import summary_text
 APPLICATION = "cdmisfa"
 """Rerun's application id: one layout is remembered for it."""
 
+ENDED = "ended:"
+"""How the event begins that says why a run ended."""
+
 FLUSH_SECONDS = 60.0
 
 
@@ -115,19 +118,25 @@ def _write_run(
     streams: Sequence[int] = range(len(header.spec.streams))
     if len(streams) > config.streams:  # which are watched most is known at the end only
         streams = read_outline(log).streams(config.streams)
-    tally, view = Tally(header), RunView(recording, header, streams, config)
+    tally, view, ended = Tally(header), RunView(recording, header, streams, config), ""
     for stretch in read_stretches(log, header, every=config.every):
         for columns in stretch.signals:
             tally.add(columns)
         view.take(stretch)
+        ended = next((e.text for e in stretch.events if e.text.startswith(ENDED)), ended)
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
     _properties(recording, outline, folder)
-    text = label(summary_text(outline, _name(log)))
+    text = label(summary_text(outline, _name(log), _sentence(ended)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)
     layout = RunLayout(outline, all_views=all_views is not None, head=head)
     recording.send_blueprint(layout.blueprint())
+
+
+def _sentence(ended: str) -> str:
+    reason = ended.removeprefix(ENDED).strip()
+    return f"It ended: {reason}." if reason else ""
 
 
 def _name(log: Path) -> str:

@@ -104,10 +104,10 @@ def open_window(
             "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
             "--screenshot"
         )
-    with _view_of(path, every, all_views) as view:
+    with _opened(path, every, all_views) as (name, view):
         port = str(free_port())
         run_program(
-            [str(view), "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit]
+            [name, "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit], view
         )
 
 
@@ -130,7 +130,7 @@ def serve(
     check_limit(memory_limit)
     data_port, viewer_port, page_port = free_port(), free_port(), port or free_port()
     with (
-        _view_of(path, every, all_views) as view,
+        _opened(path, every, all_views) as (name, view),
         serve_page(viewer_port, data_port, page_port),
     ):
         proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
@@ -142,8 +142,9 @@ def serve(
                 *("--port", str(data_port)),
                 *("--web-viewer-port", str(viewer_port)),
                 *("--server-memory-limit", memory_limit),
-                str(view),
-            ]
+                name,
+            ],
+            view,
         )
 
 
@@ -318,8 +319,31 @@ def _view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
         yield view
 
 
-def run_program(arguments: Sequence[str]) -> None:
+@contextlib.contextmanager
+def _opened(
+    path: Path, every: int, all_views: Path | None
+) -> Iterator[tuple[str, BinaryIO | None]]:
+    """The view of a run as the viewer's argument, and as its standard input.
+
+    The file has no name any more when it is read, so that it goes with its last reader,
+    whatever ends us. Windows cannot do that and keeps the name.
+    """
+    with contextlib.ExitStack() as until_read:
+        view = until_read.enter_context(_view_of(path, every, all_views))
+        if os.name == "nt" or view == path:
+            yield str(view), None
+            return
+        with open(view, "rb") as file:
+            until_read.close()
+            yield "-", file
+
+
+def run_program(arguments: Sequence[str], given: BinaryIO | None = None) -> None:
     """Run the viewer, or its server, until it ends; an interrupt ends it and is passed on.
+
+    Args:
+        arguments: of the program.
+        given: its standard input.
 
     Raises:
         CdmisfaError: it ended with an error, whose last words are given.
@@ -328,7 +352,12 @@ def run_program(arguments: Sequence[str]) -> None:
     variables = {**environment(), "RUST_LOG": "warn"}
     with tempfile.TemporaryFile() as words:
         process = subprocess.Popen(
-            command, env=variables, stdout=words, stderr=words, preexec_fn=_ends_with_parent()
+            command,
+            env=variables,
+            stdin=given,
+            stdout=words,
+            stderr=words,
+            preexec_fn=_ends_with_parent(),
         )
         try:
             code = process.wait()
