@@ -77,7 +77,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 
 
 @click.command("export")
-@options.path_argument("path")
+@options.fetched_argument("path")
 @click.option(
     "--to",
     "form",
