@@ -11,6 +11,7 @@ import os
 import subprocess
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -25,8 +26,9 @@ from replay.config import ViewConfig
 from replay.layout import MOST_MODULES, RunLayout
 from replay.outline import LINES, Outline
 from replay.run_view import RunView
-from replay.runlog import RunHeader
+from replay.runlog import RunHeader, read_header, run_log
 from replay.signal_columns import columns_of_records
+from replay.stretch import read_stretches
 from replay.view import APPLICATION
 from replay.viewer import environment, free_port, program
 
@@ -86,6 +88,7 @@ class LiveView:
         self._view = RunView(
             self._recording, outline.header, outline.streams(config.streams), config
         )
+        self._tau = tau
         self._images = len(spec.frame_shape) == 2
         self._records: list[BlockSignals] = []
         self._watched: list[NDArray[Any]] = []
@@ -103,6 +106,25 @@ class LiveView:
             self._view.weights(f"modules/{signals.module}/weights", block.t, phi)
         if len(self._records) >= MOST_BLOCKS or time.monotonic() >= self._next:
             self.flush()
+
+    def earlier(self, run: Path) -> None:
+        """Show what the log of a run that goes on holds already, before its next block.
+
+        Raises:
+            UsageError: there is no such run.
+            LogDamagedError: its log cannot be read.
+        """
+        log = run_log(run)
+        for stretch in read_stretches(log, read_header(log), every=self._tau):
+            self._view.take(stretch)
+            weights = dict(stretch.phi)
+            for columns in stretch.signals:
+                self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
+                for i in np.flatnonzero(columns["saved"]).tolist():
+                    t, module = int(columns.frames[i]), int(columns["module"][i])
+                    if t in weights:
+                        self._view.weights(f"modules/{module}/weights", t, weights[t])
+            self._view.flush()
 
     def event(self, t: int, iteration: int, text: str) -> None:
         """Say in words what happened."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import socket
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from cdmisfa.experiments.run import learn
 from cdmisfa.streams import OscillatorySource
 from replay import live, viewer
 from replay.live import LiveView
+from replay.runlog import read_signals
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
 
@@ -85,24 +84,35 @@ def test_a_run_gives_the_same_with_and_without(tmp_path):
     assert len(said) == 1
 
 
+def test_a_run_that_goes_on_shows_what_went_before(tmp_path, monkeypatch):
+    """All of a resumed run is handed over, each record once, and in order."""
+    config, sent = LearnerConfig(), []
+
+    def keep(self, times, values):
+        if self.path == "signals/epsilon":
+            sent.append(np.array(values).reshape(-1))
+
+    run = tmp_path / "run"
+    learn(OscillatorySource(), config, run, max_iterations=30, rerun=False)
+    monkeypatch.setattr("replay.columns.Column.send", keep)
+    learn(
+        OscillatorySource(),
+        config,
+        run,
+        max_iterations=50,
+        rerun=False,
+        resume=True,
+        live=True,
+    )
+    expected = [s.epsilon for s in read_signals(run)]
+    assert len(expected) == 50
+    np.testing.assert_array_equal(np.concatenate(sent), expected)
+
+
 def test_rerun_switched_off_is_said(monkeypatch):
     monkeypatch.setattr(rr, "is_enabled", lambda recording: False)
     with pytest.raises(CdmisfaError, match="RERUN"):
         LiveView(VECTOR, MANIFEST, 40, 1)
-
-
-def test_the_learner_hardly_waits():
-    """CPU time of this thread for a block, against the 2 ms that the learner takes for one."""
-    spec = dataclasses.replace(IMAGE, frame_shape=(48, 128))
-    fed = list(run_of(spec, 1000))
-    phi = np.ones((1, 48 * 128))
-    with LiveView(spec, MANIFEST, 40, 1) as view:
-        begin = time.thread_time()
-        for signals, block in fed:
-            view.block(signals, block, phi)
-        view.flush()
-        each = (time.thread_time() - begin) / len(fed)
-    assert each < 400e-6
 
 
 @pytest.mark.skipif(bool(viewer.missing_driver()), reason=viewer.missing_driver())

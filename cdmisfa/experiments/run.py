@@ -170,6 +170,8 @@ def learn(
     ):
         if log is not None and resume:
             _go_on(log, learner, source, digest)
+            if shown is not None:
+                shown.earlier(log.path.parent)
         _say_if_compiling()
         while True:
             ended = _ending(learner, limit, max_iterations, stop)
@@ -372,7 +374,10 @@ def _say_if_compiling() -> None:
     """Explain the wait to whoever is looking, when numba has nothing on disk yet."""
     if not sys.stderr.isatty():
         return
-    if needs_compiling(think) or needs_compiling(strict.update):
+    functions: list[Callable[..., Any]] = [think, strict.update]
+    if scan := sys.modules.get("replay.scan"):  # of a source that reads recordings
+        functions += [scan.scan, scan.gather]
+    if any(needs_compiling(function) for function in functions):
         print("compiling the learner, this first time only (some 10 to 30 s)", file=sys.stderr)
 
 
