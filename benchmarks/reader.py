@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
+from benchmarks import long_recordings
 from benchmarks.recordings import SAMPLE, write_pictures
 from benchmarks.report import interleaved, ratio, save
 from replay.recorded import RecordedSource
@@ -94,7 +95,9 @@ def copying(frames: int) -> Callable[[], int]:
 
 
 def main(*, quick: bool = False, full: bool = False) -> None:
-    """Measure, and write results/reader.json."""
+    """Measure, and write results/reader.json; with `full` a recording of 10 GB, too."""
+    if full:
+        long_recordings.main(full=True)
     rounds, noisy = (3, 400) if quick else (9, 2000)
     with tempfile.TemporaryDirectory() as folder:
         cases = {

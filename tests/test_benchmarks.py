@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import kernels, learn, reader, recorder, report, scaling
+from benchmarks import kernels, learn, long_recordings, reader, recorder, report, scaling
 
 
 @pytest.fixture
@@ -22,6 +22,15 @@ def test_reader(results: Path) -> None:
     table = json.loads((results / "reader.json").read_text())["tables"][0]
     assert [row[0] for row in table["rows"]] == ["sample log", "noisy pictures"]
     assert "## Reading a recording" in report.write_page().read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("work", ["messages", "info"])
+def test_long_recordings_take_no_more_memory(tmp_path: Path, work: str) -> None:
+    peaks = []
+    for size in (50, 200):
+        path = long_recordings.write_long(tmp_path / str(size), size * long_recordings.MEGABYTE)
+        peaks.append(long_recordings.measured(work, path)[1])
+    assert peaks[1] < peaks[0] + 25
 
 
 def test_learn(tmp_path: Path) -> None:

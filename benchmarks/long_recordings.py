@@ -1,0 +1,119 @@
+"""How much memory reading takes, of a recording of 100 MB and of one a hundred times as long."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.report import save
+from cdmisfa.blocks import Block, SourceSpec
+from recorder.config import RecordConfig
+from recorder.viewlog import Identity, ViewLog
+
+SHAPE = (240, 320)
+TAU = 40
+MEGABYTE = 10**6
+
+
+def write_long(folder: Path, size: int) -> Path:
+    """Record one view of about `size` bytes, uncompressed: a plain image with a line that moves."""
+    folder.mkdir(parents=True, exist_ok=True)
+    spec = SourceSpec(("left",), SHAPE, "uint8", ("x", "y"), 50.0, 10**18)
+    settings = RecordConfig(compression="none")
+    log = ViewLog(folder, "left", Identity("plain", 0, spec, {}), settings)
+    frames = np.full((TAU, *SHAPE), 100, np.uint8)
+    frames[np.arange(TAU), np.arange(TAU)] = 200
+    truth = np.zeros((TAU, 2))
+    while log.size < size:
+        log.write(Block(0, log.t, frames, truth))
+    log.finish()
+    return log.path
+
+
+def play(path: Path) -> None:
+    """Take every block of a recording."""
+    from replay.recorded import RecordedSource
+
+    with contextlib.closing(RecordedSource(path)) as source:
+        for _ in range(source.frames // TAU):
+            source.take(0, TAU)
+
+
+def messages(path: Path) -> None:
+    """Go over every message of a log."""
+    from replay.reader import LogReader
+
+    with LogReader(path) as reader:
+        for _ in reader.messages():
+            pass
+
+
+def info(path: Path) -> None:
+    """Describe a log."""
+    from replay.info import describe
+
+    describe(path)
+
+
+def verify(path: Path) -> None:
+    """Check all of a log."""
+    from replay.verify import verify
+
+    if not verify(path)["ok"]:
+        raise SystemExit(f"{path} is damaged")
+
+
+WORK: dict[str, Callable[[Path], None]] = {
+    work.__name__: work for work in (play, messages, info, verify)
+}
+
+
+def measured(work: str, path: Path) -> tuple[float, float]:
+    """Do some work in a process of its own: seconds, and its peak of memory in MB."""
+    words = [sys.executable, "-m", "benchmarks.long_recordings", work, str(path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    seconds, peak = done.stdout.split()
+    return float(seconds), float(peak)
+
+
+def main(*, quick: bool = False, full: bool = False) -> None:
+    """Measure, and write results/long_recordings.json; 10 GB with `full`."""
+    short, long = (100, 10_000) if full else (50, 100 if quick else 500)
+    rows: dict[str, list[object]] = {work: [work] for work in WORK}
+    for size in (short, long):
+        with tempfile.TemporaryDirectory() as folder:
+            path = write_long(Path(folder), size * MEGABYTE)
+            for work in WORK:
+                seconds, peak = measured(work, path)
+                rows[work] += [round(seconds, 1), round(peak)]
+    header = ["work"]
+    for size in (short, long):
+        header += [f"{size} MB: seconds", f"{size} MB: peak of memory, MB"]
+    save(
+        "long_recordings",
+        "Long recordings",
+        f"One view of {SHAPE[0]} x {SHAPE[1]} frames, uncompressed, each kind of work in a "
+        "process of its own, whose peak counts Python and its libraries, too. Every checksum is "
+        "checked; verify reads a recording several times.",
+        [(header, list(rows.values()))],
+    )
+
+
+def _one(work: str, path: Path) -> None:
+    before = time.perf_counter()
+    WORK[work](path)
+    seconds = time.perf_counter() - before
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    peak = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+    print(seconds, int(peak.split()[1]) / 1000)
+
+
+if __name__ == "__main__":
+    _one(sys.argv[1], Path(sys.argv[2]))
