@@ -71,8 +71,12 @@ class VideoImages:
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Videos have no checksums: a damaged pixel in one may be seen by nobody."""
-        return (f"{self.path}: a video has no checksums, damaged pixels may go unnoticed",)
+        """Videos have no checksums; and one may have lost its end."""
+        found = [f"{self.path}: a video has no checksums, damaged pixels may go unnoticed"]
+        last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
+        if stated > last + 1:
+            found.append(f"{self.path}: it states {stated:g} s, its last frame is at {last:g} s")
+        return found
 
     def frame(self, row: int) -> Bytes:
         """Decode a frame, (height, width) uint8.
@@ -120,7 +124,9 @@ class VideoImages:
             raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")
         self._tick = Fraction(stream.time_base)
         stamps: list[int] = []
+        packets = 0
         for packet in self._container.demux(stream):
+            packets += packet.size > 0
             if packet.size == 0 or packet.is_discard:
                 continue
             if packet.pts is None:
@@ -130,10 +136,15 @@ class VideoImages:
             stamps.append(packet.pts)
         if not stamps:
             raise LogDamagedError(f"{self.path}: there is no frame in it")
+        if stream.frames not in (0, packets):
+            raise LogDamagedError(
+                f"{self.path}: it states {stream.frames} frames, {packets} are there"
+            )
         self._stamps = np.sort(np.array(stamps, np.int64))
         if (np.diff(self._stamps) == 0).any():
             raise LogDamagedError(f"{self.path}: two of its frames have the same time")
         self.count = len(stamps)
+        self._stated_seconds = (self._container.duration or 0) / self._av.time_base
         self.times = self._nanoseconds()
         self._container.seek(0, stream=stream, backward=True)
 

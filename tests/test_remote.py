@@ -130,15 +130,15 @@ def test_the_chunks_of_other_topics_are_left_where_they_are(web: WebServer, tmp_
 
 
 def test_a_short_run_reads_only_the_beginning(web: WebServer, tmp_path: Path) -> None:
-    write_cameras(tmp_path / "a.mcap", {"/left": (20_000, 20), "/right": (20_000, 20)})
+    write_cameras(tmp_path / "a.mcap", {"/left": (8000, 20), "/right": (8000, 20)})
     web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
     near = ForeignSource(tmp_path / "a.mcap", ["/left"], size=(12, 16))
     far = ForeignSource(web.url("/a.mcap"), ["/left"], size=(12, 16))
     web.reset()
     np.testing.assert_array_equal(far.take(0, 100).frames, near.take(0, 100).frames)
     assert web.sent < 0.1 * len(web.files["/a.mcap"])
-    far.seek(15_000)
-    near.seek(15_000)
+    far.seek(6000)
+    near.seek(6000)
     np.testing.assert_array_equal(far.take(0, 100).frames, near.take(0, 100).frames)
     assert web.sent < 0.2 * len(web.files["/a.mcap"])
     far.close()
@@ -289,6 +289,9 @@ def test_a_run_on_a_server_is_looked_at_and_not_learned_from(
     assert (done.code, "is a run, not a recording" in done.err) == (2, True), done.err
     assert cdmisfa("view", url, "--save", tmp_path / "a.rrd").code == 0
     assert (tmp_path / "a.rrd").stat().st_size > 1000
+    for source, out in ((url, "far.csv"), (oscillatory_run, "near.csv")):
+        assert cdmisfa("export", source, "-o", tmp_path / out).code == 0
+    assert (tmp_path / "far.csv").read_bytes() == (tmp_path / "near.csv").read_bytes()
 
 
 def test_camera_logs_on_a_server_are_converted(

@@ -52,14 +52,22 @@ def write_video(
     return written
 
 
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two videos of 120 frames; not to be changed."""
+    folder = tmp_path_factory.mktemp("videos")
+    paths = [folder / "left.mp4", folder / "right.mp4"]
+    for seed, path in enumerate(paths):
+        write_video(path, pictures(120, seed), codec="libx264", pixels="yuv420p")
+    return paths
+
+
 class TestVideo(SourceContract):
     ends = True
 
     @pytest.fixture(autouse=True)
-    def _video(self, tmp_path: Path) -> None:
-        self.paths = [tmp_path / "left.mp4", tmp_path / "right.mp4"]
-        for seed, path in enumerate(self.paths):
-            write_video(path, pictures(120, seed), codec="libx264", pixels="yuv420p")
+    def _videos(self, videos: list[Path]) -> None:
+        self.paths = videos
 
     def open(self) -> FrameSource:
         return ForeignSource(self.paths, size=SIZE)
@@ -140,24 +148,35 @@ def test_what_is_no_video_is_one_line(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
 
 
 def test_damage_within_a_video_is_found_where_ffmpeg_sees_it(tmp_path: Path) -> None:
-    path = tmp_path / "a.mkv"
+    path = tmp_path / "a.mp4"
     write_video(path, pictures(60), codec="libx264", pixels="yuv420p")
     data = bytearray(path.read_bytes())
     random = np.random.default_rng(2)
-    for at in random.integers(1000, len(data) - 500, 40):
+    for at in random.integers(data.index(b"mdat") + 1500, data.index(b"moov") - 100, 40):
         data[at] ^= 255
     path.write_bytes(bytes(data))
-    with pytest.raises(LogDamagedError, match=r"a\.mkv: (at|FFmpeg)"):
+    with pytest.raises(LogDamagedError, match=r"a\.mp4: (at|FFmpeg)"):
         ForeignSource(path, size=SIZE).take(0, 60)
 
 
-def test_videos_are_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    for seed, name in enumerate(("left", "right")):
-        write_video(tmp_path / f"{name}.mp4", pictures(60, seed), codec="libx264", pixels="yuv420p")
-    words = (tmp_path / "left.mp4", tmp_path / "right.mp4", "--size", "16x12")
+def test_a_video_that_lost_its_end_says_so(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mkv", pictures(100))
+    data = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "a.mkv").write_bytes(data[: len(data) // 3])
+    source = ForeignSource(tmp_path / "a.mkv", size=SIZE)
+    assert source.spec.length is not None
+    assert source.spec.length < 50
+    assert any("it states 4 s, its last frame is at" in said for said in source.warnings)
+    source.close()
+
+
+def test_videos_are_learned_from_and_converted(
+    cdmisfa: Cdmisfa, videos: list[Path], tmp_path: Path
+) -> None:
+    words = (*videos, "--size", "16x12")
     learned = cdmisfa("learn", *words, *QUICK)
     assert learned.code == 0, learned.err
-    assert "left: 60 images" in learned.err
+    assert "left: 120 images" in learned.err
     source = learned.json["source"]
     assert "luma" in source["recipe"]
     assert [len(file["sha256"]) for file in source["files"]] == [64, 64]
