@@ -156,6 +156,9 @@ class RunLayout:
 
     def _gate(self) -> rrb.Container:
         verdict = self._lanes("Verdict", "/lanes/1_stream", "/lanes/2_learning", "/lanes/3_gate")
+        threshold = self._clusters_below()
+        if threshold is not None:
+            return rrb.Vertical(verdict, *self._clusters(threshold), name="Gate")
         bands = [
             self._lines(
                 f"Slowness in the block by module {i}: known within the band of 2 SD",
@@ -167,8 +170,31 @@ class RunLayout:
             "Slowness in the block by the abstraction, its mean and SD",
             ["/signals/eta_inst", "/signals/gate_mean", "/signals/gate_sd"],
         )
-        share = self._lines("Share of novel blocks", ["/signals/share"], (0.0, 1.05))
-        return rrb.Vertical(verdict, *bands, own, share, name="Gate")
+        return rrb.Vertical(verdict, *bands, own, self._share(), name="Gate")
+
+    def _clusters_below(self) -> float | None:
+        """The clustering error below which CD-MISFA 1.0 saves and knows; None of 2.0."""
+        value = self._outline.header.setting("learner", "roc_error")
+        is_old = self._outline.header.setting("learner", "algorithm") == "1.0"
+        return float(value) if is_old and isinstance(value, int | float) else None
+
+    def _clusters(self, threshold: float) -> list[rrb.View]:
+        """The gate of CD-MISFA 1.0: clusters instead of bands of slowness."""
+        modules = [
+            self._lines(
+                f"Clustering error by module {i}: known below {threshold:g}",
+                [f"/signals/roc_error_frozen/{i}"],
+            )
+            for i in range(1, min(self._outline.modules, MOST_MODULES) + 1)
+        ]
+        own = self._lines(
+            f"Clustering error of the block, and its mean: saved below {threshold:g}",
+            ["/signals/roc_error_inst", "/signals/roc_error"],
+        )
+        return [*modules, own, self._share()]
+
+    def _share(self) -> rrb.View:
+        return self._lines("Share of novel blocks", ["/signals/share"], (0.0, 1.05))
 
     def _decision(self) -> rrb.Container:
         rewards = ["curiosity", "expert", "reward"]

@@ -29,7 +29,7 @@ from replay.stretch import Stretch
 AXES = {"S": "stream", "A": "action", "J": "output"}
 """Names of tensors' dimensions; the second S of a tensor is the next stream."""
 
-BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2}
+BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
 """Colours of signals that are drawn beside another one."""
 
 SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")

@@ -15,7 +15,8 @@ def summary_text(outline: Outline, name: str, ended: str = "") -> str:
         name: of the run.
         ended: why it ended, where that is known.
     """
-    spec = outline.header.spec
+    header = outline.header
+    spec = header.spec
     lines = [f"## {name}", _opening(outline), ""]
     if outline.saved:
         lines += [
@@ -35,11 +36,14 @@ def summary_text(outline: Outline, name: str, ended: str = "") -> str:
     for s in outline.streams(16):
         share = outline.visits[s] / max(outline.frames, 1)
         lines.append(f"| {spec.streams[s]} | {outline.visits[s]} frames, {share:.0%} |")
-    settings = [("seed", outline.header.manifest.get("seed"))]
-    settings += [(key, outline.header.setting("learner", key)) for key in ("nu", "tau", "sigma")]
+    settings = [("seed", header.manifest.get("seed"))]
+    settings += [(key, header.setting("learner", key)) for key in ("nu", "tau", "sigma")]
     settings += [("delta", outline.delta)]
     said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
-    return "\n".join([*lines, "", said, ""])
+    lines += ["", said, ""]
+    if header.missing:
+        lines.append(f"Signals of version {header.schema}, without {', '.join(header.missing)}.")
+    return "\n".join(lines)
 
 
 def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:

@@ -8,17 +8,20 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from run_data import VECTOR, write_run
 
 from cdmisfa.blocks import Block
 from cdmisfa.errors import LogDamagedError, UsageError
 from cdmisfa.experiments.checkpoint import refuse_difference
 from cdmisfa.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
-from replay import signals_message
+from replay import layout, signals_message
 from replay.compare import compare
+from replay.outline import read_outline
 from replay.runlog import RunWriter, read_header, read_phi, read_signals, read_truth, read_watched
 
 OLD = Path(__file__).parent / "data" / "signals_v1"
@@ -140,3 +143,27 @@ def test_sizes_without_values_allocate_nothing() -> None:
     hostile = replace(records[0], **fields, roc_error_frozen=np.empty(0))
     with pytest.raises(LogDamagedError, match="sizes without values"):
         signals_message.decode(signals_message.encode(hostile), version=1)
+
+
+def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Titles in the gate's tab of a run's layout."""
+    tabs: list[Any] = []
+    monkeypatch.setattr(layout, "blueprint", lambda *found, **_: tabs.extend(found))
+    layout.RunLayout(read_outline(run)).blueprint()
+    (gate,) = [tab for tab in tabs if tab.name == "Gate"]
+    return [view.name for view in gate.contents]
+
+
+def test_the_gate_of_1_0_shows_its_clusters(monkeypatch) -> None:
+    assert gate_of(OLD, monkeypatch)[1:] == [
+        "Clustering error by module 1: known below 3",
+        "Clustering error of the block, and its mean: saved below 3",
+        "Share of novel blocks",
+    ]
+
+
+def test_the_gate_of_2_0_shows_its_bands(monkeypatch, tmp_path) -> None:
+    write_run(tmp_path / "run.mcap", VECTOR, 12)
+    shown = gate_of(tmp_path, monkeypatch)
+    assert any("within the band of 2 SD" in name for name in shown)
+    assert not any("Clustering" in name for name in shown)
