@@ -41,6 +41,9 @@ def test_learn(tmp_path: Path) -> None:
 def test_recorder(tmp_path: Path) -> None:
     assert recorder.rendering("oscillatory", 4)() == 12
     assert recorder.recording("oscillatory", 4, tmp_path, 1)() == 12
+    frame, start = recorder.steady_and_start("oscillatory", 500, tmp_path, 1, 1)
+    assert 0 < frame < 1e6
+    assert start > -1
 
 
 def test_scaling() -> None:
