@@ -86,7 +86,7 @@ def variants() -> Iterator[tuple[str, frozenset[str]]]:
     """Every kind of content with every combination of features that applies to it."""
     for kind in KINDS:
         has = {
-            "none": ("sum", "pad"),
+            "none": ("st", "sum", "pad"),
             "attachment": ("ax", "st", "sum", "pad"),
             "metadata": ("mdx", "st", "sum", "pad"),
         }.get(kind, ("ch", "chx", "mx", "rch", "rsh", "st", "sum", "pad"))
