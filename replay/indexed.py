@@ -96,7 +96,7 @@ def confirm(file: RandomFile, segment: Segment) -> None:
     Raises:
         MalformedRecord: they differ.
     """
-    head = file.peek(segment.offset, segment.data_offset - segment.offset)
+    head = file.read(segment.offset, segment.data_offset - segment.offset)
     opcode, length = RECORD_HEADER.unpack_from(head)
     if opcode != Opcode.CHUNK:
         raise MalformedRecord("the summary points to something that is no chunk")

@@ -25,6 +25,7 @@ CACHE_BYTES: Final = 16 * 1024 * 1024
 """Bytes of an object that are kept; the last part always is."""
 _LEAST: Final = 16 * 1024
 _MOST: Final = 1024 * 1024
+_AT_ONCE: Final = 16
 _TRIES: Final = 3
 _CONNECT_SECONDS: Final = 20.0
 _READ_SECONDS: Final = 60.0
@@ -83,9 +84,9 @@ class RemoteStore:
         self._held = 0
         self._spans: list[tuple[int, int]] = []
         self._starts: list[int] = []
-        self._ahead: tuple[int, int, Future[Part]] | None = None
+        self._ahead: dict[int, tuple[int, Future[Part]]] = {}
         self._reach, self._follows = _LEAST, -1
-        self._stride, self._awaited = EDGE_BYTES, -1
+        self._stride = EDGE_BYTES
         self.size, self.tag = 0, ""
         first = self._wait(self._start(0, EDGE_BYTES), 0, EDGE_BYTES)
         self.size, self.tag = first.total, first.tag
@@ -102,12 +103,18 @@ class RemoteStore:
             return b""
         found = self._cached(offset, count)
         if found is None:
-            start, stop = self._choose(offset, offset + count)
-            found = self._fetch(start, stop)[offset - start : offset - start + count]
+            number = bisect.bisect_right(self._starts, offset) - 1
+            if number >= 0 and offset + count <= self._spans[number][1]:
+                start, data = self._expected(number)
+            else:
+                start, data = self._unexpected(offset, offset + count)
+            self._keep(start, data)
+            found = data[offset - start : offset - start + count]
         return found
 
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:
         """Hear which spans, from and up to before, will be read, one after the other."""
+        self._drop_ahead()
         self._spans = sorted(spans)
         self._starts = [start for start, _ in self._spans]
 
@@ -117,63 +124,60 @@ class RemoteStore:
 
     def close(self) -> None:
         """Forget what was read; harmless when called twice."""
-        if self._ahead is not None:
-            self._ahead[2].cancel()
-            self._ahead = None
+        self._drop_ahead()
         self._parts.clear()
         self._begins.clear()
         self._held = 0
 
-    def _choose(self, start: int, stop: int) -> tuple[int, int]:
-        """What to fetch for a read: the chunks that are expected, or somewhat more."""
-        number = bisect.bisect_right(self._starts, start) - 1
-        if number >= 0 and stop <= self._spans[number][1]:
-            return self._bundle(number)
-        if 0 <= start - self._follows <= self._reach:
-            self._reach = min(2 * self._reach, _MOST)
-        else:
-            self._reach = _LEAST
+    def _unexpected(self, start: int, stop: int) -> tuple[int, bytes]:
+        """Fetch somewhat more than was asked for; more and more while reads go forward."""
+        forward = 0 <= start - self._follows <= self._reach
+        self._reach = min(2 * self._reach, _MOST) if forward else _LEAST
         if self.size - start <= EDGE_BYTES:
             start = max(self.size - EDGE_BYTES, 0)
-        stop = min(max(stop, start + self._reach), self.size)
-        self._follows = stop
-        return start, stop
+        stop = self._follows = min(max(stop, start + self._reach), self.size)
+        return start, self._checked(self._wait(self._start(start, stop), start, stop), start, stop)
+
+    def _expected(self, number: int) -> tuple[int, bytes]:
+        """Fetch a span that was expected, with those after it, and ask for what comes then."""
+        place = self._spans[number][0]
+        start = next((a for a, (b, _) in self._ahead.items() if a <= place < b), None)
+        if start is None:
+            self._drop_ahead()
+            self._stride = EDGE_BYTES
+            start, stop = self._bundle(number)
+            future = self._start(start, stop)
+        else:
+            self._stride = min(2 * self._stride, _MOST)
+            stop, future = self._ahead.pop(start)
+        self._ask_ahead(stop)
+        return start, self._checked(self._wait(future, start, stop), start, stop)
 
     def _bundle(self, number: int) -> tuple[int, int]:
-        """Expected spans from one on that touch; more and more while they come in order."""
+        """Expected spans from one on that touch, up to a stride of bytes."""
         start, stop = self._spans[number]
-        in_order = start == self._awaited
-        self._stride = min(2 * self._stride, _MOST) if in_order else EDGE_BYTES
         while number + 1 < len(self._spans) and stop - start < self._stride:
             number += 1
             if self._spans[number][0] != stop:
                 break
             stop = self._spans[number][1]
-        following = bisect.bisect_left(self._starts, stop)
-        self._awaited = self._starts[following] if following < len(self._starts) else -1
         return start, stop
 
-    def _fetch(self, start: int, stop: int) -> bytes:
-        ahead, self._ahead = self._ahead, None
-        if ahead is not None and (ahead[0] > start or stop > ahead[1]):
-            ahead[2].cancel()
-            ahead = None
-        if ahead is None:
-            data = self._checked(self._wait(self._start(start, stop), start, stop), start, stop)
-        else:
-            data = self._checked(self._wait(ahead[2], *ahead[:2]), *ahead[:2])[start - ahead[0] :]
-        self._keep(start, data)
-        self._read_ahead(start, stop)
-        return data
-
-    def _read_ahead(self, start: int, stop: int) -> None:
-        """Ask for the expected spans after those that were just fetched."""
+    def _ask_ahead(self, stop: int) -> None:
+        """Ask for a stride of what is expected after a place, without waiting for it."""
+        held = sum(end - begin for begin, (end, _) in self._ahead.items())
+        stop = max([stop, *(end for end, _ in self._ahead.values())])
         number = bisect.bisect_left(self._starts, stop)
-        planned = bisect.bisect_right(self._starts, start) - 1
-        if number < len(self._spans) and planned >= 0 and start < self._spans[planned][1]:
+        while number < len(self._spans) and held < self._stride and len(self._ahead) < _AT_ONCE:
             begin, end = self._bundle(number)
-            if begin not in self._parts:
-                self._ahead = begin, end, self._start(begin, end)
+            self._ahead[begin] = end, self._start(begin, end)
+            held += end - begin
+            number = bisect.bisect_left(self._starts, end)
+
+    def _drop_ahead(self) -> None:
+        for _, future in self._ahead.values():
+            future.cancel()
+        self._ahead.clear()
 
     def _start(self, start: int, stop: int) -> Future[Part]:
         return asyncio.run_coroutine_threadsafe(self._remote.part(start, stop), self._remote.loop)
@@ -216,16 +220,22 @@ class RemoteStore:
         return data[offset - start : offset - start + count]
 
     def _keep(self, start: int, data: bytes) -> None:
-        if start in self._parts:
-            self._held -= len(self._parts.pop(start))
-        else:
-            bisect.insort(self._begins, start)
+        low = bisect.bisect_left(self._begins, start)
+        high = bisect.bisect_left(self._begins, start + len(data))
+        for inner in self._begins[low:high]:
+            if inner + len(self._parts[inner]) <= start + len(data):
+                self._drop(inner)
+        if start in self._parts:  # a longer one
+            return
+        bisect.insort(self._begins, start)
         self._parts[start] = data
         self._held += len(data)
         while self._held > CACHE_BYTES and len(self._parts) > 1:
-            old, gone = self._parts.popitem(last=False)
-            self._begins.remove(old)
-            self._held -= len(gone)
+            self._drop(next(iter(self._parts)))
+
+    def _drop(self, start: int) -> None:
+        self._held -= len(self._parts.pop(start))
+        del self._begins[bisect.bisect_left(self._begins, start)]
 
 
 class _HttpRemote:
