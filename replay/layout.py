@@ -67,6 +67,18 @@ def lines(
     )
 
 
+def gaze(name: str) -> rrb.Spatial3DView:
+    """The head's poses, in the robot's root frame, seen from above and behind."""
+    return rrb.Spatial3DView(
+        origin="/head/poses",
+        name=name,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            position=(0.45, 0.0, 0.75), look_target=(-0.12, 0.0, 0.24), eye_up=(0.0, 0.0, 1.0)
+        ),
+    )
+
+
 class RunLayout:
     """The layout of a run; it adapts to its streams and modules.
 
@@ -255,8 +267,10 @@ class RunLayout:
             pictures = [rrb.Spatial2DView(origin=place, name=name) for name, place in places]
             watched = self._lanes("What it watches", "/lanes/1_stream")
             grid = rrb.Grid(*pictures, grid_columns=min(len(pictures), 3))
-            head = [self._lines("Where the head is turned", ["/head/yaw"])] if self._head else []
-            shares = [3, 1, *(1 for _ in head)]
+            turned = self._lines("Where the head is turned", ["/head/yaw"])
+            looks = rrb.Horizontal(turned, gaze("Where it looks"), column_shares=[2, 1])
+            head = [looks] if self._head else []
+            shares = [3, 1, *(2 for _ in head)]
             return rrb.Vertical(grid, watched, *head, row_shares=shares, name="All views")
         curves = [self._lines(name, [place]) for name, place in places]
         return rrb.Vertical(*curves, name="All views")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,23 @@ from foxglove_schemas_protobuf import PoseInFrame_pb2
 from google.protobuf import message
 
 from cdmisfa.errors import LogDamagedError, UsageError
-from recorder.messages import METADATA, POSE_TOPIC
+from recorder.messages import METADATA, POSE_TOPIC, HeadPose
 from replay.columns import Clock, Column, ImageColumn
 from replay.config import ViewConfig
 from replay.files import log_files
 from replay.labels import label, part
-from replay.layout import blueprint, lines, whole
+from replay.layout import blueprint, gaze, lines, whole
 from replay.outline import Outline
 from replay.palette import colour, packed_all
 from replay.reader import LogReader
 from replay.recorded import RecordedSource
-from replay.runlog import read_signals
+from replay.stretch import read_columns
+
+POSES = "head/poses"
+WATCHING = "head/poses/watching"
+
+REACH = 0.25
+"""Length of the arrow along a gaze, in metres."""
 
 BLOCK = 500
 """Frames that are read at once."""
@@ -58,7 +65,11 @@ def write_recording(recording: rr.RecordingStream, path: Path, config: ViewConfi
     }
     recording.send_property("recording", rr.AnyValues(**properties))
     images = len(spec.frame_shape) == 2
-    recording.send_blueprint(_layout(spec.streams, views, bool(spec.truth), images, first + count))
+    poses = head_poses(path)
+    if head := set(poses) >= set(spec.streams):
+        write_heads(recording, spec.streams, poses)
+    panels = Panels(truth=bool(spec.truth), images=images, head=head)
+    recording.send_blueprint(_layout(spec.streams, views, panels, first + count))
 
 
 def write_views(
@@ -110,7 +121,8 @@ def write_unwatched(
 ) -> bool:
     """Write all views of the recording that a run learned from, also while not watched.
 
-    Where the recording has head poses, `/head/yaw` says where the head was turned.
+    Where the recording has head poses, `/head/yaw` says where the head was turned, and
+    `/head/poses` shows it.
 
     Returns:
         Whether there is a head.
@@ -130,22 +142,62 @@ def write_unwatched(
         write_views(recording, source, outline.frames, config, max(outline.tau, 1))
     finally:
         source.close()
-    yaws = head_yaws(path)
+    poses = head_poses(path)
     names = outline.names()
-    if set(yaws) < set(names):
+    if set(poses) < set(names):
         return False
+    write_heads(recording, names, poses)
     name = rr.SeriesLines(names=["head turned to the left [degrees]"])
     recording.log("head/yaw", name, static=True)
-    column = Column(recording, Clock(outline.header.spec), "head/yaw", config.rows)
-    for signals in read_signals(log):
-        yaw = np.array([[yaws[names[signals.stream]]]])
-        column.add(np.array([signals.t]), signals.iteration, yaw)
+    clock = Clock(outline.header.spec)
+    column = Column(recording, clock, "head/yaw", config.rows)
+    watching = -1
+    for columns in read_columns(log, outline.header):
+        yaws = np.array([yaw_of(poses[name]) for name in names])[columns["stream"]]
+        column.add(columns.frames, columns.iterations, yaws[:, None])
+        streams = columns["stream"].astype(np.int64)
+        turns = np.flatnonzero(np.diff(streams, prepend=watching))
+        times = clock.columns(columns.frames[turns], columns.iterations[turns])
+        watched = [poses[names[s]] for s in streams[turns]]
+        if watched:
+            turned = rr.Transform3D.columns(
+                translation=[pose.position for pose in watched],
+                quaternion=[pose.quaternion for pose in watched],
+            )
+            recording.send_columns(WATCHING, times, turned)
+        watching = int(streams[-1])
     column.flush()
+    white = packed_all([(255, 255, 255)])
+    arrow = rr.Arrows3D(vectors=[[-1.4 * REACH, 0, 0]], radii=[0.003], colors=white)
+    recording.log(WATCHING, arrow, static=True)
     return True
 
 
-def head_yaws(path: Path) -> dict[str, float]:
-    """How far the head is turned in each view of a recording, degrees to the left.
+def write_heads(
+    recording: rr.RecordingStream, names: Sequence[str], poses: Mapping[str, HeadPose]
+) -> None:
+    """Show in 3D where the head looks for each view: an arrow along its gaze.
+
+    Poses are in the robot's root frame: x to the back, y to the right, z up.
+    """
+    recording.log(POSES, rr.ViewCoordinates.BRU, static=True)
+    for s, name in enumerate(names):
+        place, pose = f"{POSES}/{part(names, s)}", poses[name]
+        turn = rr.Quaternion(xyzw=pose.quaternion)
+        recording.log(
+            place, rr.Transform3D(translation=pose.position, quaternion=turn), static=True
+        )
+        arrow = rr.Arrows3D(
+            vectors=[[-REACH, 0, 0]],
+            radii=[0.005],
+            colors=packed_all([colour(s)]),
+            labels=[label(name)],
+        )
+        recording.log(place, arrow, static=True)
+
+
+def head_poses(path: Path) -> dict[str, HeadPose]:
+    """Where the head is in each view of a recording.
 
     Returns:
         By the view's name; without the views that do not say it.
@@ -154,7 +206,7 @@ def head_yaws(path: Path) -> dict[str, float]:
         UsageError: there is no such recording.
         LogDamagedError: it cannot be read.
     """
-    found: dict[str, float] = {}
+    found: dict[str, HeadPose] = {}
     for file in log_files(path):
         with LogReader(file) as reader:
             facts = next((r.values for r in reader.metadata if r.name == METADATA), {})
@@ -162,11 +214,20 @@ def head_yaws(path: Path) -> dict[str, float]:
         if entry is None or "view" not in facts:
             continue
         try:
-            turn = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose.orientation
+            pose = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose
         except message.DecodeError as error:
             raise LogDamagedError(f"{file} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
-        found[facts["view"]] = math.degrees(2 * math.atan2(turn.z, turn.w))
+        place, turn = pose.position, pose.orientation
+        found[facts["view"]] = HeadPose(
+            (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w)
+        )
     return found
+
+
+def yaw_of(pose: HeadPose) -> float:
+    """How far the head is turned, degrees to the left."""
+    _, _, z, w = pose.quaternion
+    return math.degrees(2 * math.atan2(z, w))
 
 
 def _hashes(described: Any) -> list[str]:
@@ -191,16 +252,28 @@ def _column(
     return Column(recording, clock, path, config.rows)
 
 
-def _layout(
-    names: tuple[str, ...], views: list[str], truth: bool, images: bool, frames: int
-) -> rrb.Blueprint:
+@dataclass(frozen=True, slots=True)
+class Panels:
+    """What there is to be shown of a recording beside its views."""
+
+    truth: bool
+    images: bool
+    head: bool
+
+
+def _layout(names: tuple[str, ...], views: list[str], panels: Panels, frames: int) -> rrb.Blueprint:
     axis = whole(frames)
     shown = [
         rrb.Spatial2DView(origin=f"/{view}", name=label(name))
-        if images
+        if panels.images
         else lines(label(name), [f"/{view}"], axis)
         for name, view in zip(names, views, strict=True)
     ]
-    known = [lines("What the world knows", ["/world/truth"], axis)] if truth else []
-    grid = rrb.Grid(*shown, grid_columns=min(len(shown), 3)) if images else rrb.Vertical(*shown)
-    return blueprint(rrb.Vertical(grid, *known, name="Views"), name="Recording")
+    known = [lines("What the world knows", ["/world/truth"], axis)] if panels.truth else []
+    head = [gaze("Where the head looks")] if panels.head else []
+    below = [rrb.Horizontal(*known, *head, column_shares=[3, 1][: len([*known, *head])])]
+    columns = min(len(shown), 3)
+    grid = rrb.Grid(*shown, grid_columns=columns) if panels.images else rrb.Vertical(*shown)
+    return blueprint(
+        rrb.Vertical(grid, *(below if known or head else []), name="Views"), name="Recording"
+    )

@@ -15,7 +15,7 @@ from cdmisfa.experiments.run import learn
 from recorder.config import SceneConfig
 from recorder.recording import record
 from replay.recorded import RecordedSource
-from replay.recording_view import head_yaws
+from replay.recording_view import head_poses, yaw_of
 from replay.runlog import read_signals
 from replay.view import build_view
 
@@ -72,19 +72,26 @@ def test_a_recording_that_was_moved_is_still_the_same(made, tmp_path, cdmisfa):
 def test_the_head_turns_to_what_is_watched(tmp_path):
     """In the sample recording the head looks at the left, the centre and the right in turn."""
     sample = Path(__file__).parents[1] / "sample_logs" / "icub"
-    yaws = head_yaws(sample)
+    yaws = {name: yaw_of(pose) for name, pose in head_poses(sample).items()}
     assert yaws["left"] > yaws["center"] > yaws["right"]
     source = RecordedSource(sample)
     config = LearnerConfig(expansion="none", components=5)
     learn(source, config, tmp_path / "run", max_iterations=6, rerun=False)
     source.close()
     build_view(tmp_path / "run", tmp_path / "v.rrd", all_views=sample)
-    shown = {}
+    shown, gazes = {}, {}
     for chunk in RrdReader(str(tmp_path / "v.rrd")).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/head/poses/watching" and not chunk.is_static:
+            turns = batch.column("Transform3D:quaternion").flatten().to_pylist()
+            gazes |= dict(zip(batch.column("iteration").to_pylist(), turns, strict=True))
         if chunk.entity_path == "/head/yaw" and not chunk.is_static:
-            batch = chunk.to_record_batch()
             values = batch.column("Scalars:scalars").flatten().to_pylist()
             shown |= dict(zip(batch.column("iteration").to_pylist(), values, strict=True))
     names = ("left", "center", "right")
     expected = {s.iteration: yaws[names[s.stream]] for s in read_signals(tmp_path / "run")}
     assert shown == expected
+    for iteration, yaw in expected.items():
+        *_, z, w = gazes[max(k for k in gazes if k <= iteration)]
+        assert np.degrees(2 * np.arctan2(z, w)) == pytest.approx(yaw, abs=1e-4)
+    assert set(gazes) <= {0} | {k for k in expected if expected[k] != expected.get(k - 1)}

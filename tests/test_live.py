@@ -14,9 +14,10 @@ from run_data import IMAGE, VECTOR, run_of
 
 from cdmisfa.config import LearnerConfig
 from cdmisfa.errors import CdmisfaError
+from cdmisfa.experiments import run
 from cdmisfa.experiments.run import learn
 from cdmisfa.streams import OscillatorySource
-from replay import live, viewer
+from replay import live, scan, viewer
 from replay.live import LiveView
 from replay.runlog import read_signals
 
@@ -92,21 +93,32 @@ def test_a_run_that_goes_on_shows_what_went_before(tmp_path, monkeypatch):
         if self.path == "signals/epsilon":
             sent.append(np.array(values).reshape(-1))
 
-    run = tmp_path / "run"
-    learn(OscillatorySource(), config, run, max_iterations=30, rerun=False)
+    folder = tmp_path / "run"
+    learn(OscillatorySource(), config, folder, max_iterations=30, rerun=False)
     monkeypatch.setattr("replay.columns.Column.send", keep)
     learn(
         OscillatorySource(),
         config,
-        run,
+        folder,
         max_iterations=50,
         rerun=False,
         resume=True,
         live=True,
     )
-    expected = [s.epsilon for s in read_signals(run)]
+    expected = [s.epsilon for s in read_signals(folder)]
     assert len(expected) == 50
     np.testing.assert_array_equal(np.concatenate(sent), expected)
+
+
+def test_the_wait_for_compiling_the_reader_is_said(monkeypatch, capsys):
+    cold = [scan.scan]
+    monkeypatch.setattr(run, "needs_compiling", lambda function: function in cold)
+    monkeypatch.setattr(run.sys.stderr, "isatty", lambda: True, raising=False)
+    run._say_if_compiling()
+    assert "compiling" in capsys.readouterr().err
+    cold.clear()
+    run._say_if_compiling()
+    assert capsys.readouterr().err == ""
 
 
 def test_rerun_switched_off_is_said(monkeypatch):

@@ -24,11 +24,13 @@ from cdmisfa.modules import Module
 from cdmisfa.signals import SIGNALS
 from recorder.config import SceneConfig
 from recorder.recording import record
-from replay import layout, viewer
+from replay import layout, run_view, viewer
 from replay.columns import tensor_array
 from replay.config import ViewConfig
 from replay.modules import save_modules
+from replay.outline import read_outline
 from replay.runlog import read_signals
+from replay.summary import summary_text
 from replay.view import build_view
 
 ITERATIONS = 24
@@ -177,6 +179,45 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
     assert "/summary" in statics_of(folder / "run.rrd")
     stay = scalars(rows[f"/decision/R_stay/2_{spec.streams[1]}"])[:, 0]
     np.testing.assert_array_equal(stay, [s.R[1, 0, 1] for s in records])
+
+
+def test_the_share_of_the_recent_blocks_is_there(shown, monkeypatch):
+    spec, records, _, folder = shown
+    monkeypatch.setattr(run_view, "RECENT", 5)
+    monkeypatch.setattr("replay.stretch.ITERATIONS", 4)
+    build_view(folder, folder / "short.rrd", every=20)
+    found = scalars(rows_of(folder / "short.rrd")["/decision/attention"])
+    streams = np.array([s.stream for s in records])
+    for k in range(len(records)):
+        recent = streams[max(0, k - 4) : k + 1]
+        share = np.bincount(recent, minlength=len(spec.streams)) / len(recent)
+        np.testing.assert_allclose(found[k], share)
+
+
+def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
+    written = write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS)
+    text = summary_text(read_outline(tmp_path), "run", "It ended: nothing was left.")
+    last = [s for s in written if s.module == written[-1].module]
+    assert f"Module {last[0].module} was not saved: " in text
+    assert f"of its {len(last)} blocks" in text
+    assert "It ended: nothing was left." in text
+
+
+def test_the_view_that_is_opened_has_no_name_to_be_left_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    given = []
+
+    def program(arguments, view):
+        assert list((tmp_path / "temporary").iterdir()) == []
+        given.append((arguments, view.read(4)))
+
+    monkeypatch.setattr(viewer, "run_program", program)
+    monkeypatch.setattr(viewer, "has_display", lambda: True)
+    viewer.open_window(tmp_path)
+    viewer.serve(tmp_path)
+    assert [("-" in arguments, head) for arguments, head in given] == [(True, b"RRF2")] * 2
 
 
 def test_the_file_has_a_layout_and_properties(shown):

@@ -1,0 +1,137 @@
+"""Records read many at once are, bit for bit, those read one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from run_data import IMAGE, VECTOR, run_of, write_run
+
+from cdmisfa.errors import LogDamagedError
+from cdmisfa.signals import SIGNALS
+from replay import matrix_message, signals_message, stretch
+from replay.outline import read_outline
+from replay.records import MalformedRecord
+from replay.runlog import read_events, read_header, read_phi, read_truth, read_watched
+from replay.signal_columns import columns_of_messages, columns_of_records
+from replay.stretch import read_stretches
+from replay.view import build_view
+from replay.wire import alike, spans
+
+ITERATIONS = 30
+
+
+def records(outputs=1):
+    return [s for s, _ in run_of(VECTOR, ITERATIONS, outputs=outputs, saves=True)]
+
+
+def bits(value):
+    array = np.ascontiguousarray(value)
+    return array.dtype.kind, array.shape, array.tobytes()
+
+
+def same(columns, expected):
+    """Whether pieces of columns hold these records, every NaN and every empty array too."""
+    pieces = list(columns)
+    assert sum(map(len, pieces)) == len(expected)
+    at = 0
+    for piece in pieces:
+        for i in range(len(piece)):
+            for name, signal in SIGNALS.items():
+                value = np.asarray(getattr(expected[at + i], name), dtype=signal.dtype)
+                assert bits(piece[name][i]) == bits(value), name
+        at += len(piece)
+    return len(pieces)
+
+
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_messages_become_columns_bit_for_bit(outputs):
+    written = records(outputs)
+    messages = [signals_message.encode(s) for s in written]
+    calls = []
+
+    def decode(data):
+        calls.append(data)
+        return signals_message.decode(data)
+
+    assert same(columns_of_messages(messages, decode), written) == 3  # 0, 1 and 2 modules
+    assert len(calls) == 3  # one of each layout was decoded by itself
+    assert same(columns_of_records(written), written) == 3
+
+
+def test_messages_laid_out_otherwise_are_decoded_one_by_one():
+    """Protobuf allows fields in any order, and leaves out numbers that are zero."""
+    written = records()[:8]
+    other = []
+    for i, signals in enumerate(written):
+        message = signals_message._CLASS.FromString(signals_message.encode(signals))
+        data = message.SerializeToString()
+        other.append(data if i % 2 else signals_message.encode(signals))
+    same(columns_of_messages(other, signals_message.decode), written)
+    turned = [signals_message.encode(s) for s in written]
+    first = spans(turned[0])[1]
+    turned[1] = turned[1][first[1] :] + turned[1][: first[1]]  # of the same size
+    assert len(turned[1]) == len(turned[0])
+    same(columns_of_messages(turned, signals_message.decode), written)
+
+
+def test_a_message_is_walked_over_and_damage_is_seen():
+    data = matrix_message.encode(7, np.ones((2, 3)))
+    assert spans(data) == {1: (1, 9), 2: (10, 14), 3: (20, 68)}
+    for broken in (data[:-1], b"\x08", b"\xff" * 12, b"\x0b\x00", b"\x08\x01\x08\x01"):
+        with pytest.raises(MalformedRecord):
+            spans(broken)
+    assert alike([data, data[:-1]], [(1, 9)]) is None
+    assert alike([data, matrix_message.encode(8, np.ones((2, 3)))], [(1, 9)]) is not None
+    assert alike([data, matrix_message.encode(8, np.ones((2, 3)))], [(20, 68)]) is None
+
+
+@pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
+def test_one_pass_reads_what_reading_each_topic_gives(tmp_path, monkeypatch, spec):
+    monkeypatch.setattr(stretch, "ITERATIONS", 7)
+    log = tmp_path / "run.mcap"
+    written = write_run(log, spec, ITERATIONS, phi_every=10)
+    found = list(read_stretches(log, read_header(log)))
+    assert [sum(map(len, s.signals)) for s in found] == [7, 7, 7, 7, 2]
+    same((columns for s in found for columns in s.signals), written)
+    for topic, read in (("watched", read_watched), ("truth", read_truth)):
+        rows = [pair for s in found for pair in getattr(s, topic)]
+        frames = np.concatenate([t + np.arange(len(v)) for t, v in read(log)])
+        np.testing.assert_array_equal(np.concatenate([t for t, _ in rows]), frames)
+        values = np.concatenate([v for _, v in read(log)])
+        np.testing.assert_array_equal(np.concatenate([v for _, v in rows]), values)
+    assert [t for s in found for t, _ in s.phi] == [t for t, _ in read_phi(log)]
+    assert [e for s in found for e in s.events] == list(read_events(log))
+    some = read_stretches(log, read_header(log), every=30)
+    times = [t for s in some for frames, _ in s.watched for t in frames.tolist()]
+    assert times == list(range(0, ITERATIONS * 40, 30 if spec is IMAGE else 1))
+
+
+def test_a_record_about_another_stream_is_damage(tmp_path):
+    spec = dataclasses.replace(VECTOR, streams=("x1", "x2"))
+    path = tmp_path / "run.mcap"
+    write_run(path, VECTOR, 5)
+    header = dataclasses.replace(read_header(path), spec=spec)
+    with pytest.raises(LogDamagedError, match="other streams"):
+        list(read_stretches(path, header))
+
+
+def test_an_outline_sums_the_records_up(tmp_path):
+    written = write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS, saves=True)
+    outline = read_outline(tmp_path)
+    assert outline.iterations == ITERATIONS
+    assert [s.iteration for s in outline.saved] == [s.iteration for s in written if s.saved]
+    phase = [s for s in written if s.module == written[-1].module]
+    assert (outline.last.blocks, outline.last.novel) == (len(phase), sum(s.novel for s in phase))
+    expected = np.bincount([s.stream for s in phase], minlength=3)
+    np.testing.assert_array_equal(outline.last.visits, expected)
+    np.testing.assert_array_equal(outline.lines["xi"], [s.xi for s in written])
+
+
+def test_a_torn_log_that_says_it_is_whole_is_refused(tmp_path):
+    path = tmp_path / "run.mcap"
+    write_run(path, VECTOR, 5)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(LogDamagedError):
+        build_view(tmp_path, tmp_path / "run.rrd")
