@@ -17,8 +17,8 @@ from replay.files import identity, log_files, sha256
 from replay.images import RECIPE, SCHEMAS, Decoder, compressed_gray, image_decoder, shrink
 from replay.reader import LogReader
 from replay.records import Bytes, Channel, MalformedRecord
+from replay.segments import Segment
 from replay.store import Location, Url, location
-from replay.structure import Segment
 
 CACHE_BYTES: Final = 1024 * 1024
 PICTURES: Final = (".jpeg", ".jpg", ".png")

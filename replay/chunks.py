@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from replay.reader import LogReader
 from replay.records import MAX_CHUNK, Bytes, MalformedRecord, crc32, decompress
-from replay.structure import Segment
+from replay.segments import Segment
 
 _KEPT: Final = 2
 _WINDOW: Final = MAX_CHUNK // 2

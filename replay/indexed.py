@@ -21,8 +21,8 @@ from replay.records import (
     Statistics,
     chunk_header,
 )
+from replay.segments import IndexPart, Segment
 from replay.store import RandomFile
-from replay.structure import IndexPart, Segment
 
 _FIXED = RECORD_HEADER.size + 40
 """Bytes of a chunk before its records, without the name of its compression."""

@@ -19,9 +19,9 @@ from replay.reader import Crc, LogReader
 from replay.records import MalformedRecord
 from replay.runlog import METADATA as RUN_METADATA
 from replay.runlog import RUN_FILE
+from replay.segments import Segment
 from replay.signals_message import missing
 from replay.store import Location, location
-from replay.structure import Segment
 
 SCHEMA: Final = 1
 """Rises whenever a key of what `describe` gives changes its meaning."""

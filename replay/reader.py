@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.errors import LogDamagedError
 from replay.indexed import confirm
+from replay.ordering import overlapping, within
 from replay.records import (
     INDEX_HEADER,
     MAX_CHUNK,
@@ -30,8 +31,9 @@ from replay.records import (
     decompress,
     decompress_prefix,
 )
+from replay.segments import Attachment, Metadata, Segment
 from replay.store import Location, RandomFile, Url, location
-from replay.structure import Attachment, Metadata, Segment, Structure
+from replay.structure import Structure
 from replay.tables import MessageTable, indexed_table, walked_table
 
 CACHE_BYTES: Final = 32 * 1024 * 1024
@@ -290,7 +292,7 @@ class LogReader:
             numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
             chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
         self.expect([s for _, s in chosen])
-        groups = _overlapping(chosen) if ordered else [[pair] for pair in chosen]
+        groups = overlapping(chosen) if ordered else [[pair] for pair in chosen]
         for group in groups:
             if len(group) > 1:
                 yield from self._merged(group, low, high)
@@ -300,7 +302,7 @@ class LogReader:
                 continue
             if ordered and (table.log_time[1:] < table.log_time[:-1]).any():
                 table = table.select(np.argsort(table.log_time, kind="stable"))
-            yield group[0][1], _within(table, low, high)
+            yield group[0][1], within(table, low, high)
 
     def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
         """Say which chunks will be read, one after the other, so that they come in time.
@@ -567,29 +569,4 @@ class LogReader:
             segment = group[int(piece_members[0])][1]
             table = self.table(segment)
             if table is not None:
-                yield segment, _within(table.select(piece_rows), low, high)
-
-
-def _within(table: MessageTable, low: int, high: int) -> MessageTable:
-    times = table.log_time
-    if not len(times) or (low <= int(times.min()) and int(times.max()) < high):
-        return table
-    keep = times >= np.uint64(min(low, 2**64 - 1))
-    if high < 2**64:
-        keep &= times < np.uint64(max(high, 0))
-    return table.select(keep)
-
-
-def _overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[tuple[int, Segment]]]:
-    """Group segments so that sorting within each group sorts all."""
-    ordered = sorted(segments, key=lambda pair: (pair[1].start, pair[0]))
-    group: list[tuple[int, Segment]] = []
-    end, last = -1, -1
-    for number, segment in ordered:
-        if group and (segment.start > end or (segment.start == end and number > last)):
-            yield sorted(group, key=lambda pair: pair[0])
-            group, end, last = [], -1, -1
-        group.append((number, segment))
-        end, last = max(end, segment.end), max(last, number)
-    if group:
-        yield sorted(group, key=lambda pair: pair[0])
+                yield segment, within(table.select(piece_rows), low, high)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cdmisfa.errors import LogDamagedError
 from replay.reader import LogReader
 from replay.records import Bytes, Channel, MalformedRecord
-from replay.structure import Segment
+from replay.segments import Segment
 from replay.tables import MessageTable
 from replay.viewfacts import ViewFacts
 
