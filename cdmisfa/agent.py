@@ -17,7 +17,7 @@ from cdmisfa.config import LearnerConfig
 from cdmisfa.errors import UsageError
 from cdmisfa.exploration import choose, decay, other_stream
 from cdmisfa.gate import NOVEL
-from cdmisfa.lspi import action_values, policy_iteration
+from cdmisfa.lspi import policy_iteration
 from cdmisfa.reward import add_reward, add_reward_locally, curiosity_reward, expert_reward
 from cdmisfa.roc import cluster
 from cdmisfa.signals import DENSE_STREAMS
@@ -333,19 +333,6 @@ def estimate_reward(agent: Agent, rules: Rules, stream: int, reward: float) -> N
         m["scale"] = m["rewards"]
     if m["scale"] > 0.0:
         policy_iteration(agent.stay_sum, agent.switch_sum, rules.gamma, agent.policy)
-
-
-@compiled
-def value_actions(agent: Agent, rules: Rules, Q: Float) -> None:
-    """Write the action values Q (S, 2) under the policy; 0 before the first reward.
-
-    The decision needs the policy only, so they are worked out where a record asks for them.
-    """
-    scale = agent.memory[0]["scale"]
-    if scale > 0.0:
-        action_values(agent.stay_sum, agent.switch_sum, scale, rules.gamma, agent.policy, Q)
-    else:
-        Q[:] = 0.0
 
 
 @compiled

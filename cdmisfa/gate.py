@@ -151,11 +151,12 @@ def recognise(
         roc_error_frozen: (M,) written: their clustering error; NaN but for CD-MISFA 1.0.
     """
     modules, n, outputs = y_frozen.shape
-    y = project(frozen.phi, frozen.offset, x)
-    for m in range(modules):
-        for t in range(n):
-            for j in range(outputs):
-                y_frozen[m, t, j] = y[t, m * outputs + j]
+    if modules > 0:
+        y = project(frozen.phi, frozen.offset, x)
+        for m in range(modules):
+            for t in range(n):
+                for j in range(outputs):
+                    y_frozen[m, t, j] = y[t, m * outputs + j]
     known_by = verdict(y_frozen, frozen.band_mean, frozen.band_sd, eta_inst)
     roc_error_frozen[:] = np.nan
     if frozen.counts.shape[1] > 0:

@@ -13,22 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agent import (
-    OUTCOME,
-    begin_abstraction,
-    has_gap,
-    mean_change,
-    new_agent,
-    rules,
-    think,
-    value_actions,
-)
+from cdmisfa.agent import OUTCOME, begin_abstraction, has_gap, mean_change, new_agent, rules, think
 from cdmisfa.blocks import Block, SourceSpec
 from cdmisfa.config import LearnerConfig
 from cdmisfa.errors import CdmisfaError, UsageError
 from cdmisfa.expansion import expanded_size, quadratic
 from cdmisfa.gate import Frozen, mean_output, recognise
 from cdmisfa.incsfa import IncSFA, project
+from cdmisfa.lspi import action_values
 from cdmisfa.modules import Module
 from cdmisfa.signals import BlockSignals
 
@@ -263,7 +255,8 @@ class CuriousLearner:
         agent = self.agent
         out: dict[str, Any] = dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))
         Q = np.empty((len(agent.policy), 2))
-        value_actions(agent, self.rules, Q)
+        scale = agent.memory["scale"][0]
+        action_values(agent.stay_sum, agent.switch_sum, scale, self.config.gamma, agent.policy, Q)
         return BlockSignals(
             iteration=self.iteration - 1,
             t=block.t,
@@ -280,7 +273,7 @@ class CuriousLearner:
             band_mean=self.frozen.band_mean.copy(),
             band_sd=self.frozen.band_sd.copy(),
             roc_error_frozen=roc_error_frozen,
-            R=agent.dense / (agent.memory["scale"][0] or 1.0),
+            R=agent.dense / (scale or 1.0),
             Q=Q,
             policy=agent.policy.copy(),
             **out,

@@ -122,12 +122,15 @@ def action_values(
     Args:
         stay_sum: (S,) R's stay entries times `count`.
         switch_sum: (S,) sum of R's switch entries from each stream, times `count`.
-        count: common divisor of R; the number t of rewards in the sums.
+        count: common divisor of R; the number t of rewards in the sums, 0 before the first.
         gamma: discount factor.
         policy: (S,) 0 stay, 1 switch.
         Q: (S, 2) written.
     """
     n = len(stay_sum)
+    if count <= 0.0:
+        Q[:] = 0.0
+        return
     if n == 1:
         Q[0] = stay_sum[0] / count / (1.0 - gamma)
         return

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agent import OUTCOME, Agent, Rules, has_gap, mean_change, think, value_actions
+from cdmisfa.agent import OUTCOME, Agent, Rules, has_gap, mean_change, think
 from cdmisfa.compiled import compiled
 from cdmisfa.config import LearnerConfig
 from cdmisfa.expansion import quadratic
@@ -21,6 +21,7 @@ from cdmisfa.gate import NOVEL, Frozen, mean_output, recognise
 from cdmisfa.incsfa import Params, State, project
 from cdmisfa.incsfa.strict import update
 from cdmisfa.learner import CuriousLearner
+from cdmisfa.lspi import action_values
 from cdmisfa.modules import Module
 from cdmisfa.streams import PERIOD, OscillatorySource, one_period
 
@@ -173,7 +174,9 @@ def run_iterations(
             for s in range(len(agent.policy)):
                 R[k, s] = agent.stay_sum[s] / scale
                 policy[k, s] = agent.policy[s]
-            value_actions(agent, rules, Q[k])
+            action_values(
+                agent.stay_sum, agent.switch_sum, memory["scale"], rules.gamma, agent.policy, Q[k]
+            )
         if out[0]["saved"] or memory["idle"] > patience or memory["epsilon"] < swap_below:
             return k + 1
     return len(uniforms)

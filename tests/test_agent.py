@@ -22,10 +22,10 @@ from cdmisfa.agent import (
     recent_variance,
     rules,
     think,
-    value_actions,
 )
 from cdmisfa.config import LearnerConfig
 from cdmisfa.gate import CONSTANT, NOVEL
+from cdmisfa.lspi import action_values
 from cdmisfa.signals import DENSE_STREAMS
 from cdmisfa.slowness import instantaneous_slowness
 
@@ -65,7 +65,8 @@ class Bench:
     def values(self) -> np.ndarray:
         """The action values, (S, 2)."""
         Q = np.full((len(self.agent.policy), 2), np.nan)
-        value_actions(self.agent, self.rules, Q)
+        agent, scale = self.agent, self.memory["scale"]
+        action_values(agent.stay_sum, agent.switch_sum, scale, self.config.gamma, agent.policy, Q)
         return Q
 
     @property

@@ -94,6 +94,12 @@ def test_where_it_starts_does_not_matter(
     )
 
 
+def test_before_the_first_reward_nothing_has_a_value() -> None:
+    Q = np.full((3, 2), np.nan)
+    action_values(np.zeros(3), np.zeros(3), 0.0, 0.99, np.array([0, 1, 1]), Q)
+    assert not Q.any()
+
+
 def test_one_stream_stays() -> None:
     policy, Q = solve(np.array([3.0]), np.array([9.0]), 2, 0.5, np.array([1]))
     assert policy.tolist() == [0]
