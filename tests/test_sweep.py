@@ -6,8 +6,10 @@ import contextlib
 import csv
 import dataclasses
 import importlib
+import io
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -491,6 +493,19 @@ def test_the_command_prints_one_document_and_says_what_failed(tmp_path: Path) ->
     assert (document["trials"], document["computed"], len(document["failed"])) == (4, 2, 2)
     assert {row["point"]["learner.tau"] for row in document["failed"]} == {"100"}
     assert CliRunner().invoke(results_command, [str(tmp_path / "s")]).exit_code == 0
+
+
+def test_the_page_s_python_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text("utf-8")
+    examples = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    words = io.StringIO()
+    with contextlib.redirect_stdout(words):
+        exec("\n".join(examples), {})
+    first, *points, claim = words.getvalue().splitlines()
+    assert first == "4 computed, 0 were there, 0 failed"
+    assert len(points) == 2
+    assert "'holds': True" in claim
 
 
 def test_grids_and_seeds_are_read_as_written() -> None:
