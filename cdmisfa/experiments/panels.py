@@ -155,7 +155,7 @@ def policies(axes: Axes, curves: Sequence[NDArray[Any]], letter: str, y: str) ->
             linestyle=DASHES[s % 3],
             label=STREAM_NAMES[s],
         )
-    axes.legend(fontsize=6, loc="center right")
+    axes.legend(fontsize=6)
     label(axes, letter, "iteration", y)
     stay_to_switch(axes)
 
