@@ -155,9 +155,9 @@ def direction_cosine(a: Float, b: Float) -> float:
 
 def correlation(a: Float, b: Float) -> float:
     """Absolute Pearson correlation; 0 where one does not vary."""
-    if np.std(a) == 0 or np.std(b) == 0:
+    if a.max() == a.min() or b.max() == b.min():
         return 0.0
-    return abs(float(np.corrcoef(a, b)[0, 1]))
+    return direction_cosine(a - a.mean(), b - b.mean())
 
 
 def stays_above(values: Sequence[float] | Float, threshold: float) -> int:
