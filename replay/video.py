@@ -1,4 +1,4 @@
-"""A video file as a stream of images, through PyAV: FFmpeg on one thread, so always the same bits.
+"""A video file as a stream of images, through PyAV: FFmpeg on one thread.
 
 Grey is the luma that a video stores, so that no colour conversion of FFmpeg, whose bits depend
 on the processor, comes between; only videos without luma are taken by their colours.
