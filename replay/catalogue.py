@@ -11,6 +11,9 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -59,15 +62,20 @@ def collect_views(runs: Sequence[Path], into: Path, progress: Progress | None = 
         LogDamagedError: a run cannot be read.
         CdmisfaError: a view cannot be written.
     """
+    names: list[str] = []
     for i, run in enumerate(runs):
         view, log = run / VIEW_FILE, run_log(run)
-        if not view.is_file() or view.stat().st_mtime < log.stat().st_mtime or not _identity(view):
+        old = not view.is_file() or view.stat().st_mtime < log.stat().st_mtime
+        name = "" if old else _identity(view)
+        if not name:
             build_view(run, view)
+            name = _identity(view)
+        names.append(name)
         if progress is not None:
             progress(i + 1, len(runs))
-    names = [_identity(run / VIEW_FILE) for run in runs]
+    count = Counter(names)
     for i, run in enumerate(runs):
-        if names.count(names[i]) > 1:  # the copy of a run brought its view along
+        if count[names[i]] > 1:  # the copy of a run brought its view along
             build_view(run, run / VIEW_FILE)
             names[i] = _identity(run / VIEW_FILE)
         _link(run / VIEW_FILE, into / f"{i:05d}_{run.name}.rrd")
@@ -79,7 +87,7 @@ def serve_catalogue(
 ) -> None:
     """Serve a folder of runs until interrupted, and open it where there is a display.
 
-    Prints the address on stderr.
+    Prints the address of their table on stderr.
 
     Args:
         folder: of a sweep that kept its logs, or any folder of runs.
@@ -97,11 +105,49 @@ def serve_catalogue(
     address = f"rerun+http://127.0.0.1:{port}"
     with tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place:
         collect_views(runs, Path(place), progress)
-        print(f"{len(runs)} runs at {address}    look at them: rerun {address}", file=sys.stderr)
-        if has_display():
-            open_live(address)
+        said = threading.Thread(target=_say, args=(len(runs), address), daemon=True)
+        said.start()
         arguments = ["server", "--host", "127.0.0.1", "--port", str(port)]
         run_program([*arguments, "--dataset", f"{folder.resolve().name}={place}"])
+
+
+def _say(count: int, address: str) -> None:
+    """Say where the table of runs is, once it is served, and open it there."""
+    table = table_address(address, count)
+    print(f"{count} runs at {table}    look at them: rerun {table}", file=sys.stderr, flush=True)
+    if has_display():
+        open_live(table)
+
+
+def table_address(address: str, count: int, seconds: float = 60.0) -> str:
+    """Where a server's one dataset is, so that the viewer opens with its table.
+
+    Waits until every run is in it: a viewer that has asked does not ask again.
+
+    Args:
+        address: of the server, "rerun+http://127.0.0.1:PORT".
+        count: how many runs there are.
+        seconds: how long to wait for them.
+
+    Returns:
+        The table's address; the server's own, from where it is one click to the table, where
+        the server does not say.
+    """
+    # Rerun's public client of a catalogue needs DataFusion; to ask for a name it is too much.
+    from rerun_bindings import CatalogClientInternal
+
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        try:
+            (dataset,) = CatalogClientInternal(address).datasets(include_hidden=False)
+            if len(dataset.segment_ids()) >= count:
+                return f"{address}/entry/{dataset.entry_details().id}"
+        except (ConnectionError, OSError, RuntimeError, ValueError):
+            pass  # it does not listen yet
+        except (AttributeError, TypeError):  # another version of Rerun
+            break
+        time.sleep(0.05)
+    return address
 
 
 def _identity(view: Path) -> str:
@@ -112,9 +158,10 @@ def _identity(view: Path) -> str:
 
 
 def _link(view: Path, link: Path) -> None:
+    # A hard link: the server does not see symbolic ones.
     try:
-        os.symlink(view.resolve(), link)
-    except OSError:  # not everybody may make links on Windows
+        os.link(view, link)
+    except OSError:  # on another file system
         try:
             shutil.copyfile(view, link)
         except OSError as error:

@@ -10,12 +10,16 @@ import contextlib
 import http.client
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 HOST = "127.0.0.1"
 SECONDS = 60.0
-"""Longest wait for the viewer's own server."""
+"""Longest wait for an answer of the viewer's own server."""
+
+START_SECONDS = 20.0
+"""Longest wait until it listens: a browser may be quicker than it starts."""
 
 KEPT = ("Content-Type", "Content-Length", "Cache-Control", "ETag")
 """What is passed on of what the viewer's server says about a file."""
@@ -58,6 +62,19 @@ def serve_page(viewer_port: int, data_port: int, port: int) -> Iterator[None]:
         server.server_close()
 
 
+def _connect(source: http.client.HTTPConnection) -> None:
+    """Connect to a server that may still be starting."""
+    end = time.monotonic() + START_SECONDS
+    while True:
+        try:
+            source.connect()
+            return
+        except ConnectionRefusedError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.05)
+
+
 def _handler(viewer_port: int, rules: str) -> type[BaseHTTPRequestHandler]:
     class Page(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -67,6 +84,7 @@ def _handler(viewer_port: int, rules: str) -> type[BaseHTTPRequestHandler]:
                 return
             source = http.client.HTTPConnection(HOST, viewer_port, timeout=SECONDS)
             try:
+                _connect(source)
                 source.request("GET", self.path)
                 answer = source.getresponse()
                 self.send_response(answer.status)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import time
 
 import pytest
 from rerun.chunk import RrdReader
+from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
 
 from cdmisfa.errors import UsageError
-from replay.catalogue import collect_views, runs_in, serve_catalogue
+from replay.catalogue import _identity, collect_views, runs_in, serve_catalogue, table_address
+from replay.viewer import free_port
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def test_a_folder_without_runs_is_refused(tmp_path):
         serve_catalogue(tmp_path)
 
 
-def test_the_command_serves_until_interrupted(sweep):
+def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
     process = subprocess.Popen(
         [sys.executable, "-m", "cdmisfa", "view", str(sweep)], stderr=subprocess.PIPE, text=True
     )
@@ -81,17 +81,18 @@ def test_the_command_serves_until_interrupted(sweep):
         while found is None:
             line = process.stderr.readline()
             assert line, "the command ended"
-            found = re.search(r"3 runs at rerun\+http://127\.0\.0\.1:(\d+)", line)
-        for _ in range(100):
-            try:
-                socket.create_connection(("127.0.0.1", int(found[1])), timeout=5).close()
-                break
-            except ConnectionRefusedError:
-                time.sleep(0.1)
-        else:
-            pytest.fail("nobody listens")
+            found = re.search(r"3 runs at (rerun\+http://127\.0\.0\.1:\d+)/entry/(\w+)", line)
+        (dataset,) = CatalogClientInternal(found[1]).datasets(include_hidden=False)
+        assert str(dataset.entry_details().id) == found[2]
+        names = {_identity(run / "run.rrd") for run in runs_in(sweep)}
+        assert set(dataset.segment_ids()) == names
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) == 130
     finally:
         process.kill()
         process.communicate()
+
+
+def test_a_server_that_does_not_answer_is_named_all_the_same():
+    address = f"rerun+http://127.0.0.1:{free_port()}"
+    assert table_address(address, 1, seconds=0.3) == address
