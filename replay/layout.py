@@ -19,10 +19,13 @@ LEGEND = rrb.PlotLegend(visible=True, corner=rrb.Corner2D.RightTop)
 HEAT = rrb.TensorScalarMapping(colormap="viridis")
 FIT = rrb.components.ViewFit.Fill
 
+MANY = 6
+"""With more streams than this the share of each is small, and drawn larger."""
+
 LANE = 35
 """Height of a lane, beside plots of 100 to 200."""
 
-MOST_LANES = 14
+MOST_LANES = 9
 """Lanes that get their full height; more are scrolled."""
 
 Span = tuple[float, float]
@@ -142,7 +145,9 @@ class RunLayout:
                 "What it does, and decides: the policy in each stream", "/lanes/**", "/policy/**"
             ),
             self._lines(
-                "Where it looks: share of the last 50 blocks", ["/decision/attention"], (0.0, 1.05)
+                "Where it looks: share of the last 50 blocks",
+                ["/decision/attention"],
+                (0.0, 1.05) if len(self._spec.streams) <= MANY else None,
             ),
             self._convergence("What it feels: a module is saved when η̇ falls below δ"),
             self._lines("What it expects: reward R for staying", ["/decision/R_stay/**"]),

@@ -6,6 +6,9 @@ from replay.outline import Outline
 
 ACTIONS = ("stay", "switch")
 
+NAMED = 4
+"""Most streams whose names are given together."""
+
 
 def summary_text(outline: Outline, name: str, ended: str = "") -> str:
     """What was learned, when, and where the robot stayed for it, as Markdown.
@@ -51,6 +54,8 @@ def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
     stays = [streams[s] for s, action in enumerate(policy) if action == 0]
     if len(stays) == len(streams):
         return "stay everywhere"
+    if len(stays) > NAMED:
+        return f"stay on {len(stays)} of {len(streams)} streams"
     return f"stay on {', '.join(stays)}" if stays else "switch everywhere"
 
 
