@@ -76,6 +76,7 @@ class SweepReport:
         skipped: how many of them were finished before.
         computed: how many finished now.
         failed: rows of those that failed, now or before.
+        outdated: how many of them were finished before by other code, and not reused.
     """
 
     folder: Path
@@ -83,6 +84,7 @@ class SweepReport:
     skipped: int
     computed: int
     failed: tuple[Mapping[str, Any], ...] = field(default=())
+    outdated: int = 0
 
 
 def sweep(
@@ -166,6 +168,7 @@ def sweep(
         skipped=len(trials) - len(open_trials),
         computed=sum(rows[t.id]["status"] == DONE for t in open_trials),
         failed=tuple(row for row in mine if _has_failed(row)),
+        outdated=_outdated(open_trials, before.values()),
     )
 
 
@@ -193,7 +196,9 @@ def plan(
         for values in itertools.product(*grid.values())
     ]
     # Workers may have another working directory.
-    paths = tuple(str(w) if w == kind else str(Path(w).resolve()) for w in words)
+    paths = tuple(
+        str(w) if w == kind or "://" in str(w) else str(Path(w).resolve()) for w in words
+    )
     each = tuple(dict.fromkeys(seeds))
     limits = [max_iterations, max_modules]
     trials: dict[str, Trial] = {}
@@ -357,6 +362,16 @@ def _row(trial: Trial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]
         "run": str(trial.log) if trial.log is not None and not failed else None,
         **({"error": result["error"]} if failed else {"result": result}),
     }
+
+
+def _outdated(trials: Sequence[Trial], rows: Iterable[Mapping[str, Any]]) -> int:
+    """How many trials are in the rows already, but computed by other code."""
+    done = {
+        (json.dumps(row["point"], sort_keys=True), row["seed"])
+        for row in rows
+        if row["status"] == DONE and row.get("code") != code()
+    }
+    return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)
 
 
 def _has_failed(row: Mapping[str, Any] | None) -> bool:
