@@ -196,9 +196,7 @@ def plan(
         for values in itertools.product(*grid.values())
     ]
     # Workers may have another working directory.
-    paths = tuple(
-        str(w) if w == kind or "://" in str(w) else str(Path(w).resolve()) for w in words
-    )
+    paths = tuple(str(w) if w == kind or "://" in str(w) else str(Path(w).resolve()) for w in words)
     each = tuple(dict.fromkeys(seeds))
     limits = [max_iterations, max_modules]
     trials: dict[str, Trial] = {}
