@@ -30,7 +30,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "convert": ("convert", "Write camera logs of others as a recording."),
     "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),
     "plot": ("runs", "Draw the figures of a run."),
-    "export": ("runs", "Write a run's signals as a table or arrays, a recording as images."),
+    "export": (
+        "runs",
+        "Write a run's signals as a table or arrays, a recording as images, videos or a dataset.",
+    ),
     "sweep": ("sweep", "Learn from a source many times, over a grid of settings and seeds."),
     "results": (
         "results",
