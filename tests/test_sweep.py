@@ -143,6 +143,20 @@ def test_a_recording_is_swept_as_the_scene_is(tmp_path: Path) -> None:
 # Going on
 
 
+def test_trials_of_other_code_are_computed_again_and_it_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30)
+    assert sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30).outdated == 0
+    monkeypatch.setattr(sweeping, "code", lambda: "0.0+other")
+    words = ["oscillatory", "--seeds", "0:3", "--max-iterations", "30", "-o", str(tmp_path)]
+    said = CliRunner().invoke(sweep_command, words)
+    assert said.exit_code == 0
+    assert "2 trials that were finished before are computed again: the code" in said.stderr
+    again = CliRunner().invoke(sweep_command, words)
+    assert "computed again" not in again.stderr
+
+
 def test_finished_trials_are_skipped(tmp_path: Path) -> None:
     calls: list[tuple[int, int, int]] = []
     sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30)

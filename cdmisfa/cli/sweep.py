@@ -94,6 +94,12 @@ def sweep_command(
             progress=progress,
         )
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
+    if report.outdated:
+        click.echo(
+            f"{report.outdated} trials that were finished before are computed again: the code "
+            "of the learner or the recorder has changed since",
+            err=True,
+        )
     if as_json:
         options.print_json(
             {
@@ -102,6 +108,7 @@ def sweep_command(
                 "trials": report.trials,
                 "skipped": report.skipped,
                 "computed": report.computed,
+                "outdated": report.outdated,
                 "failed": failed,
             }
         )
