@@ -149,11 +149,22 @@ class RunLayout:
                 ["/decision/attention"],
                 (0.0, 1.05) if len(self._spec.streams) <= MANY else None,
             ),
-            self._convergence("What it feels: a module is saved when η̇ falls below δ"),
+            self._feels(),
             self._lines("What it expects: reward R for staying", ["/decision/R_stay/**"]),
             row_shares=[_heights(5 + len(self._spec.streams)), 125, 190, 125],
         )
         return rrb.Horizontal(sees, story, column_shares=[2, 5], name="Overview")
+
+    def _feels(self) -> rrb.View:
+        """What comes down until a module is saved."""
+        threshold = self._clusters_below()
+        if threshold is None:
+            return self._convergence("What it feels: a module is saved when η̇ falls below δ")
+        return self._lines(
+            f"What it feels: a module is saved when the clustering error's mean is below "
+            f"{threshold:g}",
+            ["/signals/roc_error_inst", "/signals/roc_error"],
+        )
 
     def _abstraction(self) -> rrb.Container:
         span = self._outline.span

@@ -228,6 +228,19 @@ def test_the_file_has_a_layout_and_properties(shown):
     assert {"/__properties/learner", "/__properties/result"} <= properties
 
 
+def test_the_overview_of_the_first_version_shows_its_clustering_error(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 3)
+    outline = read_outline(tmp_path)
+    names = {}
+    for algorithm in ("1.0", "2.0"):
+        table = {"algorithm": algorithm, "roc_error": 0.25}
+        header = dataclasses.replace(outline.header, manifest={"config": {"learner": table}})
+        view = layout.RunLayout(dataclasses.replace(outline, header=header))._feels()
+        names[algorithm] = view.name
+    assert "clustering error's mean is below 0.25" in names["1.0"]
+    assert "falls below δ" in names["2.0"]
+
+
 def test_many_streams_show_the_most_watched(tmp_path):
     spec = SourceSpec(tuple(f"s{i}" for i in range(70)), (2,), "float64", (), 50.0, 0)
     records = write_run(tmp_path / "run.mcap", spec, 30)
