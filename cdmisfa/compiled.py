@@ -53,7 +53,7 @@ def _sources() -> str:
     digest = hashlib.sha256()
     for path in sorted([*root.glob("*.py"), *root.glob("incsfa/*.py")]):
         source = path.read_bytes()
-        if b"@compiled" in source or b"@reordered" in source:
+        if any(word in source for word in (b"@compiled", b"@reordered", b"@intrinsic")):
             digest.update(source)
     return digest.hexdigest()
 

@@ -23,40 +23,15 @@ from cdmisfa.incsfa.coefficients import (
     features_in_vectors,
     follow,
 )
-from cdmisfa.incsfa.passes import GROUP, TILE, apply_group, gram_tile
+from cdmisfa.incsfa.passes import GROUP, TILE, Work, gram_tile, new_work, run_pass
 from cdmisfa.incsfa.state import Float, Params, State, amnesic_weight, mca_step
-from cdmisfa.incsfa.strict import slow_features
 
 REFRESH = 1000
 """Frames after which the Gram matrix is computed from the vectors again."""
 
 
-class Group(NamedTuple):
-    """What is known of up to GROUP consecutive frames before they are applied.
-
-    Attributes:
-        u: (GROUP, I) centred frames; rows of missing frames are 0.
-        g: (GROUP, GROUP) their inner products.
-        e: (K, GROUP) their inner products with the vectors.
-    """
-
-    u: Float
-    g: Float
-    e: Float
-
-
-class Steps(NamedTuple):
-    """A group's CCIPCA steps, in the form `passes.apply_tile` wants them.
-
-    Attributes:
-        shrink: (K,) product of what the steps keep of each vector.
-        gain: (K, GROUP) share of the residual each vector takes, over the product so far.
-        take: (K, GROUP) share of each vector the residual loses, times the product so far.
-    """
-
-    shrink: Float
-    gain: Float
-    take: Float
+LEAST_SHRINK = 0.01
+"""Where the vectors have shrunk by more than this, they are brought to length."""
 
 
 class Features(NamedTuple):
@@ -95,17 +70,16 @@ def refresh_gram(v: Float, gram: Float) -> None:
     """
     gram[:] = 0.0
     for start in range(0, v.shape[1], TILE):
-        gram_tile(v, start, gram)
+        gram_tile(v, start, min(TILE, v.shape[1] - start), gram)
 
 
 @compiled
 def learn_group(
     state: State,
     nu: float,
-    group: Group,
+    work: Work,
     count: int,
     gap: bool,
-    steps: Steps,
     now: Features,
     xi: Float,
 ) -> None:
@@ -114,38 +88,35 @@ def learn_group(
     Args:
         state: gram, d, w, z_prev and counts are brought up to date.
         nu: learning rate of MCA.
-        group: e is overwritten.
+        work: the group; receives its steps, and e is overwritten.
         count: frames in the group.
         gap: its first frame follows a gap.
-        steps: receives the CCIPCA steps.
         now: brought up to date.
         xi: (count,) changes of phi; NaN where the frame follows a gap, and left alone
             where the frame before does.
     """
     J, K = state.w.shape
     keep, gain, take = np.empty(K), np.empty(K), np.empty(K)
-    e, work, z_dot = np.empty(K), np.empty(K), np.empty(K)
+    e, scratch, z_dot = np.empty(K), np.empty(K), np.empty(K)
     rho, m_before, gram_before = np.empty(GROUP), np.empty((J, K)), np.empty((K, K))
-    steps.shrink[:] = 1.0
-    steps.gain[:] = 0.0
-    steps.take[:] = 0.0
+    work.steps[:] = 0.0
     for t in range(count):
-        energy = group.g[t, t]
+        energy = work.g[t, t]
         gram_before[:] = state.gram
         m_before[:] = now.m
         for k in range(K):
-            e[k] = work[k] = group.e[k, t]
+            e[k] = scratch[k] = work.e[k, t]
         for s in range(GROUP):
-            rho[s] = group.g[s, t]
+            rho[s] = work.g[s, t]
         weight = amnesic_weight(state.counts[0] + 1)
-        ccipca_coefficients(state.gram, state.d, weight, energy, work, keep, gain, take)
-        follow(group.e, rho, t, keep, gain, take)
+        ccipca_coefficients(state.gram, state.d, weight, energy, scratch, keep, gain, take)
+        follow(work.e, rho, t, keep, gain, take)
         features_in_vectors(state.w, state.d, now.scale, now.m)
         for k in range(K):
-            steps.shrink[k] *= keep[k]
-            steps.gain[k, t] = gain[k] / steps.shrink[k]
-            steps.take[k, t] = take[k] * steps.shrink[k]
-            z = group.e[k, t] * now.scale[k]
+            work.shrink[k] *= keep[k]
+            work.steps[k, 2 * t] = gain[k] / work.shrink[k]
+            work.steps[k, 2 * t + 1] = -take[k] * work.shrink[k]
+            z = work.e[k, t] * now.scale[k]
             z_dot[k] = z - state.z_prev[k]
             state.z_prev[k] = z
         state.counts[0] += 1
@@ -153,11 +124,11 @@ def learn_group(
             xi[t] = np.nan
             state.counts[1] = 1
             continue
-        mca_step(state.w, z_dot, now.scale, nu, work)
+        mca_step(state.w, z_dot, now.scale, nu, scratch)
         features_in_vectors(state.w, state.d, now.scale, now.m)
         if state.counts[1] == 0:
             xi[t] = change_of_features(
-                now.m, m_before, gram_before, e, energy, keep, gain, take, work
+                now.m, m_before, gram_before, e, energy, keep, gain, take, scratch
             )
         state.counts[1] = 0
 
@@ -175,11 +146,8 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
     """
     n_frames, size = frames.shape
     J, K = state.w.shape
-    group = Group(np.zeros((GROUP, size)), np.zeros((GROUP, GROUP)), np.zeros((K, GROUP)))
-    coming = Group(np.zeros((GROUP, size)), np.zeros((GROUP, GROUP)), np.zeros((K, GROUP)))
-    steps = Steps(np.ones(K), np.zeros((K, GROUP)), np.zeros((K, GROUP)))
+    work = new_work(size, K, J)
     now = Features(np.empty(K), np.empty((J, K)))
-    tile, row = np.zeros(GROUP * TILE), np.empty(TILE)
     if state.counts[2] == 0 or state.counts[2] >= REFRESH:
         refresh_gram(state.v, state.gram)
         state.counts[2] = 0
@@ -190,19 +158,17 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
     while True:
         new_episode = gap and start == 0
         spans = count > (1 if new_episode else 0) and (new_episode or state.counts[1] == 1)
-        learn_group(state, params.nu, group, count, new_episode, steps, now, xi[start:])
+        learn_group(state, params.nu, work, count, new_episode, now, xi[start:])
         start += count
         following = group_length(n_frames - start, state.counts[1] == 1, gap and start == 0)
-        apply_group(
-            state.v, state.mean, group.u, count, steps.shrink, steps.gain, steps.take, tile,
-            frames, start, following, state.counts[0], params.mean_window,
-            coming.u, coming.g, coming.e,
-        )  # fmt: skip
+        shown = spans or (following == 0 and state.counts[1] == 0)
+        settle = shown or following == 0 or work.shrink.min() < LEAST_SHRINK
+        m = now.m if shown else now.m[:0]
+        square = run_pass(
+            state, work, count, settle, m, frames, start, following, params.mean_window
+        )
         if spans:
-            xi[start - 1] = slow_features(state.w, now.scale, state.v, state.phi, row)
+            xi[start - 1] = np.sqrt(square)
         if following == 0:
             break
         count = following
-        group, coming = coming, group
-    if state.counts[1] == 0 and not spans:
-        slow_features(state.w, now.scale, state.v, state.phi, row)
