@@ -13,10 +13,18 @@ import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+MARKS = (b"@compiled", b"@inlined", b"@reordered", b"@_intrinsic")
+"""What files that hold compiled functions contain."""
+
 
 def compiled(function: Function) -> Function:
     """Compile strictly (no reordering of floating point) and keep the result on disk."""
     return _compile(function)
+
+
+def inlined(function: Function) -> Function:
+    """Compile strictly, into every function that calls it: for the small ones of a hot loop."""
+    return _compile(function, forceinline=True)
 
 
 def reordered(function: Function) -> Function:
@@ -28,6 +36,7 @@ def reordered(function: Function) -> Function:
 
 
 def _compile(function: Function, **options: Any) -> Function:
+    options["error_model"] = "numpy"  # no test at every division whether an error is to be raised
     try:
         return cast(Function, kept_while_sources_last(numba.njit(cache=True, **options)(function)))
     except RuntimeError:  # numba found no folder that it may write to
@@ -53,7 +62,7 @@ def _sources() -> str:
     digest = hashlib.sha256()
     for path in sorted([*root.glob("*.py"), *root.glob("incsfa/*.py")]):
         source = path.read_bytes()
-        if any(word in source for word in (b"@compiled", b"@reordered", b"@intrinsic")):
+        if any(word in source for word in MARKS):
             digest.update(source)
     return digest.hexdigest()
 

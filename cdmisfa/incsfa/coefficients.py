@@ -52,27 +52,42 @@ def ccipca_coefficients(
         energy = max(energy - projection * t, 0.0)
         gram[i, i] = updated
         keep[i], gain[i], take[i] = kept, g, t
-    _finish_gram(gram, keep, gain, take, e)
+    _finish_gram(gram, keep, gain, take)
     for i in range(K):
         d[i] = np.sqrt(gram[i, i])
 
 
 @reordered
-def _finish_gram(gram: Float, keep: Float, gain: Float, take: Float, p: Float) -> None:
-    """Turn v_i'.v_j (i < j, upper triangle) into v_i'.v_j' and mirror it; p is scratch."""
+def _finish_gram(gram: Float, keep: Float, gain: Float, take: Float) -> None:
+    """Turn v_j'.v_i (j < i, upper triangle) into v_j'.v_i' and mirror it.
+
+    Along a row each product waits for the one before; four rows at a time fill the wait.
+    """
     K = keep.shape[0]
-    for j in range(K):
-        for i in range(j + 1, K):
-            gram[i, j] = gram[j, i]
-    for i in range(K):
-        p[i] = 0.0
-        row = gram[i]
-        for j in range(i):
-            row[j] = keep[i] * row[j] + gain[i] * p[j]
-            p[j] -= take[i] * row[j]
-    for j in range(K):
-        for i in range(j + 1, K):
-            gram[j, i] = gram[i, j]
+    p = np.zeros(4)
+    for first in range(0, K, 4):
+        stop = min(first + 4, K)
+        for j in range(first, stop):
+            rest = 0.0
+            for i in range(j + 1, stop):
+                x = keep[i] * gram[j, i] + gain[i] * rest
+                rest -= take[i] * x
+                gram[j, i] = gram[i, j] = x
+            p[j - first] = rest
+        a, b, c, d = p[0], p[1], p[2], p[3]
+        for i in range(stop, K):
+            w = keep[i] * gram[first, i] + gain[i] * a
+            x = keep[i] * gram[first + 1, i] + gain[i] * b
+            y = keep[i] * gram[first + 2, i] + gain[i] * c
+            z = keep[i] * gram[first + 3, i] + gain[i] * d
+            a -= take[i] * w
+            b -= take[i] * x
+            c -= take[i] * y
+            d -= take[i] * z
+            gram[first, i] = gram[i, first] = w
+            gram[first + 1, i] = gram[i, first + 1] = x
+            gram[first + 2, i] = gram[i, first + 2] = y
+            gram[first + 3, i] = gram[i, first + 3] = z
 
 
 @reordered

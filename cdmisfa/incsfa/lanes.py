@@ -8,11 +8,13 @@ Indices are not checked and must not be negative; arrays are two-dimensional and
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 from llvmlite import ir
 from numba.core import types
-from numba.core.datamodel import PrimitiveModel, register_default
+from numba.core.datamodel.models import PrimitiveModel
+from numba.core.datamodel.registry import register_default
 from numba.extending import intrinsic
 
 LANES = 8
@@ -22,18 +24,22 @@ _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _INDEX = ir.IntType(32)
 
 
-class _Lanes(types.Type):  # type: ignore[misc]
+class _Lanes(types.Type):
     def __init__(self) -> None:
         super().__init__(name="Lanes")
 
 
 @register_default(_Lanes)
-class _LanesModel(PrimitiveModel):  # type: ignore[misc]
+class _LanesModel(PrimitiveModel):
     def __init__(self, manager: Any, of: Any) -> None:
-        super().__init__(manager, of, _VECTOR)
+        super().__init__(manager, of, _VECTOR)  # type: ignore[no-untyped-call]
 
 
 _LANES = _Lanes()
+
+
+def _intrinsic(emitter: Callable[..., Any]) -> Callable[..., Any]:
+    return cast(Callable[..., Any], intrinsic(emitter))
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
@@ -46,9 +52,9 @@ def _lanes_pointer(context: Any, builder: Any, kind: Any, *where: Any) -> Any:
     return builder.bitcast(_pointer(context, builder, kind, *where), _VECTOR.as_pointer())
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_intrinsic
 def load(typing: Any, array: Any, row: Any, column: Any) -> Any:
-    """array[row, column : column + LANES]."""
+    """Return array[row, column : column + LANES]."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load(_lanes_pointer(context, builder, signature.args[0], *args), align=8)
@@ -56,9 +62,9 @@ def load(typing: Any, array: Any, row: Any, column: Any) -> Any:
     return _LANES(array, types.intp, types.intp), emit
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_intrinsic
 def store(typing: Any, array: Any, row: Any, column: Any, x: Any) -> Any:
-    """array[row, column : column + LANES] = x."""
+    """Set array[row, column : column + LANES] to x."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pointer = _lanes_pointer(context, builder, signature.args[0], *args[:3])
@@ -68,9 +74,9 @@ def store(typing: Any, array: Any, row: Any, column: Any, x: Any) -> Any:
     return types.void(array, types.intp, types.intp, _LANES), emit
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@_intrinsic
 def add(typing: Any, x: Any, table: Any, row: Any, column: Any, y: Any) -> Any:
-    """x + table[row, column] * y, the coefficient not loaded before the `add` ahead of it."""
+    """Return x + table[row, column] * y; the coefficient is not loaded before the last `add`'s."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         x, table, row, column, y = args
@@ -83,13 +89,3 @@ def add(typing: Any, x: Any, table: Any, row: Any, column: Any, y: Any) -> Any:
         return builder.fadd(x, builder.fmul(factor, y))
 
     return _LANES(_LANES, table, types.intp, types.intp, _LANES), emit
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def nothing(typing: Any) -> Any:
-    """LANES zeros."""
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return ir.Constant(_VECTOR, [0.0] * LANES)
-
-    return _LANES(), emit

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.compiled import compiled, reordered
-from cdmisfa.incsfa.lanes import LANES, add, load, nothing, store
+from cdmisfa.incsfa.lanes import LANES, add, load, store
 from cdmisfa.incsfa.state import PIXEL, Float, State, mean_rate
 
 GROUP = 4
@@ -207,25 +207,29 @@ def features_tile(v: Float, start: int, width: int, m: Float, rows: Float) -> No
     """
     J, K = m.shape
     whole = J - J % 4
-    for j in range(0, whole, 4):
-        for i in range(0, width, LANES):
-            a = b = c = d = nothing()
-            for k in range(K):
-                x = load(v, k, start + i)
-                a = add(a, m, j, k, x)
-                b = add(b, m, j + 1, k, x)
-                c = add(c, m, j + 2, k, x)
-                d = add(d, m, j + 3, k, x)
-            store(rows, j, i, a)
-            store(rows, j + 1, i, b)
-            store(rows, j + 2, i, c)
-            store(rows, j + 3, i, d)
-    for j in range(whole, J):
-        for i in range(0, width, LANES):
-            a = nothing()
-            for k in range(K):
-                a = add(a, m, j, k, load(v, k, start + i))
-            store(rows, j, i, a)
+    rows[:] = 0.0
+    for panel in range(0, K, PANEL):
+        stop = min(panel + PANEL, K)
+        for j in range(0, whole, 4):
+            for i in range(0, width, LANES):
+                a, b = load(rows, j, i), load(rows, j + 1, i)
+                c, d = load(rows, j + 2, i), load(rows, j + 3, i)
+                for k in range(panel, stop):
+                    x = load(v, k, start + i)
+                    a = add(a, m, j, k, x)
+                    b = add(b, m, j + 1, k, x)
+                    c = add(c, m, j + 2, k, x)
+                    d = add(d, m, j + 3, k, x)
+                store(rows, j, i, a)
+                store(rows, j + 1, i, b)
+                store(rows, j + 2, i, c)
+                store(rows, j + 3, i, d)
+        for j in range(whole, J):
+            for i in range(0, width, LANES):
+                a = load(rows, j, i)
+                for k in range(panel, stop):
+                    a = add(a, m, j, k, load(v, k, start + i))
+                store(rows, j, i, a)
 
 
 @reordered
@@ -336,7 +340,7 @@ def run_pass(
             state.v[:, start:] = v[:, :width]
         if count > 0:
             centre_tile(frames, first, count, start, state.mean, state.counts[0], window, u)
-            gram_tile(u, 0, width, work.g)
+            measure_tile(u, 0, width, u, work.g)
             measure_tile(v, column, padded, u, work.e)
     if settle:
         work.shrink[:] = 1.0

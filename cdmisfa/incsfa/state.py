@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.compiled import compiled
+from cdmisfa.compiled import compiled, inlined
 from cdmisfa.config import LearnerConfig
 
 Float = NDArray[np.float64]
@@ -113,13 +113,13 @@ def copy_into(source: State, target: State) -> None:
     target.counts[:] = source.counts
 
 
-@compiled
+@inlined
 def mean_rate(n: int, window: float) -> float:
     """Rate of the running mean at the n-th frame (from 1): 1/n, then 2/(window + 1)."""
     return max(2.0 / (window + 1.0), 1.0 / n)
 
 
-@compiled
+@inlined
 def amnesic_weight(n: int) -> float:
     """Weight of the new frame in CCIPCA at the n-th frame (from 1); the old vector has the rest.
 
@@ -136,7 +136,7 @@ def amnesic_weight(n: int) -> float:
     return (1.0 + amnesia) / k
 
 
-@compiled
+@inlined
 def rank_floor(d: Float) -> float:
     """Variance at or below which a component is rounding noise.
 
@@ -152,13 +152,13 @@ def rank_floor(d: Float) -> float:
     return max(RANK_TOLERANCE * largest, LEAST_VARIANCE)
 
 
-@compiled
+@inlined
 def whitening_scale(d: float, floor: float) -> float:
     """Factor that turns u.v into a component of unit variance: d^-3/2, 0 for rounding noise."""
     return 1.0 / (d * np.sqrt(d)) if d > floor else 0.0
 
 
-@compiled
+@inlined
 def mca_step(w: Float, z_dot: Float, scale: Float, nu: float, step: Float) -> None:
     """Turn each row of w towards the next slowest direction, in place.
 

@@ -6,10 +6,12 @@ calls. Across CPUs only the contraction of a*b+c may differ, and numba does not 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.compiled import compiled
+from cdmisfa.compiled import compiled, inlined
 from cdmisfa.incsfa.state import (
     PIXEL,
     Float,
@@ -26,12 +28,19 @@ TILE = 256
 """Columns of phi computed at a time, so that they stay in L1."""
 
 
-@compiled
-def centre(frame: NDArray, scale: float, mean: Float, n: int, window: float, u: Float) -> None:  # type: ignore[type-arg]
+FEW = 32
+"""Up to so many inputs phi is computed weight by weight, as there is little to vectorise."""
+
+
+@inlined
+def centre(
+    frames: NDArray[Any], t: int, scale: float, mean: Float, n: int, window: float, u: Float
+) -> None:
     """Take the n-th frame (from 1) into the mean and subtract it; the very first is not centred.
 
     Args:
-        frame: (I,) as it came, times `scale`.
+        frames: (n, I) as they came.
+        t: index of the one.
         scale: 1 for values, 1/255 for pixels.
         mean: (I,) updated in place.
         n: number of this frame.
@@ -40,12 +49,12 @@ def centre(frame: NDArray, scale: float, mean: Float, n: int, window: float, u: 
     """
     rate = mean_rate(n, window)
     for i in range(mean.shape[0]):
-        x = frame[i] * scale
+        x = frames[t, i] * scale
         mean[i] += rate * (x - mean[i])
         u[i] = x if n == 1 else x - mean[i]
 
 
-@compiled
+@inlined
 def ccipca_step(v: Float, d: Float, weight: float, r: Float) -> None:
     """Turn the vectors towards the principal components; r is left with what none explains.
 
@@ -61,26 +70,30 @@ def ccipca_step(v: Float, d: Float, weight: float, r: Float) -> None:
     """
     K, D = v.shape
     floor = rank_floor(d)
+    projection = 0.0
+    for i in range(D):
+        projection += r[i] * v[0, i]
     for j in range(K):
-        rate = weight / d[j]  # ahead of the products, which it would otherwise wait for
-        projection = 0.0
-        for i in range(D):
-            projection += r[i] * v[j, i]
         keep = 1.0 - weight if d[j] > floor else 1.0
-        gain = rate * projection
+        gain = weight / d[j] * projection
         square = 0.0
         projection = 0.0
         for i in range(D):
-            v[j, i] = keep * v[j, i] + gain * r[i]
-            square += v[j, i] * v[j, i]
-            projection += r[i] * v[j, i]
+            x = keep * v[j, i] + gain * r[i]
+            v[j, i] = x
+            square += x * x
+            projection += r[i] * x
         d[j] = np.sqrt(square)
-        projection /= square
+        take = projection / square
+        projection = 0.0
+        following = min(j + 1, K - 1)
         for i in range(D):
-            r[i] -= projection * v[j, i]
+            rest = r[i] - take * v[j, i]
+            r[i] = rest
+            projection += rest * v[following, i]
 
 
-@compiled
+@inlined
 def whiten(v: Float, scale: Float, u: Float, z: Float) -> None:
     """z_j = (u.v_j) |v_j|^-3/2, a component of unit variance.
 
@@ -97,7 +110,7 @@ def whiten(v: Float, scale: Float, u: Float, z: Float) -> None:
         z[j] = projection * scale[j]
 
 
-@compiled
+@inlined
 def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> float:
     """Set phi to w diag(scale) v; return xi, the length of its change.
 
@@ -110,6 +123,16 @@ def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> f
     """
     xi = 0.0
     K, size = v.shape
+    if size <= FEW:
+        for j in range(w.shape[0]):
+            for i in range(size):
+                new = 0.0
+                for k in range(K):
+                    new += w[j, k] * scale[k] * v[k, i]
+                change = new - phi[j, i]
+                xi += change * change
+                phi[j, i] = new
+        return float(np.sqrt(xi))
     for start in range(0, size, row.shape[0]):
         width = min(row.shape[0], size - start)
         for j in range(w.shape[0]):
@@ -134,7 +157,7 @@ def slow_features(w: Float, scale: Float, v: Float, phi: Float, row: Float) -> f
 
 
 @compiled
-def update(state: State, params: Params, frames: NDArray, gap: bool, xi: Float) -> None:  # type: ignore[type-arg]
+def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Float) -> None:
     """Learn from consecutive frames.
 
     The first frame after a gap, and the very first, update mean and whitening only.
@@ -149,25 +172,29 @@ def update(state: State, params: Params, frames: NDArray, gap: bool, xi: Float) 
     n_frames, D = frames.shape
     K = state.d.shape[0]
     pixel = PIXEL if frames.itemsize == 1 else 1.0
+    nu, window = params.nu, params.mean_window
+    mean, v, d, w = state.mean, state.v, state.d, state.w  # a look-up in the loop costs 10 ns
+    z_prev, phi, counts = state.z_prev, state.phi, state.counts
     u, r, row = np.empty(D), np.empty(D), np.empty(min(D, TILE))
     z, z_dot, scale, step = np.empty(K), np.empty(K), np.empty(K), np.empty(K)
     for t in range(n_frames):
-        state.counts[0] += 1
-        n = state.counts[0]
-        centre(frames[t], pixel, state.mean, n, params.mean_window, u)
-        r[:] = u
-        ccipca_step(state.v, state.d, amnesic_weight(n), r)
-        floor = rank_floor(state.d)
+        counts[0] += 1
+        n = counts[0]
+        centre(frames, t, pixel, mean, n, window, u)
+        for i in range(D):
+            r[i] = u[i]
+        ccipca_step(v, d, amnesic_weight(n), r)
+        floor = rank_floor(d)
         for k in range(K):
-            scale[k] = whitening_scale(state.d[k], floor)
-        whiten(state.v, scale, u, z)
+            scale[k] = whitening_scale(d[k], floor)
+        whiten(v, scale, u, z)
         for k in range(K):
-            z_dot[k] = z[k] - state.z_prev[k]
-            state.z_prev[k] = z[k]
+            z_dot[k] = z[k] - z_prev[k]
+            z_prev[k] = z[k]
         if n == 1 or (gap and t == 0):
             xi[t] = np.nan
-            state.counts[1] = 1
+            counts[1] = 1
         else:
-            mca_step(state.w, z_dot, scale, params.nu, step)
-            xi[t] = slow_features(state.w, scale, state.v, state.phi, row)
-            state.counts[1] = 0
+            mca_step(w, z_dot, scale, nu, step)
+            xi[t] = slow_features(w, scale, v, phi, row)
+            counts[1] = 0
