@@ -67,8 +67,9 @@ class TestFollowed(SourceContract):
 
 def test_frames_are_waited_for_until_the_recorder_is_done(tmp_path: Path) -> None:
     live, unfinished = OscillatorySource(), 0
-    with recorder(tmp_path / "rec"):
+    with recorder(tmp_path / "rec", wait=0.1):  # loading what is compiled takes a while, too
         source = FollowedSource(tmp_path / "rec", timeout=30)
+        unfinished += not source.finished
         assert source.spec.length is None
         for i in range(FRAMES // 40):
             same(source.take(i % 3, 40), live.take(i % 3, 40))
