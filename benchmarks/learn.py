@@ -43,7 +43,7 @@ def timed(call: Callable[[int], None], iterations: int) -> dict[str, float]:
 
 def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/learn.json."""
-    rounds, short, long = (2, 20, 60) if quick else (7, 250, 1000)
+    rounds, short, long = (2, 20, 60) if quick else (5, 250, 1000)
     with tempfile.TemporaryDirectory() as folder:
         work = {
             "no log": learning(None, rerun=False),
