@@ -34,7 +34,9 @@ def test_long_recordings_take_no_more_memory(tmp_path: Path, work: str) -> None:
 
 
 def test_learn(tmp_path: Path) -> None:
-    assert learn.learning(tmp_path / "run", 2, rerun=True)() == 2
+    times = learn.timed(learn.learning(tmp_path / "run", rerun=True), 2)
+    assert set(times) == set(learn.CLOCKS)
+    assert 0 < times["learning thread"] <= times["all threads"] + 1000
     assert {"run.mcap", "run.rrd"} <= {path.name for path in (tmp_path / "run").iterdir()}
 
 
