@@ -59,7 +59,7 @@ class LearnerConfig:
     slowness_window: int = 600
     eta_dot_window: int = 40
     gate_window: int = 20
-    warm_up: int = 20
+    warm_up: int = 80
     min_variance: float = 0.1
     novel_share: float = 0.9
     patience: int = 1000
