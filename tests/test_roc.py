@@ -90,7 +90,7 @@ def test_a_local_reward_changes_one_entry_and_the_norm() -> None:
 
 def test_1_0_learns_modules_and_its_reward_function_has_norm_1() -> None:
     source = OscillatorySource()
-    learner = CuriousLearner(LearnerConfig(algorithm="1.0"), source.spec, 0)
+    learner = CuriousLearner(LearnerConfig(algorithm="1.0", warm_up=20), source.spec, 0)
     for _ in range(60):
         signals = learner.step(source.take(learner.stream, learner.tau))
     assert np.linalg.norm(signals.R) == pytest.approx(1.0)
