@@ -6,12 +6,9 @@ The view can always be built again: the logs are the archive.
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import rerun as rr
 
@@ -21,15 +18,13 @@ from replay.config import ViewConfig
 from replay.labels import label
 from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
-from replay.outline import Outline, Tally, read_outline
+from replay.outline import Tally, read_outline
+from replay.properties import APPLICATION, identity, properties_of
 from replay.recording_view import write_recording, write_unwatched
 from replay.run_view import RunView
 from replay.runlog import is_run, read_header, run_log
 from replay.stretch import read_stretches
 from replay.summary import summary_text
-
-APPLICATION = "cdmisfa"
-"""Rerun's application id: one layout is remembered for it."""
 
 ENDED = "ended:"
 """How the event begins that says why a run ended."""
@@ -93,7 +88,7 @@ def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStr
     partial = partial_path(out)
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
-    recording = rr.RecordingStream(APPLICATION, recording_id=_identity(name, source))
+    recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))
     recording.set_log_time_enabled(False)
     try:
         recording.save(partial)
@@ -126,7 +121,8 @@ def _write_run(
         ended = next((e.text for e in stretch.events if e.text.startswith(ENDED)), ended)
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
-    _properties(recording, outline, folder)
+    for section, values in properties_of(outline, folder).items():
+        recording.send_property(section, rr.AnyValues(**values))
     text = label(summary_text(outline, _name(log), _sentence(ended)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)
@@ -141,51 +137,3 @@ def _sentence(ended: str) -> str:
 
 def _name(log: Path) -> str:
     return log.resolve().parent.name
-
-
-def _identity(name: str, source: Path) -> str:
-    """A name no other run has: Rerun merges recordings of the same name."""
-    place = hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]
-    return f"{name}-{place}"
-
-
-def _properties(recording: rr.RecordingStream, outline: Outline, folder: Path) -> None:
-    """Configuration and result, which the viewer's tables of runs show as columns."""
-    config = outline.header.manifest.get("config")
-    if isinstance(config, Mapping):
-        for section, table in config.items():
-            values = dict(_flat(table)) if isinstance(table, Mapping) else {}
-            if values:
-                recording.send_property(str(section), rr.AnyValues(**values))
-    result: dict[str, Any] = {
-        "seed": outline.header.manifest.get("seed", 0),
-        "iterations": outline.iterations,
-        "frames": outline.frames,
-        "modules": len(outline.saved),
-        "learned": ", ".join(label(outline.names()[s.stream]) for s in outline.saved),
-        **_ending(folder),
-    }
-    recording.send_property("result", rr.AnyValues(**result))
-
-
-def _ending(folder: Path) -> dict[str, str]:
-    """Why the run ended, where its manifest is there to say it."""
-    try:
-        document = json.loads((folder / "run.json").read_text("utf-8"))
-        result = document["result"]
-        return {name: str(result[name]) for name in ("ended", "signals_sha256")}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    values: list[tuple[str, Any]] = []
-    for key, value in table.items():
-        name = f"{prefix}{key}".replace(".", "_")
-        if isinstance(value, Mapping):
-            values += _flat(value, f"{name}_")
-        elif isinstance(value, bool | int | float):
-            values.append((name, value))
-        else:
-            values.append((name, label(value if isinstance(value, str) else json.dumps(value))))
-    return values

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from rerun.chunk import RrdReader
@@ -14,17 +16,26 @@ from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
 
 from cdmisfa.errors import UsageError
-from replay.catalogue import _identity, collect_views, runs_in, serve_catalogue, table_address
+from replay.catalogue import (
+    LAYER,
+    _identity,
+    ready_view,
+    runs_in,
+    serve_catalogue,
+    table_address,
+)
+from replay.outline import read_outline
+from replay.properties import properties_of, read_properties, run_identity, write_row
 from replay.viewer import free_port
 
 
 @pytest.fixture
 def sweep(tmp_path):
     for seed in range(3):
-        run = tmp_path / "sweep" / "trials" / f"trial{seed}"
+        run = tmp_path / "sweep #1" / "trials" / f"trial{seed}"
         run.mkdir(parents=True)
         write_run(run / "run.mcap", VECTOR, 6, seed=seed)
-    return tmp_path / "sweep"
+    return tmp_path / "sweep #1"
 
 
 def test_runs_are_found_in_a_sweep_and_beside_one_another(sweep):
@@ -34,37 +45,52 @@ def test_runs_are_found_in_a_sweep_and_beside_one_another(sweep):
     assert runs_in(sweep / "nothing") == []
 
 
-def test_views_have_names_of_their_own_and_say_what_was_run(sweep, tmp_path):
-    into = tmp_path / "links"
-    into.mkdir()
-    collect_views(runs_in(sweep)[:1], into)
-    shutil.rmtree(into)
-    into.mkdir()
-    shutil.copytree(sweep / "trials" / "trial0", sweep / "trials" / "copy")
-    names = collect_views(runs_in(sweep), into)
-    assert len(set(names)) == 4
-    assert len(list(into.glob("*.rrd"))) == 4
-    for link in into.iterdir():
-        properties = {
-            name
-            for chunk in RrdReader(str(link)).stream()
-            if chunk.entity_path in ("/__properties/learner", "/__properties/result")
-            for name in chunk.to_record_batch().schema.names
-        }
-        assert {"delta", "tau", "seed", "iterations", "modules"} <= properties
+def test_rows_and_views_of_a_run_have_one_name_and_say_what_was_run(sweep, tmp_path):
+    ready_view(sweep / "trials" / "trial0")
+    shutil.copytree(sweep / "trials" / "trial0", sweep / "trials" / "copy of a #1")
+    names = set()
+    for i, run in enumerate(runs_in(sweep)):
+        row = tmp_path / f"{i}.rrd"
+        write_row(run, row)
+        assert _identity(row) == _identity(ready_view(run)) == run_identity(run)
+        names.add(_identity(row))
+        for file in (row, run / "run.rrd"):
+            properties = {
+                name
+                for chunk in RrdReader(str(file)).stream()
+                if chunk.entity_path in ("/__properties/learner", "/__properties/result")
+                for name in chunk.to_record_batch().schema.names
+            }
+            assert {"delta", "tau", "seed", "iterations", "modules"} <= properties
+    assert len(names) == 4
 
 
-def test_only_what_is_missing_or_old_is_built(sweep, tmp_path):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    collect_views(runs_in(sweep), tmp_path / "a")
+def test_the_manifest_of_a_run_says_what_its_log_says(sweep):
+    run = sweep / "trials" / "trial1"
+    outline = read_outline(run)
+    streams, manifest = outline.names(), outline.header.manifest
+    result = {
+        "iterations": outline.iterations,
+        "frames": outline.frames,
+        "modules": [{"stream": streams[saved.stream]} for saved in outline.saved],
+        "ended": "max_iterations",
+        "signals_sha256": "0" * 64,
+    }
+    document = {"config": manifest["config"], "seed": manifest["seed"], "result": result}
+    (run / "run.json").write_text(json.dumps(document), "utf-8")
+    assert read_properties(run) == properties_of(outline, run)
+    result["modules"] = "?"
+    (run / "run.json").write_text(json.dumps(document), "utf-8")
+    assert read_properties(run) == properties_of(outline, run)
+
+
+def test_only_what_is_missing_or_old_is_built(sweep):
+    for run in runs_in(sweep):
+        ready_view(run)
     before = {run: (run / "run.rrd").stat().st_mtime_ns for run in runs_in(sweep)}
     (runs_in(sweep)[1] / "run.rrd").unlink()
-    seen = []
-    collect_views(runs_in(sweep), tmp_path / "b", lambda done, total: seen.append((done, total)))
-    after = {run: (run / "run.rrd").stat().st_mtime_ns for run in runs_in(sweep)}
+    after = {run: ready_view(run).stat().st_mtime_ns for run in runs_in(sweep)}
     assert [before[run] == after[run] for run in before] == [True, False, True]
-    assert seen == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
@@ -84,8 +110,12 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
             found = re.search(r"3 runs at (rerun\+http://127\.0\.0\.1:\d+)/entry/(\w+)", line)
         (dataset,) = CatalogClientInternal(found[1]).datasets(include_hidden=False)
         assert str(dataset.entry_details().id) == found[2]
-        names = {_identity(run / "run.rrd") for run in runs_in(sweep)}
-        assert set(dataset.segment_ids()) == names
+        assert set(dataset.segment_ids()) == {run_identity(run) for run in runs_in(sweep)}
+        end = time.monotonic() + 60
+        while dict(dataset.info().layers).get(LAYER) != 3:  # the views follow the table
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert set(dataset.segment_ids()) == {_identity(run / "run.rrd") for run in runs_in(sweep)}
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) == 130
     finally:
