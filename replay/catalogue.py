@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import subprocess
 import sys
 import tempfile
 import threading
@@ -18,18 +19,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rerun.chunk import RrdReader
+from rerun_bindings import CatalogClientInternal, RrdReaderInternal
 
 from cdmisfa.errors import CdmisfaError, UsageError
-from replay.properties import run_identity, write_row
+from replay.program import free_port, has_display, running
+from replay.properties import APPLICATION, read_properties, run_identity, write_rows
 from replay.runlog import is_run, run_log
-from replay.viewer import free_port, has_display, run_program
 
 VIEW_FILE = "run.rrd"
 """Name of the view in a run's folder."""
 
 TRIALS = "trials"
 """Folder of a sweep that holds its runs."""
+
+ROWS = "base"
+"""Name of the layer of rows."""
 
 LAYER = "view"
 """Name of the layer of views, beside that of the rows."""
@@ -38,12 +42,18 @@ TOGETHER = 100
 """Views that are registered at once: each time the server goes over all that it has."""
 
 REGISTER_SECONDS = 300
-"""Longest wait for the server to read the views that are registered at once."""
+"""Longest wait for the server to read what is registered at once."""
+
+START_SECONDS = 60.0
+"""Longest wait for the server to listen."""
 
 LAST_SECONDS = 5.0
 """Longest wait, at the end, for the view that is being built."""
 
 Progress = Callable[[int, int], None]
+
+REFUSALS = (OSError, RuntimeError, ValueError)
+"""What Rerun's client raises when the server refuses, or is not there."""
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -98,41 +108,100 @@ def serve_catalogue(
         raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
     port, ended = port or free_port(), threading.Event()
     address = f"rerun+http://127.0.0.1:{port}"
-    with tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place:
-        for i, run in enumerate(runs):
-            write_row(run, Path(place) / f"{i:05d}.rrd")
+    with (
+        tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place,
+        running(["server", "--host", "127.0.0.1", "--port", str(port)]) as server,
+    ):
+        files = write_rows(runs, Path(place))  # while the server starts
+        dataset = _created(address, _dataset_name(folder), server)
+        if dataset is None:
+            return
+        refused = _register(dataset, files, ROWS)
+        for file, reason in refused.items():
+            print(f"{runs[files.index(file)]} has no row: {reason}", file=sys.stderr, flush=True)
+        table = f"{address}/entry/{dataset.entry_details().id}"
+        shown = f"{len(runs) - len(refused)} runs at {table}    look at them: rerun {table}"
+        print(shown, file=sys.stderr, flush=True)
         follow = threading.Thread(
-            target=_follow, args=(runs, address, progress, ended), daemon=True
+            target=_follow, args=(runs, dataset, Path(place), table, progress, ended), daemon=True
         )
         follow.start()
-        arguments = ["server", "--host", "127.0.0.1", "--port", str(port)]
         try:
-            run_program([*arguments, "--dataset", f"{_dataset_name(folder)}={place}"])
+            server.wait()
         finally:
             ended.set()
             follow.join(LAST_SECONDS)
 
 
+def _created(address: str, name: str, server: subprocess.Popen[bytes]) -> Any:
+    """A new dataset of a server that is starting; None where the server has ended.
+
+    Raises:
+        CdmisfaError: it does not listen in time.
+    """
+    # Rerun's public client of a catalogue needs DataFusion; for this it is too much.
+    end, refusal = time.monotonic() + START_SECONDS, ""
+    while time.monotonic() < end:
+        if server.poll() is not None:
+            return None
+        try:
+            return CatalogClientInternal(address).create_dataset(name)
+        except REFUSALS as error:
+            refusal = str(error).splitlines()[0]
+        time.sleep(0.01)
+    raise CdmisfaError(f"the server did not start within {START_SECONDS:.0f} s: {refusal}")
+
+
 def _follow(
-    runs: Sequence[Path], address: str, progress: Progress | None, ended: threading.Event
+    runs: Sequence[Path],
+    dataset: Any,
+    place: Path,
+    table: str,
+    progress: Progress | None,
+    ended: threading.Event,
 ) -> None:
-    """Say where the table of runs is, once it is served, open it there, and add the views."""
-    table = table_address(address, len(runs), ended=ended)
-    if ended.is_set():
-        return
-    print(
-        f"{len(runs)} runs at {table}    look at them: rerun {table}", file=sys.stderr, flush=True
-    )
+    """Open the table of runs, and add the views to it."""
     if has_display():
         from replay.live import open_live
 
         open_live(table)
-    add_views(runs, address, progress, ended)
+    try:
+        set_layout(runs, dataset, place)
+    except (CdmisfaError, *REFUSALS) as error:
+        print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
+    try:
+        add_views(runs, dataset, place, progress, ended)
+    except REFUSALS as error:
+        if not ended.wait(1.0):  # the server goes first
+            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+
+
+def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
+    """Make the layout of the run that learned most the one in which every run opens.
+
+    Args:
+        runs: folders of runs.
+        dataset: the server's.
+        place: folder of the layout's file.
+
+    Raises:
+        LogDamagedError: that run cannot be read.
+    """
+    from replay.layout import RunLayout  # takes half a second: only once the table is there
+    from replay.outline import read_outline
+
+    most = max(runs, key=lambda run: int(read_properties(run)["result"]["modules"]))
+    file = place / "layout.rbl"
+    RunLayout(read_outline(most)).blueprint().save(APPLICATION, str(file))
+    layouts = dataset.blueprint_dataset()
+    (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
+    dataset.set_default_blueprint_segment_id(segment)
 
 
 def add_views(
     runs: Sequence[Path],
-    address: str,
+    dataset: Any,
+    place: Path,
     progress: Progress | None = None,
     ended: threading.Event | None = None,
 ) -> None:
@@ -142,7 +211,8 @@ def add_views(
 
     Args:
         runs: folders of runs.
-        address: of the server, "rerun+http://127.0.0.1:PORT".
+        dataset: the server's.
+        place: folder for copies of views.
         progress: called with the runs that are done, and all.
         ended: set once the server has ended.
     """
@@ -157,67 +227,42 @@ def add_views(
                 print(f"{run} has no view: {error}", file=sys.stderr, flush=True)
             if progress is not None:
                 progress(i, len(runs))
-        try:
-            _register(address, views)
-        except (OSError, RuntimeError, ValueError) as error:
-            if ended is None or not ended.wait(1.0):  # the server goes first
-                print(f"views are not served: {error}", file=sys.stderr, flush=True)
+        # The rows hold the properties too, perhaps in other types: a table's column has one.
+        bare = {
+            _without_properties(view, place / f"view-{start + i:05d}.rrd"): view
+            for i, view in enumerate(_register(dataset, views, LAYER))
+        }
+        for copy, reason in _register(dataset, list(bare), LAYER).items():
+            print(f"{bare[copy]} is not served: {reason}", file=sys.stderr, flush=True)
 
 
-def _register(address: str, views: Sequence[Path]) -> None:
-    if not views:
-        return
-    names, layers = [view.resolve().as_uri() for view in views], [LAYER] * len(views)
-    _dataset(address).register(names, layers, "replace").wait(REGISTER_SECONDS)
+def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str]:
+    """Add recordings to a dataset; those that the server refuses, with its reasons."""
+    if not files:
+        return {}
+    names = {file.resolve().as_uri(): file for file in files}
+    handle = dataset.register(list(names), [layer] * len(names), "replace")
+    answers = handle.iter_results(REGISTER_SECONDS)
+    return {names[name]: reason.splitlines()[-1] for name, _, reason in answers if reason}
+
+
+def _without_properties(view: Path, out: Path) -> Path:
+    """A copy of a view that leaves a run's properties to its row."""
+    reader = RrdReaderInternal(str(view))
+    (store,) = (s for s in reader.store_entries() if s.kind == "recording")
+    kept = reader.stream(store).drop_matching(content=["/__properties/**"])
+    kept.write_rrd(str(out), store.application_id, store.recording_id)
+    return out
 
 
 def _dataset_name(folder: Path) -> str:
     """A folder's name in the letters that the server takes."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", folder.resolve().name).strip("_.-") or "runs"
-
-
-def _dataset(address: str) -> Any:
-    """A server's one dataset."""
-    # Rerun's public client of a catalogue needs DataFusion; to ask for a name it is too much.
-    from rerun_bindings import CatalogClientInternal
-
-    (dataset,) = CatalogClientInternal(address).datasets(include_hidden=False)
-    return dataset
-
-
-def table_address(
-    address: str, count: int, seconds: float = 60.0, ended: threading.Event | None = None
-) -> str:
-    """Where a server's one dataset is, so that the viewer opens with its table.
-
-    Waits until every run is in it: a viewer that has asked does not ask again.
-
-    Args:
-        address: of the server, "rerun+http://127.0.0.1:PORT".
-        count: how many runs there are.
-        seconds: how long to wait for them.
-        ended: set once the server has ended.
-
-    Returns:
-        The table's address; the server's own, from where it is one click to the table, where
-        the server does not say.
-    """
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and not (ended is not None and ended.is_set()):
-        try:
-            dataset = _dataset(address)
-            if len(dataset.segment_ids()) >= count:
-                return f"{address}/entry/{dataset.entry_details().id}"
-        except (ConnectionError, OSError, RuntimeError, ValueError):
-            pass  # it does not listen yet
-        except (AttributeError, TypeError):  # another version of Rerun
-            break
-        time.sleep(0.05)
-    return address
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", folder.resolve().name).strip("_.-")[:180] or "runs"
 
 
 def _identity(view: Path) -> str:
     """Name of the recording in a view, "" where it cannot be read."""
-    with contextlib.suppress(RuntimeError, ValueError, OSError):
-        return str(RrdReader(str(view)).recordings()[0].recording_id)
+    with contextlib.suppress(*REFUSALS):
+        stores = RrdReaderInternal(str(view)).store_entries()
+        return next((str(s.recording_id) for s in stores if s.kind == "recording"), "")
     return ""

@@ -25,12 +25,12 @@ from cdmisfa.signals import SCHEMA_VERSION, BlockSignals
 from replay.config import ViewConfig
 from replay.layout import MOST_MODULES, RunLayout
 from replay.outline import LINES, Outline
+from replay.program import environment, free_port, program
 from replay.properties import APPLICATION
 from replay.run_view import RunView
 from replay.runlog import RunHeader, read_header, run_log
 from replay.signal_columns import columns_of_records
 from replay.stretch import read_stretches
-from replay.viewer import environment, free_port, program
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""

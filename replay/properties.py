@@ -1,21 +1,25 @@
-"""What a run was and came to: the columns that the viewer's tables of runs show."""
+"""What a run was and came to: the columns that the viewer's tables of runs show.
+
+Rows are written with the bindings below Rerun's package, which takes half a second to import.
+"""
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import rerun as rr
-from rerun.chunk import Chunk, ChunkStore
+import pyarrow as pa
+from rerun_bindings import ChunkInternal, ChunkStoreInternal, ComponentDescriptor
 
 from cdmisfa.errors import CdmisfaError
 from replay.labels import label
-from replay.outline import Outline, read_outline
 from replay.runlog import run_log
+
+if TYPE_CHECKING:
+    from replay.outline import Outline
 
 APPLICATION = "cdmisfa"
 """Rerun's application id: one layout is remembered for it."""
@@ -86,34 +90,83 @@ def read_properties(run: Path) -> Sections:
             **_ending(manifest),
         }
     except (KeyError, TypeError, ValueError):
+        from replay.outline import read_outline  # only where there is no result
+
         return properties_of(read_outline(run), run)
     return {**_configuration(manifest), "result": result}
 
 
-def write_row(run: Path, out: Path) -> None:
-    """Write a recording that holds a run's properties only, as the row of a table.
+def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
+    """Write recordings that hold the properties of runs only, as the rows of a table.
+
+    A column has one type: text where the runs' values are of several, as "auto" and 0.5 are.
+
+    Args:
+        runs: folders of runs.
+        folder: of the files.
 
     Raises:
         UsageError: there is no such run.
         LogDamagedError: it cannot be read.
-        CdmisfaError: the row cannot be written.
+        CdmisfaError: a row cannot be written.
     """
-    sections = read_properties(run)
-    try:
-        chunks = [
-            Chunk.from_property(name, _batches(json.dumps(values)))
-            for name, values in sections.items()
-        ]
-        store = ChunkStore.from_chunks(chunks)
-        store.write_rrd(out, application_id=APPLICATION, recording_id=run_identity(run))
-    except (RuntimeError, OSError, ValueError) as error:
-        raise CdmisfaError(f"{out} cannot be written: {error}") from error
+    rows = [read_properties(run) for run in runs]
+    types: dict[tuple[str, str], set[type]] = {}
+    for row in rows:
+        for section, values in row.items():
+            for name, value in values.items():
+                types.setdefault((section, name), set()).add(type(value))
+    columns = {column: _joint(found) for column, found in types.items()}
+    cells: dict[tuple[str, str, Any], pa.Array] = {}  # runs of a sweep share most
+    files = []
+    for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
+        out = folder / f"{i:05d}.rrd"
+        try:
+            chunks = [
+                ChunkInternal.from_property(section, _components(section, values, columns, cells))
+                for section, values in row.items()
+            ]
+            stream = ChunkStoreInternal.from_chunks(chunks).stream()
+            stream.write_rrd(str(out), APPLICATION, run_identity(run))
+        except (RuntimeError, OSError, OverflowError, ValueError) as error:
+            raise CdmisfaError(f"{out} cannot be written: {error}") from error
+        files.append(out)
+    return files
 
 
-@functools.lru_cache(maxsize=1024)
-def _batches(values: str) -> tuple[rr.DescribedComponentBatch, ...]:
-    """A section's values, given as JSON, as Rerun stores them; runs of a sweep share most."""
-    return tuple(rr.AnyValues(**json.loads(values)).as_component_batches())
+def property_chunks(sections: Sections) -> list[ChunkInternal]:
+    """The properties of one run as Rerun's chunks."""
+    return [
+        ChunkInternal.from_property(
+            section,
+            {ComponentDescriptor(name): pa.array([value]) for name, value in values.items()},
+        )
+        for section, values in sections.items()
+    ]
+
+
+def _joint(types: Iterable[type]) -> type:
+    """The type that holds values of all these."""
+    found = set(types)
+    if len(found) == 1:
+        return found.pop()
+    return float if found == {int, float} else str
+
+
+def _components(
+    section: str,
+    values: Mapping[str, Any],
+    columns: Mapping[tuple[str, str], type],
+    cells: dict[tuple[str, str, Any], pa.Array],
+) -> dict[ComponentDescriptor, pa.Array]:
+    """A section's values as Rerun stores them, in the types of their columns."""
+    components = {}
+    for name, value in values.items():
+        key = section, name, (type(value), value)
+        if key not in cells:
+            cells[key] = pa.array([columns[section, name](value)])
+        components[ComponentDescriptor(name)] = cells[key]
+    return components
 
 
 def _configuration(manifest: Mapping[str, Any]) -> Sections:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import rerun as rr
+from rerun.chunk import Chunk
 
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.logfile import partial_path
@@ -19,7 +20,7 @@ from replay.labels import label
 from replay.layout import RunLayout
 from replay.modules import MODULES_FILE, load_modules
 from replay.outline import Tally, read_outline
-from replay.properties import APPLICATION, identity, properties_of
+from replay.properties import APPLICATION, identity, properties_of, property_chunks
 from replay.recording_view import write_recording, write_unwatched
 from replay.run_view import RunView
 from replay.runlog import is_run, read_header, run_log
@@ -121,8 +122,8 @@ def _write_run(
         ended = next((e.text for e in stretch.events if e.text.startswith(ENDED)), ended)
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
-    for section, values in properties_of(outline, folder).items():
-        recording.send_property(section, rr.AnyValues(**values))
+    # Not as `AnyValues`, which lose a value of another type than the process's first of its name.
+    recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
     text = label(summary_text(outline, _name(log), _sentence(ended)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)

@@ -11,22 +11,33 @@ import sys
 import time
 
 import pytest
-from rerun.chunk import RrdReader
+from rerun.chunk import Chunk, ChunkStore, RrdReader
 from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
 
-from cdmisfa.errors import UsageError
+from cdmisfa.errors import CdmisfaError, UsageError
 from replay.catalogue import (
     LAYER,
+    ROWS,
+    _created,
     _identity,
+    _register,
+    add_views,
     ready_view,
     runs_in,
     serve_catalogue,
-    table_address,
+    set_layout,
 )
 from replay.outline import read_outline
-from replay.properties import properties_of, read_properties, run_identity, write_row
-from replay.viewer import free_port
+from replay.program import free_port, running
+from replay.properties import (
+    properties_of,
+    property_chunks,
+    read_properties,
+    run_identity,
+    write_rows,
+)
+from replay.viewer import headless_viewer, missing_driver
 
 
 @pytest.fixture
@@ -49,9 +60,8 @@ def test_rows_and_views_of_a_run_have_one_name_and_say_what_was_run(sweep, tmp_p
     ready_view(sweep / "trials" / "trial0")
     shutil.copytree(sweep / "trials" / "trial0", sweep / "trials" / "copy of a #1")
     names = set()
-    for i, run in enumerate(runs_in(sweep)):
-        row = tmp_path / f"{i}.rrd"
-        write_row(run, row)
+    rows = write_rows(runs_in(sweep), tmp_path)
+    for run, row in zip(runs_in(sweep), rows, strict=True):
         assert _identity(row) == _identity(ready_view(run)) == run_identity(run)
         names.add(_identity(row))
         for file in (row, run / "run.rrd"):
@@ -123,6 +133,74 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
         process.communicate()
 
 
-def test_a_server_that_does_not_answer_is_named_all_the_same():
-    address = f"rerun+http://127.0.0.1:{free_port()}"
-    assert table_address(address, 1, seconds=0.3) == address
+@pytest.fixture
+def dataset():
+    """An empty dataset of a server."""
+    port = str(free_port())
+    with running(["server", "--host", "127.0.0.1", "--port", port]) as server:
+        yield _created(f"rerun+http://127.0.0.1:{port}", "runs", server)
+
+
+def manifest(run, **learner):
+    """Give a run a manifest that says this of its learner."""
+    document = {
+        "config": {"learner": learner},
+        "seed": 1,
+        "result": {"iterations": 6, "frames": 240, "modules": [], "ended": "max_iterations"},
+    }
+    (run / "run.json").write_text(json.dumps(document), "utf-8")
+
+
+def cells(file, name):
+    """Values of a property in a recording."""
+    return [
+        value
+        for chunk in RrdReader(str(file)).stream()
+        if chunk.entity_path == "/__properties/learner"
+        for value in chunk.to_record_batch().column(name).flatten().to_pylist()
+    ]
+
+
+def test_a_column_of_several_types_keeps_every_cell(sweep, tmp_path, dataset, capfd):
+    runs = runs_in(sweep)
+    for run, beta, nu in zip(runs, ("auto", 0.5, 2), (0.25, 1, 0.5), strict=True):
+        manifest(run, beta=beta, nu=nu)
+    rows = write_rows(runs, tmp_path)
+    assert [cells(row, "beta") for row in rows] == [["auto"], ["0.5"], ["2"]]
+    assert [cells(row, "nu") for row in rows] == [[0.25], [1.0], [0.5]]
+    assert _register(dataset, rows, ROWS) == {}
+    # Views were made for themselves, in types of their own.
+    for run, beta in zip(runs, ("auto", 0.5, 2), strict=True):
+        stream = RrdReader(str(ready_view(run))).stream()
+        chunks = [c for c in stream if not c.entity_path.startswith("/__properties")]
+        chunks += [Chunk(c) for c in property_chunks({"learner": {"beta": beta}})]
+        ChunkStore.from_chunks(chunks).write_rrd(
+            run / "run.rrd", application_id="cdmisfa", recording_id=run_identity(run)
+        )
+    add_views(runs, dataset, tmp_path)
+    assert dict(dataset.info().layers) == {ROWS: 3, LAYER: 3}
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.skipif(bool(missing_driver()), reason=missing_driver())
+def test_a_run_opens_in_the_prepared_layout(sweep, tmp_path, dataset):
+    runs = runs_in(sweep)
+    assert _register(dataset, write_rows(runs, tmp_path), ROWS) == {}
+    set_layout(runs, dataset, tmp_path)
+    add_views(runs, dataset, tmp_path)
+    url = dataset.segment_url(run_identity(runs[1]))
+    with headless_viewer("1200x800") as viewer:
+        viewer.ask(lambda client: client.open(url) or True)
+        names = viewer.ask(lambda client: {view.name for view in client.get_state().views})
+    assert {"Events", "Change of weights ξ"} <= names  # as the views of one run are called
+
+
+def served_nothing():
+    with running(["server", "--port", "?"]) as server:
+        server.wait()
+        assert _created(f"rerun+http://127.0.0.1:{free_port()}", "runs", server) is None
+
+
+def test_a_server_that_has_ended_is_not_waited_for():
+    with pytest.raises(CdmisfaError, match="code"):
+        served_nothing()

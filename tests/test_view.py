@@ -29,6 +29,7 @@ from replay.columns import tensor_array
 from replay.config import ViewConfig
 from replay.modules import save_modules
 from replay.outline import read_outline
+from replay.program import check_limit, environment, program, run_program
 from replay.runlog import read_signals
 from replay.summary import summary_text
 from replay.view import build_view
@@ -381,8 +382,8 @@ def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):
 
 
 def test_telemetry_is_off():
-    assert viewer.environment()["CI"] == "1"
-    assert viewer.program().is_file()
+    assert environment()["CI"] == "1"
+    assert program().is_file()
 
 
 def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
@@ -395,7 +396,7 @@ def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
     for limit in ("banana", "4", "GB", "-1GB"):
         with pytest.raises(UsageError, match="4GB or 75%"):
             viewer.open_window(tmp_path, memory_limit=limit)
-    assert [viewer.check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
+    assert [check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
     last = max(s.t + len(s.y) - 1 for s in read_signals(tmp_path))
     with pytest.raises(UsageError, match=f"the last of .* is {last}$"):
         viewer.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)
@@ -408,7 +409,7 @@ def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
     program.write_text(f"#!/bin/sh\necho $$ > {told}.part\nmv {told}.part {told}\nexec sleep 60\n")
     program.chmod(0o755)
     code = (
-        "import sys, pathlib, replay.viewer as v\n"
+        "import sys, pathlib, replay.program as v\n"
         f"v.program = lambda: pathlib.Path({str(program)!r})\n"
         "v.run_program([])\n"
     )
@@ -426,12 +427,12 @@ def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
 
 
 def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
-    program = tmp_path / "program"
-    program.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
-    program.chmod(0o755)
-    monkeypatch.setattr(viewer, "program", lambda: program)
+    script = tmp_path / "program"
+    script.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
+    script.chmod(0o755)
+    monkeypatch.setattr("replay.program.program", lambda: script)
     with pytest.raises(CdmisfaError, match="code 3: no luck"):
-        viewer.run_program([])
+        run_program([])
     assert capfd.readouterr().err == ""
 
 

@@ -21,7 +21,7 @@ from PIL import Image
 from run_data import VECTOR, write_run
 
 from replay import webpage
-from replay.viewer import free_port
+from replay.program import free_port
 from replay.webpage import policy, serve_page
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

@@ -163,7 +163,7 @@ def go_on(ctx: click.Context, run: Path | None) -> None:
 def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
     from replay.live import open_live
-    from replay.viewer import has_display
+    from replay.program import has_display
 
     click.echo(f"live view {address}    look at it: rerun --connect {address}", err=True)
     if has_display():

@@ -54,17 +54,18 @@ def view_command(
         raise click.UsageError("choose one of --save, --web and --screenshot")
     if at is not None and screenshot is None:
         raise click.UsageError("--at goes with --screenshot")
-    import replay.viewer as viewer
     from replay.catalogue import runs_in, serve_catalogue
+    from replay.program import check_limit
 
-    viewer.check_limit(memory_limit)
-
+    check_limit(memory_limit)
     if runs_in(run):
         if save is not None or web or screenshot is not None:
             raise click.UsageError(f"{run} holds many runs, which are only served: name one run")
         with bar("preparing views", "runs") as shown:
             serve_catalogue(run, progress=shown.update)
         return
+    import replay.viewer as viewer  # only here: it takes half a second
+
     if save is not None:
         viewer.save(run, save, every=every, all_views=all_views, force=force)
         click.echo(f"view {save}", err=True)
