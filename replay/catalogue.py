@@ -16,6 +16,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -190,9 +191,17 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
     from replay.layout import RunLayout  # takes half a second: only once the table is there
     from replay.outline import read_outline
 
-    most = max(runs, key=lambda run: int(read_properties(run)["result"]["modules"]))
+    results = [read_properties(run)["result"] for run in runs]
+    most = max(range(len(runs)), key=lambda i: int(results[i]["modules"]))
+    outline = read_outline(runs[most])
+    # Its own ranges would cut the others' curves off: the viewer chooses each run's.
+    outline = replace(
+        outline,
+        frames=max(int(result["frames"]) for result in results),
+        lines={name: values[:0] for name, values in outline.lines.items()},
+    )
     file = place / "layout.rbl"
-    RunLayout(read_outline(most)).blueprint().save(APPLICATION, str(file))
+    RunLayout(outline).blueprint().save(APPLICATION, str(file))
     layouts = dataset.blueprint_dataset()
     (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
     dataset.set_default_blueprint_segment_id(segment)

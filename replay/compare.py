@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -11,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.signals import BlockSignals, canonical_bytes, values
-from replay.runlog import read_header, read_signals
+from replay.runlog import RunHeader, read_header, read_signals
+
+Pair = tuple[BlockSignals | None, BlockSignals | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,27 +64,35 @@ class Difference:
         }
 
 
-def compare(first: Path, second: Path) -> Difference | None:
+def compare(
+    first: Path, second: Path, headers: tuple[RunHeader, RunHeader] | None = None
+) -> Difference | None:
     """The first difference between two runs' signals, or None where every bit is the same.
 
     Runs of different versions of the record differ by that; the first difference is then
     sought among the signals that both hold.
 
+    Args:
+        first: a run.
+        second: another one.
+        headers: what stands at the beginning of their logs, where that was read already.
+
     Raises:
         UsageError: one of them is no run.
         LogDamagedError: one of them cannot be read.
     """
-    versions = read_header(first).schema, read_header(second).schema
-    found = _first_difference(first, second, min(versions))
+    a, b = headers or (read_header(first), read_header(second))
+    versions = a.schema, b.schema
+    pairs = zip_longest(read_signals(first, a), read_signals(second, b))
+    found = _first_difference(pairs, min(versions))
     if versions[0] == versions[1]:
         return found
     found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
     return replace(found, versions=versions)
 
 
-def _first_difference(first: Path, second: Path, version: int) -> Difference | None:
+def _first_difference(pairs: Iterable[Pair], version: int) -> Difference | None:
     """The first difference among the signals of a version of the record."""
-    pairs = zip_longest(read_signals(first), read_signals(second))
     for iteration, (a, b) in enumerate(pairs):
         if a is None or b is None:
             ended, more = f"ended after {iteration} iterations", "goes on"

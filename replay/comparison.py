@@ -83,10 +83,13 @@ def survey(runs: Sequence[Path]) -> tuple[Row, ...]:
         UsageError: one of them is no run.
         LogDamagedError: one of them cannot be read.
     """
-    return tuple(
-        Row(_name(run), read_outline(run), compare(runs[0], run) if i else None)
-        for i, run in enumerate(runs)
-    )
+    rows: list[Row] = []
+    for run in runs:
+        outline, found = read_outline(run), None
+        if rows:
+            found = compare(runs[0], run, (rows[0].outline.header, outline.header))
+        rows.append(Row(_name(run), outline, found))
+    return tuple(rows)
 
 
 def build_overlay(

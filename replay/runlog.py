@@ -339,15 +339,19 @@ def _schema(log: Path, found: Mapping[str, str]) -> int:
     return version
 
 
-def read_signals(path: Path) -> Iterator[BlockSignals]:
+def read_signals(path: Path, header: RunHeader | None = None) -> Iterator[BlockSignals]:
     """Every iteration's record, in order; NaN where an older log lacks a signal.
+
+    Args:
+        path: of the run.
+        header: what stands at the beginning of its log, where that was read already.
 
     Raises:
         UsageError: there is no such run, or it is of a later version of this software.
         LogDamagedError: a record is damaged, or a finished file is cut short.
     """
     log = run_log(path)
-    version = read_header(log).schema
+    version = (header or read_header(log)).schema
     for _, data in _messages(log, SIGNALS_TOPIC):
         yield signals_message.decode(data, f"{log} {SIGNALS_TOPIC}", version)
 
