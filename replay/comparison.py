@@ -1,11 +1,9 @@
-"""Many runs side by side: a table of what they came to, and their curves in one view."""
+"""The curves of many runs in one view, and the table of what they came to beside them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -15,13 +13,13 @@ from numpy.typing import NDArray
 from cdmisfa.errors import UsageError
 from cdmisfa.signals import SIGNALS, BlockSignals
 from replay.columns import ITERATION, Clock, Column
-from replay.compare import Difference, compare
+from replay.compare import Difference
 from replay.config import ViewConfig
 from replay.labels import label, part
 from replay.layout import blueprint, lines, whole
-from replay.outline import Outline, read_outline
 from replay.palette import colour, packed
-from replay.runlog import read_signals, run_log
+from replay.runlog import read_signals
+from replay.survey import HEAD, Row
 from replay.view import recording_to
 
 CURVES = {
@@ -37,59 +35,6 @@ CURVES = {
 FIRST_TAB = ("eta_dot", "epsilon")
 
 R_STAY = "R_stay"
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A run in a table of runs.
-
-    Attributes:
-        name: of the run's folder.
-        outline: the run in short.
-        difference: where its signals first differ from the first run's; None where every
-            bit is the same, as for the first run itself.
-    """
-
-    name: str
-    outline: Outline
-    difference: Difference | None
-
-    def as_json(self) -> dict[str, Any]:
-        """The row as JSON values."""
-        streams = self.outline.names()
-        return {
-            "run": self.name,
-            "seed": self.outline.header.manifest.get("seed"),
-            "iterations": self.outline.iterations,
-            "modules": [streams[saved.stream] for saved in self.outline.saved],
-            "first_difference": None if self.difference is None else self.difference.as_json(),
-        }
-
-    def cells(self) -> tuple[str, ...]:
-        """The row as words, in the order of `HEAD`."""
-        found = self.as_json()
-        same = "identical, bit for bit" if self.difference is None else str(self.difference)
-        learned = ", ".join(found["modules"]) or "none"
-        return self.name, str(found["seed"]), str(found["iterations"]), learned, same
-
-
-HEAD = ("run", "seed", "iterations", "modules", "against the first run")
-
-
-def survey(runs: Sequence[Path]) -> tuple[Row, ...]:
-    """What each run came to, and where it first differs from the first one.
-
-    Raises:
-        UsageError: one of them is no run.
-        LogDamagedError: one of them cannot be read.
-    """
-    rows: list[Row] = []
-    for run in runs:
-        outline, found = read_outline(run), None
-        if rows:
-            found = compare(runs[0], run, (rows[0].outline.header, outline.header))
-        rows.append(Row(_name(run), outline, found))
-    return tuple(rows)
 
 
 def build_overlay(
@@ -142,10 +87,6 @@ def _shortly(difference: Difference | None) -> str:
     if difference.iteration < 0:
         return f"{difference.first} against {difference.second}, else identical"
     return f"differs from iteration {difference.iteration}, first in {difference.signal}"
-
-
-def _name(run: Path) -> str:
-    return run_log(run).resolve().parent.name
 
 
 def _write(

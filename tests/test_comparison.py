@@ -8,7 +8,8 @@ from rerun.chunk import RrdReader
 from run_data import VECTOR, write_run
 
 from cdmisfa.errors import UsageError
-from replay.comparison import build_overlay, survey
+from replay.comparison import build_overlay
+from replay.survey import survey
 
 
 @pytest.fixture

@@ -31,10 +31,12 @@ def compare_command(
     """
     if len(runs) < 2:
         raise click.UsageError("name two runs, or more")
-    from replay.comparison import HEAD, build_overlay, survey
+    from replay.survey import HEAD, survey
 
     rows = survey(runs)
     if save is not None:
+        from replay.comparison import build_overlay  # takes half a second
+
         build_overlay(runs, rows, save, force=force)
     different = [row.difference for row in rows if row.difference is not None]
     if as_json:
