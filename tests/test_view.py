@@ -239,7 +239,7 @@ def test_the_overview_of_the_first_version_shows_its_clustering_error(tmp_path):
         view = layout.RunLayout(dataclasses.replace(outline, header=header))._feels()
         names[algorithm] = view.name
     assert "clustering error's mean is below 0.25" in names["1.0"]
-    assert "falls below δ" in names["2.0"]
+    assert "below δ" in names["2.0"]
 
 
 def test_many_streams_show_the_most_watched(tmp_path):
