@@ -76,6 +76,23 @@ def test_more_trials_run_only_what_is_missing(tmp_path: Path) -> None:
     assert counts == [2, 3, 4]
 
 
+def test_results_of_more_or_other_trials_are_replaced_only_with_force(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["reproduce", "stability", "-o", str(tmp_path)]
+    folder = tmp_path / "stability"
+    assert cdmisfa([*command, "--trials", "2"]) in (0, 4)
+    before = {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
+    capsys.readouterr()
+    assert cdmisfa([*command, "--trials", "1"]) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert f"{folder} holds results of 4 trials, 2 of them not among the 2" in message
+    assert "--force" in message
+    assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
+    assert cdmisfa([*command, "--trials", "1", "--force"]) in (0, 4)
+    assert json.loads((folder / "results.json").read_text())["trials"] == 2
+
+
 def test_a_killed_reproduction_goes_on_where_it_stopped(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cdmisfa", "reproduce", "oscillatory"]
     command += ["-o", str(tmp_path), "--trials", "400"]

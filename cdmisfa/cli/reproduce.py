@@ -31,6 +31,7 @@ from cdmisfa.cli.progress import Bar, bar
 @click.option(
     "--page", type=click.Path(path_type=Path), help="Write this Markdown page of all results."
 )
+@click.option("--force", is_flag=True, help="Replace results of more or other trials.")
 @options.as_json
 def reproduce_command(
     name: str | None,
@@ -42,12 +43,14 @@ def reproduce_command(
     recording: Path | None,
     quick: bool,
     page: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Reproduce an experiment of the paper: numbers, tables and figures.
 
     NAME is oscillatory, stability, nonstationary, icub, difficulty or all. Finished trials
-    are kept and not run again. Exit code 4 says that a claim of the paper did not come out.
+    are kept and not run again; results of more or other trials than are asked for now are
+    not replaced without --force. Exit code 4 says that a claim of the paper did not come out.
     Without NAME, --page makes the page from the results that are there.
     """
     from cdmisfa.errors import UsageError
@@ -60,7 +63,7 @@ def reproduce_command(
     names = NAMES if name == "all" else (name,) if name else ()
     documents: list[dict[str, Any]] = []
     for each in names:
-        request = Request(trials, quick, recording, root / each, jobs)
+        request = Request(trials, quick, recording, root / each, jobs, force)
         if each == "icub" and recording is None:
             click.echo(f"icub: records the scene into {root}/icub-recording first", err=True)
         started, finished = time.monotonic(), [0]

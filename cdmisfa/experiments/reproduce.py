@@ -30,6 +30,9 @@ from cdmisfa.experiments.sweep import code
 NAMES = ("oscillatory", "stability", "nonstationary", "icub", "difficulty")
 """The experiments, each a module of this package, in the order of the paper."""
 
+SETTING = "set_"
+"""How the columns of rows.parquet begin that hold a trial's settings."""
+
 Settings = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -44,6 +47,7 @@ class Request:
         recording: folder of a recording, for the experiments that see.
         folder: where the experiment's files go.
         jobs: parallel processes.
+        force: results of more or other trials may be replaced.
     """
 
     trials: int | None
@@ -51,6 +55,7 @@ class Request:
     recording: Path | None
     folder: Path
     jobs: int = 1
+    force: bool = False
 
     def count(self, paper: int, quick: int) -> int:
         """Trials per condition."""
@@ -162,13 +167,16 @@ def reproduce(
         The document of results.json.
 
     Raises:
-        UsageError: no such experiment or engine.
+        UsageError: no such experiment or engine, or the folder holds results of trials that
+            are not asked for, and `force` is not set.
         CdmisfaError: a trial killed every process that ran it; the others are kept.
     """
     module = experiment(name)
     store = request.folder / "trials"
     store.mkdir(parents=True, exist_ok=True)
     planned = module.plan(request)
+    if not request.force:
+        _keep_results(request.folder, planned)
     version = code()
     names = [trial_name(name, settings, version) for settings in planned]
     missing = [i for i, n in enumerate(names) if not (store / f"{n}.npz").exists()]
@@ -265,10 +273,44 @@ def write_rows(path: Path, trials: Sequence[Trial]) -> None:
     import pyarrow
     from pyarrow import parquet
 
-    rows = [{**{f"set_{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
+    rows = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
     partial = path.with_name(path.name + ".partial")
     parquet.write_table(pyarrow.Table.from_pylist(rows), partial)
     os.replace(partial, path)
+
+
+def _keep_results(folder: Path, planned: Sequence[Settings]) -> None:
+    """Refuse to replace results that hold trials which are not planned now.
+
+    Raises:
+        UsageError: they do, or cannot be read.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    path = folder / "rows.parquet"
+    if not path.is_file():
+        return
+    try:
+        rows = parquet.ParquetFile(path).read().to_pylist()
+    except (OSError, pyarrow.ArrowException) as error:
+        raise UsageError(f"{path} is damaged: write it anew with --force") from error
+    known = [_given(settings) for settings in planned]
+    there = [
+        _given({k.removeprefix(SETTING): v for k, v in row.items() if k.startswith(SETTING)})
+        for row in rows
+    ]
+    lost = sum(settings not in known for settings in there)
+    if lost:
+        raise UsageError(
+            f"{folder} holds results of {len(rows)} trials, {lost} of them not among the "
+            f"{len(planned)} asked for now: choose another -o, or replace them with --force"
+        )
+
+
+def _given(settings: Settings) -> Settings:
+    """Settings as they come back from a table, where what one trial lacks is None."""
+    return {k: v for k, v in json.loads(json.dumps(settings)).items() if v is not None}
 
 
 HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
