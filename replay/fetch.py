@@ -17,8 +17,9 @@ def fetched(place: Location) -> Iterator[Path]:
     """Give a path as it is, and a URL as a copy that is gone afterwards.
 
     Raises:
-        LogDamagedError: the server does not give it.
-        CdmisfaError: there is no room for it.
+        UsageError: there is no such object.
+        LogDamagedError: the server sends less than it says, or something else.
+        CdmisfaError: the server does not give it, or there is no room for it.
     """
     if not isinstance(place, Url):
         yield place

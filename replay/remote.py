@@ -37,7 +37,11 @@ Value = TypeVar("Value")
 
 
 class RemoteError(LogDamagedError):
-    """A server that does not give a log, or not the one that was opened."""
+    """A server that sends less than it says, or not the log that was opened."""
+
+
+class UnreachableError(CdmisfaError):
+    """A server that cannot be reached, or does not give parts of the log."""
 
 
 class _Again(Exception):  # noqa: N818 - asks for another try
@@ -74,7 +78,9 @@ class RemoteStore:
         """Look for the object and read its beginning.
 
         Raises:
-            RemoteError: the server does not give it.
+            UsageError: there is no such object.
+            UnreachableError: the server does not give it.
+            RemoteError: what it gives is not what it says.
             CdmisfaError: what reads URLs is not installed.
         """
         self._url = url
@@ -96,7 +102,8 @@ class RemoteStore:
         """Read `count` bytes from `offset` on, fewer only at the end.
 
         Raises:
-            RemoteError: the server does not give them, or the object changed.
+            UnreachableError: the server does not give them.
+            RemoteError: it gives others, or the object changed.
         """
         count = max(min(count, self.size - offset), 0)
         if not count:
@@ -187,13 +194,11 @@ class RemoteStore:
         for attempt in range(_TRIES):
             try:
                 return future.result(_WAIT_SECONDS)
-            except RemoteError as error:
-                raise RemoteError(f"{self._url}: {error}") from None
             except _Again as error:
                 if attempt == _TRIES - 1 or not self.size:
-                    raise RemoteError(f"{self._url}: {error}") from None
+                    raise _refusal(self._url, error.__cause__ or error) from None
             except Exception as error:
-                raise RemoteError(f"{self._url}: {_words(error)}") from None
+                raise _refusal(self._url, error) from None
             time.sleep(0.2 * 4**attempt)
             future = self._start(start, stop)
         raise AssertionError("every try ends")
@@ -264,7 +269,7 @@ class _HttpRemote:
             async with session.get(self._address, headers=headers) as answer:
                 return await self._taken(answer, start, stop)
         except (aiohttp.ClientError, asyncio.IncompleteReadError, TimeoutError) as error:
-            raise _Again(_words(error)) from None
+            raise _Again from error
 
     async def _taken(self, answer: Any, start: int, stop: int) -> Part:
         headers = answer.headers
@@ -273,14 +278,16 @@ class _HttpRemote:
             raise _Again(f"the server answers {answer.status} {answer.reason}")
         if answer.status == 416 and _NOTHING.fullmatch(headers.get("Content-Range", "")):
             return Part(b"", 0, tag)
+        if answer.status in (404, 410):
+            raise UsageError(f"the server answers {answer.status} {answer.reason}")
         if answer.status not in (200, 206):
-            raise RemoteError(f"the server answers {answer.status} {answer.reason}")
+            raise UnreachableError(f"the server answers {answer.status} {answer.reason}")
         if headers.get("Content-Encoding", "identity") != "identity":
-            raise RemoteError("the server packs it on the way: download it first")
+            raise UnreachableError("the server packs it on the way: download it first")
         if answer.status == 200:
             length = headers.get("Content-Length", "")
             if start or not length.isdecimal() or int(length) > stop:
-                raise RemoteError(
+                raise UnreachableError(
                     "the server sends no parts of a file (range requests): download it first"
                 )
             return Part(await answer.content.readexactly(int(length)), int(length), tag)
@@ -321,7 +328,7 @@ def listed(url: Url) -> list[Url]:
 
     Raises:
         UsageError: there is none.
-        RemoteError: the server does not list it.
+        UnreachableError: the server does not list it.
     """
     files = _importing(_s3)
 
@@ -331,7 +338,7 @@ def listed(url: Url) -> list[Url]:
     try:
         names = _waited(files.loop, keys())
     except Exception as error:
-        raise RemoteError(f"{url}: {_words(error)}") from None
+        raise _refusal(url, error) from None
     logs = [Url(f"s3://{n}") for n in sorted(names) if n.endswith((".mcap", ".mcap.partial"))]
     if not logs:
         raise UsageError(f"{url}: no .mcap file below this prefix")
@@ -376,8 +383,22 @@ def _waited(loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, Value]) -
     return asyncio.run_coroutine_threadsafe(work, loop).result(_WAIT_SECONDS)
 
 
+def _refusal(url: Url, error: BaseException) -> CdmisfaError:
+    """What to raise: there is no such object, it came short or changed, or not at all."""
+    kind: type[CdmisfaError] = UnreachableError
+    if isinstance(error, CdmisfaError):
+        kind = type(error)
+    elif isinstance(error, FileNotFoundError):
+        kind = UsageError
+    elif isinstance(error, asyncio.IncompleteReadError) or "Payload" in type(error).__name__:
+        kind = RemoteError
+    return kind(f"{url}: {_words(error)}")
+
+
 def _words(error: BaseException) -> str:
     """What a server, or the way to it, has against us, in one line."""
+    if isinstance(error, CdmisfaError | _Again):
+        return str(error)
     if type(error).__name__ == "NoCredentialsError":
         return (
             "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
