@@ -114,6 +114,7 @@ def _whole_file(out: Path) -> Iterator[Path]:
     """A file to write, which becomes `out` once it is complete."""
     partial = partial_path(out)
     try:
+        out.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         os.replace(partial, out)
     except (OSError, pa.ArrowException) as error:

@@ -44,7 +44,7 @@ def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dic
 
     Raises:
         UsageError: no such log, or the output exists and `force` is not set.
-        LogDamagedError: not an MCAP file.
+        LogDamagedError: not an MCAP file, or nothing in it can be saved.
         LogWriteError: the disk does not take it.
     """
     place, dst = location(src), Path(dst)
@@ -69,7 +69,8 @@ def _recover(src: Path, dst: Path, force: bool) -> dict[str, Any]:
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
-    reports = [_recover_file(f, t, force) for f, t in zip(files, targets, strict=True)]
+    alone = not src.is_dir()  # else it may be that there is something in the other logs
+    reports = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
     return {
         "schema": 1,
         "out": str(dst),
@@ -80,8 +81,11 @@ def _recover(src: Path, dst: Path, force: bool) -> dict[str, Any]:
     }
 
 
-def _recover_file(src: Path, dst: Path, force: bool) -> dict[str, Any]:
+def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> dict[str, Any]:
     with LogReader(src, salvage=True) as reader:
+        found = reader.channels or reader.metadata or reader.attachments
+        if alone and reader.missing and not found:
+            raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             tallies, unverified = _copy(reader, log)

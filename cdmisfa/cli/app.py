@@ -87,6 +87,7 @@ def cli() -> None:
     """Record what a curious robot sees, learn from it live or from the log, and look.
 
     Every command that prints takes --json: one document on stdout, nothing else.
+    An error is one line on stderr, with --json too.
     """
 
 

@@ -44,7 +44,7 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
     for figure in report.figures:
         if figure.suffix == ".png":
             click.echo(f"figure     {figure}")
-    click.echo(f"look at it {sys.argv[0]} view {report.run}")
+    click.echo(f"look at it {options.quoted(sys.argv[0])} view {options.quoted(report.run)}")
 
 
 @contextmanager

@@ -18,6 +18,16 @@ from cdmisfa.cli import options
 PACKAGES = ("numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
 """Packages that no command can do without for long."""
 
+EXTRAS = {
+    "video": (("av",), "videos: learn, convert, export --to mp4"),
+    "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
+    "ros": (("rosbags",), "ROS bags: learn, convert"),
+    "sklearn": (("sklearn",), "the transformer for scikit-learn"),
+    "dask": (("distributed",), "sweep and reproduce --engine dask"),
+    "ray": (("ray",), "sweep and reproduce --engine ray"),
+}
+"""Optional parts of the package: the modules they bring, and what needs them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Check:
@@ -63,6 +73,13 @@ def _packages() -> Iterator[Check]:
             yield Check(name, True, metadata.version(name))
         except metadata.PackageNotFoundError:
             yield Check(name, False, f"pip install {name}")
+
+
+def _extras() -> Iterator[Check]:
+    for extra, (modules, needed_for) in EXTRAS.items():
+        has = all(importlib.util.find_spec(module) is not None for module in modules)
+        detail = "installed" if has else f"pip install 'cdmisfa[{extra}]'"
+        yield Check(f"extra {extra}", has, detail, needed_for)
 
 
 def _simulator() -> Iterator[Check]:
@@ -113,6 +130,7 @@ def _screen() -> Iterator[Check]:
 LOOKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _python,
     _packages,
+    _extras,
     _simulator,
     _kernel_cache,
     _vulkan,

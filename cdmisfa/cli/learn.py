@@ -116,6 +116,7 @@ def learn_command(
         with bar("learning", "blocks") as shown, stoppable() as stop:
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
+            reporter = Reporter(shown)
             result = learn(
                 frames,
                 configuration.learner,
@@ -126,7 +127,7 @@ def learn_command(
                 sections=configuration.tables(),
                 force=force,
                 rerun=not no_rerun,
-                progress=Reporter(shown),
+                progress=reporter,
                 stop=stop,
                 resume=resume,
                 live=live_view,
@@ -138,6 +139,8 @@ def learn_command(
         raise
     finally:
         frames.close()
+    if resume and not reporter.called and not stop():
+        click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)
     if stop():
         ctx.exit(stop.exit_code)
@@ -171,15 +174,21 @@ def announce(address: str) -> None:
 
 
 class Reporter:
-    """Shows a run's progress: every module once, the rest a few times a second."""
+    """Shows a run's progress: every module once, the rest a few times a second.
+
+    Attributes:
+        called: whether anything was learned.
+    """
 
     def __init__(self, shown: Bar) -> None:
         self._shown = shown
+        self.called = False
         self._modules = 0
         self._next = 0.0
 
     def __call__(self, progress: Progress) -> None:
         """Take in where the run stands."""
+        self.called = True
         if progress.modules > self._modules:
             self._modules = progress.modules
             self._shown.say(
@@ -219,5 +228,5 @@ def summary(result: RunResult) -> str:
     lines.append(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     lines.append(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
-        lines.append(f"run {result.run}    look at it: cdmisfa view {result.run}")
+        lines.append(f"run {result.run}    look at it: cdmisfa view {options.quoted(result.run)}")
     return "\n".join(lines)

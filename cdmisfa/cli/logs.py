@@ -76,7 +76,7 @@ def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
     """
     from replay.verify import verify
 
-    document = verify(path)
+    document = {"schema": options.SCHEMA, **verify(path)}
     if as_json:
         options.print_json(document)
     elif document["ok"]:

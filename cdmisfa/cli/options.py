@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import click
 
+from cdmisfa.errors import CdmisfaError
+
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+FETCHED = "cdmisfa.fetched"
+"""Where a command's context keeps the paths of copies, and what they are copies of."""
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -88,8 +95,26 @@ def place_argument(name: str) -> Callable[[Command], Command]:
 
 
 def fetched_argument(name: str) -> Callable[[Command], Command]:
-    """A path; a log behind a URL is copied into a file for as long as the command runs."""
-    return click.argument(name, callback=_fetched)
+    """A path; a log behind a URL is copied into a file for as long as the command runs.
+
+    What the command complains about then names the URL, not the copy.
+    """
+
+    def wrapped(command: Command) -> Command:
+        @functools.wraps(command)
+        def naming_the_url(*args: Any, **values: Any) -> Any:
+            try:
+                return command(*args, **values)
+            except CdmisfaError as error:
+                text = str(error)
+                for copy, url in click.get_current_context().meta.get(FETCHED, ()):
+                    text = text.replace(copy, url)
+                error.args = (text,)
+                raise
+
+        return cast(Command, click.argument(name, callback=_fetched)(naming_the_url))
+
+    return wrapped
 
 
 def _fetched(ctx: click.Context, param: click.Parameter, value: str) -> Path:
@@ -98,7 +123,15 @@ def _fetched(ctx: click.Context, param: click.Parameter, value: str) -> Path:
     from replay.fetch import fetched
     from replay.store import location
 
-    return ctx.with_resource(fetched(location(value)))
+    place = location(value)
+    copy = ctx.with_resource(fetched(place))
+    ctx.meta[FETCHED] = [(str(copy), str(place)), (str(copy.parent), str(place.parent))]
+    return copy
+
+
+def quoted(path: str | Path) -> str:
+    """A path as a shell takes it in a command to copy."""
+    return shlex.quote(str(path))
 
 
 def print_json(document: Mapping[str, Any]) -> None:

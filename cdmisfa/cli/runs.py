@@ -54,7 +54,7 @@ def compare_command(
     else:
         options.print_table(HEAD, [row.cells() for row in rows])
     if save is not None and not as_json:
-        click.echo(f"view {save}    look at it: cdmisfa view {save}", err=True)
+        click.echo(f"view {save}    look at it: cdmisfa view {options.quoted(save)}", err=True)
     if different and len(runs) == 2:
         ctx.exit(NotReproducedError.exit_code)
 
@@ -101,6 +101,8 @@ def export_command(
     """
     from replay.export import CSV_LEAVES_OUT, RECORDINGS, export
 
+    if str(out) == "-":
+        raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
     rows = export(path, out, form, force=force, lossless=lossless)
     if form == "csv":

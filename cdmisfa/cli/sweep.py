@@ -120,7 +120,7 @@ def sweep_command(
         for row in failed:
             at = " ".join(f"{key}={value}" for key, value in row["point"].items())
             click.echo(f"failed: {at} seed {row['seed']}: {row['error']}")
-        click.echo(f"look at it: cdmisfa results {out}")
+        click.echo(f"look at it: cdmisfa results {options.quoted(out)}")
     if failed:
         ctx.exit(1)
 

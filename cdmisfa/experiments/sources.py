@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -188,6 +189,9 @@ def open_source(
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
         return open_scene(kind, configuration.scene, configuration.record), configuration
+    scene = next((word for word in words if word in SCENES), None)
+    if scene is not None and not Path(scene).exists():
+        raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
     from replay.store import Url, location
 
     paths = [location(word) for word in words]
@@ -284,7 +288,7 @@ def _refuse_remote_run(path: Location) -> None:
 
 def _a_run(path: Location) -> UsageError:
     return UsageError(
-        f"{path} is a run, not a recording: look at it with cdmisfa view {path}, "
+        f"{path} is a run, not a recording: look at it with cdmisfa view {shlex.quote(str(path))}, "
         "or learn from what it learned from"
     )
 
@@ -295,8 +299,9 @@ def open_cameras(
     *,
     loop: bool = False,
     salvage: bool = False,
+    goal: tuple[str, str] = ("learn", "RUN"),
 ) -> ForeignSource:
-    """Open the camera logs of others as streams on one clock.
+    """Open the camera logs of others as streams on one clock; see `ForeignSource`.
 
     Raises:
         UsageError: no such log, or streams that need to be aligned.
@@ -312,4 +317,5 @@ def open_cameras(
         rate=cameras.rate,
         loop=loop,
         salvage=salvage,
+        goal=goal,
     )

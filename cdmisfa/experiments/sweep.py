@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from cdmisfa.config import as_table
-from cdmisfa.errors import CdmisfaError, LogDamagedError
+from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.run import learn, module_table, write_json
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
@@ -130,6 +130,8 @@ def sweep(
         EngineError: no scheduler answers.
     """
     folder = Path(folder).resolve()
+    if log := next(folder.glob("*.mcap*"), None):
+        raise UsageError(f"{folder} holds {log.name}, of a run or a recording: choose another -o")
     trials = plan(
         source,
         grid=grid or {},

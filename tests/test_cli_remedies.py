@@ -1,0 +1,102 @@
+"""What the command line says when it is asked for what it cannot do, or need not do."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shlex
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+from web_server import serving
+
+from cdmisfa.cli.doctor import EXTRAS
+
+SHORT = ("--set", "learner.tau=10", "--no-rerun")
+
+
+@pytest.mark.parametrize("words", [("oscillatory", "icub"), ("here", "oscillatory")])
+def test_only_one_scene_can_be_named(cdmisfa: Cdmisfa, words: tuple[str, ...]) -> None:
+    done = cdmisfa("learn", *words)
+    assert done.code == 2
+    assert "is a scene, of which only one can be named" in done.err
+    assert done.err.count("\n") == 1
+
+
+def test_verify_says_its_schema(cdmisfa: Cdmisfa, oscillatory_recording: Path) -> None:
+    assert cdmisfa("verify", oscillatory_recording, "--json").json["schema"] == 1
+
+
+def test_export_writes_no_file_named_dash(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = cdmisfa("export", oscillatory_run, "-o", "-", "--to", "csv")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["y.csv", "y.parquet"])
+def test_export_makes_its_folders(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, name: str
+) -> None:
+    out = tmp_path / "no" / "such" / name
+    assert cdmisfa("export", oscillatory_run, "-o", out).code == 0
+    assert out.stat().st_size > 0
+
+
+def test_errors_about_a_fetched_log_name_its_url(
+    cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path
+) -> None:
+    with serving() as web:
+        web.files["/x1.mcap"] = (oscillatory_recording / "x1.mcap").read_bytes()
+        url = web.url("/x1.mcap")
+        done = cdmisfa("export", url, "-o", tmp_path / "a.csv")
+    assert done.code != 0
+    assert url in done.err
+    assert "/cdmisfa-" not in done.err
+
+
+def test_advice_can_be_pasted_into_a_shell(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    run = tmp_path / "my run #1"
+    done = cdmisfa("learn", "oscillatory", "-o", run, "--max-iterations", 3, *SHORT)
+    advice = done.out.partition("look at it: ")[2]
+    assert shlex.split(advice, comments=True) == ["cdmisfa", "view", str(run)]
+
+
+def test_a_sweep_goes_into_no_run(cdmisfa: Cdmisfa, oscillatory_run: Path) -> None:
+    before = sorted(oscillatory_run.iterdir())
+    done = cdmisfa("sweep", "oscillatory", "-o", oscillatory_run, "--seeds", "0:1")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "run.mcap" in done.err
+    assert sorted(oscillatory_run.iterdir()) == before
+
+
+def test_a_stub_is_not_recovered_as_an_empty_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    stub, out = tmp_path / "stub.mcap", tmp_path / "out.mcap"
+    stub.write_bytes(b"\x89MCAP0\r\n" + bytes([1]) + (100).to_bytes(8, "little") + b"cut")
+    done = cdmisfa("recover", stub, "-o", out)
+    assert (done.code, "nothing in it can be saved" in done.err) == (3, True), done.err
+    assert not out.exists()
+
+
+def test_resuming_what_has_come_as_far_is_said(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    words = ("learn", "oscillatory", "-o", run, *SHORT, "--max-iterations")
+    assert cdmisfa(*words, 5).code == 0
+    again = cdmisfa(*words, 4, "--resume")
+    assert (again.code, "nothing was left to do" in again.err) == (0, True), again.err
+    more = cdmisfa(*words, 6, "--resume")
+    assert (more.code, "nothing was left to do" in more.err) == (0, False), more.err
+
+
+def test_doctor_says_how_to_get_each_extra(
+    cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "s3fs" else find(n))
+    done = cdmisfa("doctor", "--json")
+    details = {check["what"]: check["detail"] for check in json.loads(done.out)["checks"]}
+    assert details["extra cloud"] == "pip install 'cdmisfa[cloud]'"
+    assert {f"extra {name}" for name in EXTRAS} <= details.keys()
