@@ -12,6 +12,8 @@ from conftest import Cdmisfa
 from web_server import serving
 
 from cdmisfa.cli.doctor import EXTRAS
+from cdmisfa.errors import LogDamagedError
+from replay.catalogue import runs_in
 
 SHORT = ("--set", "learner.tau=10", "--no-rerun")
 
@@ -71,6 +73,31 @@ def test_a_sweep_goes_into_no_run(cdmisfa: Cdmisfa, oscillatory_run: Path) -> No
     assert (done.code, done.err.count("\n")) == (2, 1)
     assert "run.mcap" in done.err
     assert sorted(oscillatory_run.iterdir()) == before
+
+
+@pytest.mark.parametrize("words", [(), ("--web",), ("--save", "a.rrd")])
+def test_a_sweep_without_logs_says_how_to_keep_them(
+    cdmisfa: Cdmisfa, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    swept = ("sweep", "oscillatory", "-o", tmp_path, "--seeds", "0:1", "--max-iterations", 2)
+    assert cdmisfa(*swept).code == 0
+    done = cdmisfa("view", tmp_path, *words)
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "this sweep kept no logs: sweep again with --keep-logs" in done.err
+
+
+def test_the_runs_of_a_sweep_are_those_it_was_asked_for_last(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    swept = ("sweep", "oscillatory", "-o", tmp_path, "--keep-logs", "--max-iterations", 2)
+    assert cdmisfa(*swept, "--seeds", "0:2").code == 0
+    assert cdmisfa(*swept, "--seeds", "1:2", "--set", "learner.tau=10").code == 0
+    assert len(list((tmp_path / "trials").iterdir())) == 3
+    (run,) = runs_in(tmp_path)
+    assert json.loads((run / "run.json").read_text())["config"]["learner"]["tau"] == 10
+    (tmp_path / "sweep.json").write_text("{")
+    with pytest.raises(LogDamagedError, match=r"sweep\.json is damaged"):
+        runs_in(tmp_path)
 
 
 def test_a_stub_is_not_recovered_as_an_empty_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.progress import bar
+from cdmisfa.errors import UsageError
 
 FILE = click.Path(path_type=Path)
 
@@ -47,14 +48,14 @@ def view_command(
     """Open a run in the Rerun viewer, or save, serve or picture it.
 
     RUN is the folder of a run, or its run.mcap, a recording, or an .rrd file; of a log behind
-    a URL a copy is made. A sweep that kept its logs is served as a table, one row per run,
-    until interrupted.
+    a URL a copy is made. A sweep that kept its logs is served as a table, one row per run
+    that it was asked for last, until interrupted.
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
         raise click.UsageError("choose one of --save, --web and --screenshot")
     if at is not None and screenshot is None:
         raise click.UsageError("--at goes with --screenshot")
-    from replay.catalogue import runs_in, serve_catalogue
+    from replay.catalogue import is_sweep, runs_in, serve_catalogue
     from replay.program import check_limit
 
     check_limit(memory_limit)
@@ -64,6 +65,8 @@ def view_command(
         with bar("preparing views", "runs") as shown:
             serve_catalogue(run, progress=shown.update)
         return
+    if is_sweep(run):
+        raise UsageError(f"{run}: this sweep kept no logs: sweep again with --keep-logs")
     import replay.viewer as viewer  # only here: it takes half a second
 
     if save is not None:
