@@ -85,12 +85,27 @@ def location(value: str | Path | Url) -> Location:
         raise UsageError(f"{scheme}:// is not read: use one of {', '.join(SCHEMES)}, or a path")
     url = Url(scheme + value[len(found[1]) :])
     try:
-        whole = bool(urlsplit(url.address).netloc and urlsplit(url.address).path.strip("/"))
+        parts = urlsplit(url.address)
+        whole = bool(parts.netloc and parts.path.strip("/"))
     except ValueError:
         whole = False
+    else:
+        _check_port(url)
     if not whole and not (scheme == "s3" and url.address.removeprefix("s3://").strip("/")):
         raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
     return url
+
+
+def _check_port(url: Url) -> None:
+    """Refuse a port that no server can have.
+
+    Raises:
+        UsageError: it is no number up to 65535.
+    """
+    try:
+        _ = urlsplit(url.address).port if url.scheme != "s3" else None
+    except ValueError:
+        raise UsageError(f"{url} has no port: a port is a number up to 65535") from None
 
 
 class Store(Protocol):

@@ -326,6 +326,12 @@ def test_other_schemes_are_refused_by_name(cdmisfa: Cdmisfa) -> None:
         location("https://host")
 
 
+def test_a_port_that_cannot_be_is_one_line(cdmisfa: Cdmisfa) -> None:
+    done = cdmisfa("info", "http://127.0.0.1:99999/x.mcap")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "a port is a number up to 65535" in done.err
+
+
 def test_without_the_packages_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(CdmisfaError, match=r"pip install 'cdmisfa\[cloud\]'"):
