@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from cdmisfa.blocks import Block
 from cdmisfa.errors import UsageError
@@ -57,6 +57,16 @@ class Split:
             f"--split is {text!r}: give a size ({', '.join(_BYTES)}) or a duration "
             f"({', '.join(_SECONDS)}), as 512MB or 10min"
         )
+
+    def __str__(self) -> str:
+        """The limit as `parse` reads it, in the largest unit that it is a multiple of."""
+        units: dict[str, Any] = _SECONDS if self.size is None else _BYTES
+        limit = (self.seconds or 0.0) if self.size is None else self.size
+        least = next(iter(units))
+        unit = max(
+            (u for u in units if limit % units[u] == 0), key=units.__getitem__, default=least
+        )
+        return f"{limit / units[unit]:.6f}".rstrip("0").rstrip(".") + unit
 
     def frames(self, fps: float) -> int | None:
         """Frames of a part, where a duration is given."""
@@ -260,6 +270,8 @@ class ViewParts:
                 return None
             check_identity(best, self._identity.metadata(self.view, self._first))
             done = (path, found[best] - self._first)
+            if self._length is not None and done[1] > self._length:
+                raise self._another_split(best, done[1])
             if best != path or not self._goes_on(done):
                 return best, found[best]
             if found[best] >= frames:
@@ -283,11 +295,14 @@ class ViewParts:
         logs = view_logs(self._folder, self.view, split=True)
         follows = any(_part(path.name) > len(self.parts) for path in logs)
         if follows and self._length is not None and done[1] != self._length:
-            raise UsageError(
-                f"{done[0]} has {done[1]} frames, with this --split it would have {self._length}: "
-                "use the same, or overwrite with --force"
-            )
+            raise self._another_split(*done)
         return follows
+
+    def _another_split(self, path: Path, frames: int) -> UsageError:
+        return UsageError(
+            f"{path} has {frames} frames, with this --split it would have {self._length}: "
+            "use the same, or overwrite with --force"
+        )
 
     def _later_parts(self) -> list[Path]:
         """Logs of parts after the one to go on with, begun when the recorder ended."""

@@ -17,7 +17,7 @@ from cdmisfa.blocks import FrameSource, SourceSpec
 from cdmisfa.config import as_table
 from cdmisfa.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.folder import answered, ask, asked, held
+from recorder.folder import Asked, answered, ask, asked, held
 from recorder.logfile import LogWriteError
 from recorder.messages import HeadPose
 from recorder.parts import Split, ViewParts, view_logs
@@ -88,7 +88,8 @@ def record(
         jobs: processes that render.
         force: overwrite an earlier recording in the folder.
         resume: go on where an earlier attempt with the same arguments ended.
-        split: write every view as parts of limited size or duration.
+        split: write every view as parts of limited size or duration; where a recording is
+            resumed by default as it was begun.
         progress: called after every block; never where there was nothing left to record.
 
     Raises:
@@ -123,6 +124,7 @@ def record(
                 remove_views(folder, names)
             earlier: dict[str, dict[Path, FramesHeld]] = {}
             if resume:
+                split = _as_begun(folder, kind, scene.seed or 0, names, split)
                 earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in names}
                 frames = _length(folder, earlier, frames)
             frames = frames or DEFAULT_FRAMES
@@ -141,7 +143,10 @@ def record(
                 for name in names
             ]
             unfinished = [log.view for log in logs if not log.complete]
-            _note(ask, folder, unfinished, frames)
+            limits = {} if split is None else dict.fromkeys(unfinished, str(split))
+            lengths = dict.fromkeys(unfinished, frames)
+            if unfinished:
+                _note(ask, folder, Asked(lengths, limits, kind, scene.seed or 0))
             for log in logs:
                 open_logs.callback(log.abandon)
                 log.open()
@@ -240,8 +245,31 @@ def _length(
                 f"nothing, give --frames {there.end} or more, or overwrite with --force"
             )
         longest = max(longest, there.end)
-    wanted = asked(folder, list(earlier))
+    wanted = asked(folder).length(list(earlier))
     return frames or max(longest, wanted or (longest if _finished(earlier) else DEFAULT_FRAMES))
+
+
+def _as_begun(
+    folder: Path, kind: str, seed: int, views: Sequence[str], split: Split | None
+) -> Split | None:
+    """Where parts end in a recording that is gone on with.
+
+    Raises:
+        UsageError: it was begun with another scene, seed or split.
+    """
+    known = asked(folder)
+    limits = sorted({known.split[view] for view in views if view in known.split})
+    pairs = [("", known.scene or kind, kind)]
+    pairs.append(("--seed ", str(seed if known.seed is None else known.seed), str(seed)))
+    if limits and split is not None:
+        pairs.append(("--split ", limits[0], str(split)))
+    for option, before, now in pairs:
+        if before != now:
+            raise UsageError(
+                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
+                "same, or overwrite with --force"
+            )
+    return split if split is not None or not limits else Split.parse(limits[0])
 
 
 def _finished(earlier: Mapping[str, Mapping[Path, FramesHeld]]) -> bool:

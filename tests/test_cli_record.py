@@ -11,6 +11,10 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa
 
+from recorder.config import SceneConfig
+from recorder.parts import Split
+from recorder.recording import record
+
 PNG = b"\x89PNG"
 
 
@@ -46,6 +50,42 @@ def test_going_on_with_a_complete_recording_says_so(cdmisfa: Cdmisfa, tmp_path: 
     assert again.err == f"{tmp_path / 'rec'} is complete: nothing was left to record\n"
     longer = cdmisfa(*words, "--resume", "--frames", 150)
     assert (longer.json["frames"], longer.err) == (150, "")
+
+
+def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ("--frames", 400, "--seed", 7, "--split", "5s")
+    cdmisfa("record", "oscillatory", "-o", tmp_path / "whole", *words)
+    folder = tmp_path / "rec"
+
+    def stop(done: float) -> None:
+        if done >= 100:
+            raise OSError
+
+    with pytest.raises(OSError):  # noqa: PT011 - what stops it is no matter
+        record(
+            "oscillatory",
+            folder,
+            SceneConfig(seed=7),
+            frames=400,
+            split=Split(seconds=5),
+            progress=stop,
+        )
+    again = ("record", "--resume", "-o", folder)
+    for wrong, what in (
+        (("--seed", 8), "begun with --seed 7, not --seed 8"),
+        (("--split", "4s"), "begun with --split 5s, not --split 4s"),
+        (("icub",), "begun with oscillatory, not icub"),
+    ):
+        if wrong == ("icub",):
+            pytest.importorskip("pybullet")
+        refused = cdmisfa(*again, *wrong)
+        assert (refused.code, what in refused.err) == (2, True), refused.err
+    done = cdmisfa(*again)
+    assert done.code == 0, done.err
+    contents = [{p.name: p.read_bytes() for p in f.iterdir()} for f in (folder, tmp_path / "whole")]
+    assert contents[0] == contents[1]
+    nothing = cdmisfa("record", "--resume", "-o", tmp_path / "new")
+    assert (nothing.code, "name the SCENE" in nothing.err) == (2, True)
 
 
 class TestScenePicture:

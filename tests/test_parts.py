@@ -124,6 +124,12 @@ def test_a_lost_part_is_not_written_over(parts: Path, split: Split, tmp_path: Pa
     assert contents(folder) == before
 
 
+def test_a_shorter_split_than_the_first_part_is_refused(tmp_path: Path) -> None:
+    record("oscillatory", tmp_path / "a", frames=150, split=Split(seconds=100))
+    with pytest.raises(UsageError, match="has 150 frames, with this --split it would have 100"):
+        record("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
+
+
 def test_another_split_is_refused(tmp_path: Path) -> None:
     record("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
     before = contents(tmp_path / "a")
@@ -149,6 +155,7 @@ def test_another_split_is_refused(tmp_path: Path) -> None:
 )
 def test_limits_are_read(text: str, split: Split) -> None:
     assert Split.parse(text) == split
+    assert Split.parse(str(split)) == split
 
 
 @pytest.mark.parametrize("text", ["", "512", "0MB", "-1s", "10 minutes", "nanGB", "1e9s"])

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from cdmisfa.cli import options
 from cdmisfa.cli.progress import bar
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @click.command("record")
-@click.argument("scene")
+@click.argument("scene", required=False)
 @options.out("Folder of the recording.")
 @click.option(
     "--frames",
@@ -38,12 +39,15 @@ if TYPE_CHECKING:
 @click.option(
     "--split",
     metavar="LIMIT",
-    help="Begin a new file of each view at this size or duration: 512MB, 10min.",
+    help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
+    "--resume as first asked for.",
 )
 @options.force
 @options.as_json
+@click.pass_context
 def record_command(
-    scene: str,
+    ctx: click.Context,
+    scene: str | None,
     out: Path | None,
     frames: int,
     seed: int,
@@ -59,10 +63,20 @@ def record_command(
 ) -> None:
     """Record what a scene shows, one MCAP file per view.
 
-    SCENE is icub or oscillatory. The same seed gives the same bytes.
+    SCENE is icub or oscillatory; --resume knows it, the seed and the split of what was begun. The
+    same seed gives the same bytes.
     """
     from cdmisfa.experiments.sources import configure_scene
+    from recorder.folder import Asked, asked
+    from recorder.scenes import SCENES
 
+    begun = asked(out) if resume and out is not None else Asked()
+    scene = scene or begun.scene
+    if not scene:
+        where = f"{out} does not say of what it is: " if resume and out is not None else ""
+        raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
+    if begun.seed is not None and ctx.get_parameter_source("seed") is ParameterSource.DEFAULT:
+        seed = begun.seed
     configuration = configure_scene(scene, preset, settings, seed)
     if scene_picture is not None:
         if scene != "icub":
