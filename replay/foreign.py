@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,9 +14,16 @@ from numpy.typing import NDArray
 
 from cdmisfa.blocks import NANOSECONDS, Block, SourceSpec, check_request, freeze
 from cdmisfa.errors import LogExhaustedError, UsageError
-from replay.camera_logs import ImageStream, even_times, fingerprint, image_logs, open_images
+from replay.camera_logs import (
+    ImageStream,
+    even_times,
+    fingerprint,
+    image_logs,
+    open_images,
+)
 from replay.images import step_of
 from replay.joined import join_parts
+from replay.records import Bytes
 from replay.store import Location, Url
 
 Align = Literal["index", "time"]
@@ -51,6 +59,7 @@ class ForeignSource:
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged.
+        goal: the command and the folder of its result that a refusal names in what would work.
 
     Attributes:
         alignment: for each stream the counts of its messages, of repeated frames and of
@@ -68,6 +77,7 @@ class ForeignSource:
         rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
+        goal: tuple[str, str] = ("learn", "RUN"),
     ) -> None:
         """Open the logs and find their images.
 
@@ -85,6 +95,7 @@ class ForeignSource:
         self._t = 0
         self._hashes: list[dict[str, Any]] | None = None
         self._size = size
+        self._goal = goal
         self._streams: list[ImageStream] = []
         try:
             for path, topic in _pairs(self._files, topics):
@@ -138,6 +149,7 @@ class ForeignSource:
         Raises:
             LogExhaustedError: fewer than n frames are left; t stays.
             LogDamagedError: a message is no image; t stays.
+            UsageError: an image is smaller than a frame; t stays.
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
@@ -149,7 +161,7 @@ class ForeignSource:
         frames = np.empty((n, *self._spec.frame_shape), np.uint8)
         rows = self._aligned[stream].rows
         for i in range(n):
-            frames[i] = self._streams[stream].frame(int(rows[(self._t + i) % self._count]))
+            frames[i] = self._frame(stream, int(rows[(self._t + i) % self._count]))
         block = Block(stream, self._t, freeze(frames), freeze(np.empty((n, 0))))
         self._t += n
         return block
@@ -189,6 +201,13 @@ class ForeignSource:
         """Let go of the files; harmless when called twice."""
         for stream in self._streams:
             stream.close()
+
+    def _frame(self, stream: int, row: int) -> Bytes:
+        images = self._streams[stream]
+        try:
+            return images.frame(row)
+        except UsageError as error:
+            raise UsageError(f"{images.path}: {error}") from None
 
     def _put_on_clock(self, align: Align | None) -> list[Aligned]:
         if align == "time":
@@ -259,13 +278,13 @@ class ForeignSource:
 
     def _command(self) -> str:
         """Give a command that takes these streams."""
-        words = ["cdmisfa", "learn", *map(str, self._files)]
+        words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
         start, stop = self._overlap()
         words += ["--size", f"{self._size[1]}x{self._size[0]}"]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
-        return shlex.join([*words, "-o", "RUN"])
+        return shlex.join([*words, "-o", self._goal[1]])
 
 
 def _pairs(files: Sequence[Location], topics: Sequence[str]) -> list[tuple[Location, str | None]]:
@@ -295,11 +314,31 @@ def _rate(streams: Sequence[ImageStream]) -> float:
 
 
 def _names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
-    """Topics as names of streams, with the file's where topics are shared."""
+    """Topics as names of streams, with the file's and folders' where topics are shared."""
     topics = [s.topic for s in streams]
     if len(set(topics)) == len(topics):
         return tuple(topics)
-    names = [f"{s.path.stem}{s.topic}" for s in streams]
-    if len(set(names)) < len(names):
-        raise UsageError(f"{streams[0].path}: a topic is named twice")
-    return tuple(names)
+    places = [_place(stream) for stream in streams]
+    for i, place in enumerate(places):
+        if place in places[:i]:
+            raise UsageError(f"{topics[i]} of {streams[i].path} is named twice: leave one out")
+    for folders in range(max(len(Path(path).parts) for path, _ in places)):
+        names = [_in_folders(stream, folders) for stream in streams]
+        if len(set(names)) == len(names):
+            return tuple(names)
+    return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
+
+
+def _place(stream: ImageStream) -> tuple[str, str]:
+    """Where the images of a stream lie, and their topic there."""
+    path = stream.path
+    return (path.address if isinstance(path, Url) else str(path.resolve())), stream.topic
+
+
+def _in_folders(stream: ImageStream, folders: int) -> str:
+    """A stream's name with those of its file, and of some of the folders this is in."""
+    path, topic = stream.path, stream.topic
+    of_file = topic == path.stem or (isinstance(path, Path) and topic == path.resolve().name)
+    own = topic if of_file else path.stem + topic
+    above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
+    return "/".join([*above[max(len(above) - folders, 0) :], own]).removeprefix("//")

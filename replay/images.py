@@ -19,6 +19,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from PIL import Image
 
+from cdmisfa.errors import UsageError
 from replay.records import Bytes, MalformedRecord
 
 MAX_PIXELS: Final = 64 * 1024 * 1024
@@ -103,12 +104,12 @@ def shrink(image: Bytes, height: int, width: int) -> Bytes:
     """Average the areas of a gray image into fewer pixels.
 
     Raises:
-        MalformedRecord: the image is smaller.
+        UsageError: the image is smaller.
     """
     if image.shape == (height, width):
         return image
     if image.shape[0] < height or image.shape[1] < width:
-        raise MalformedRecord(
+        raise UsageError(
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
             "choose a smaller --size"
         )

@@ -151,12 +151,16 @@ def test_an_image_is_averaged_over_areas() -> None:
     image = RANDOM.integers(0, 256, (96, 256), np.uint8)
     expected = image.reshape(48, 2, 128, 2).mean(axis=(1, 3))
     assert abs(shrink(image, 48, 128) - expected).max() <= 1
-    with pytest.raises(MalformedRecord, match="--size"):
+    with pytest.raises(UsageError, match="--size"):
         shrink(image, 100, 128)
 
 
 def write(
-    path: Path, streams: dict[str, tuple[int, int]], *, schema: str = "foxglove.RawImage"
+    path: Path,
+    streams: dict[str, tuple[int, int]],
+    *,
+    schema: str = "foxglove.RawImage",
+    width: int = 8,
 ) -> None:
     """A log with `count` images on each topic, `step` milliseconds apart; all are of one value."""
     with path.open("wb") as file:
@@ -167,7 +171,9 @@ def write(
         for topic, (count, step) in streams.items():
             channel = writer.register_channel(topic, "protobuf", number)
             for i in range(count):
-                image = RawImage(width=8, height=6, step=8, encoding="mono8", data=bytes([i]) * 48)
+                image = RawImage(
+                    width=width, height=6, step=8, encoding="mono8", data=bytes([i]) * 48
+                )
                 messages.append((1000 + i * step, channel, image.SerializeToString()))
         for time, channel, data in sorted(messages):
             writer.add_message(channel, time * 1_000_000, data, time * 1_000_000)
@@ -238,6 +244,11 @@ def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, {"/left": (3, 20)})
     source = ForeignSource(path, size=(60, 80))
-    with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns.*--size"):
+    with pytest.raises(UsageError, match=r"a\.mcap: .* 8x6 is smaller than 80x60.*--size"):
+        source.take(0, 1)
+    assert source.t == 0
+    write(path, {"/left": (3, 20)}, width=9)
+    source = ForeignSource(path, size=(3, 4))
+    with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns"):
         source.take(0, 1)
     assert source.t == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 import sys
 from collections.abc import Iterable
 from fractions import Fraction
@@ -183,6 +184,46 @@ def test_videos_are_learned_from_and_converted(
     assert cdmisfa("convert", *words, "-o", tmp_path / "rec").code == 0
     again = cdmisfa("learn", tmp_path / "rec", *QUICK)
     assert again.json["signals_sha256"] == learned.json["signals_sha256"]
+
+
+def test_a_size_too_large_leaves_nothing_behind(
+    cdmisfa: Cdmisfa, videos: list[Path], tmp_path: Path
+) -> None:
+    words = ("convert", *videos, "-o", tmp_path / "rec", "--size")
+    refused = cdmisfa(*words, "320x240")
+    assert (refused.code, "smaller --size" in refused.err) == (2, True), refused.err
+    assert str(videos[0]) in refused.err
+    assert not (tmp_path / "rec").exists()
+    assert cdmisfa(*words, "16x12").code == 0
+
+
+def test_unequal_videos_are_converted_as_the_refusal_says(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    for name, count in (("a", 20), ("b", 10)):
+        write_video(tmp_path / f"{name}.mkv", pictures(count))
+    files = (tmp_path / "a.mkv", tmp_path / "b.mkv")
+    refused = cdmisfa("convert", *files, "-o", tmp_path / "rec", "--size", "16x12")
+    assert refused.code == 2
+    command = shlex.split(refused.err.partition("as with: ")[2])
+    assert command[:2] == ["cdmisfa", "convert"]
+    assert cdmisfa(*command[1:]).code == 0
+    assert {p.name for p in (tmp_path / "rec").iterdir()} == {"a.mcap", "b.mcap"}
+
+
+def test_videos_of_one_name_are_told_apart_by_their_folders(
+    cdmisfa: Cdmisfa, videos: list[Path], tmp_path: Path
+) -> None:
+    files = [tmp_path / side / "cam.mp4" for side in "lr"]
+    for file, video in zip(files, videos, strict=True):
+        file.parent.mkdir()
+        file.write_bytes(video.read_bytes())
+        file.with_name("é.mp4").write_bytes(video.read_bytes())
+    copies = [file.with_name("é.mp4") for file in files]
+    assert ForeignSource(files, size=SIZE).spec.streams == ("l/cam", "r/cam")
+    done = cdmisfa("convert", *copies, "-o", tmp_path / "rec", "--size", "16x12")
+    assert done.code == 0, done.err
+    assert {p.name for p in (tmp_path / "rec").iterdir()} == {"l_e.mcap", "r_e.mcap"}
+    with pytest.raises(UsageError, match=r"cam\.mp4 is named twice: leave one out"):
+        ForeignSource([files[0], files[0]], size=SIZE)
 
 
 def test_without_pyav_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,8 @@ def convert_command(
     if not resume:
         refuse_existing(out, force=force, remedy=REMEDY)
     cameras = CameraOptions(topics, size, align, rate)
-    with contextlib.closing(open_cameras(places, cameras, salvage=salvage)) as frames:
+    goal = ("convert", str(out))
+    with contextlib.closing(open_cameras(places, cameras, salvage=salvage, goal=goal)) as frames:
         say_about(frames)
         length = frames.spec.length or 0
         with bar("converting", "frames") as shown, stoppable() as stop:

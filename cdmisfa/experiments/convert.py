@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -54,8 +55,8 @@ def convert(
         progress: told after every block how many frames of all streams are written.
 
     Raises:
-        UsageError: the folder exists, the source has no end, or what is to be gone on with
-            came from another one.
+        UsageError: the folder exists, the source has no end, its images are too small, or what
+            is to be gone on with came from another one.
         LogDamagedError: an image cannot be read.
         LogWriteError: the disk does not take it.
     """
@@ -67,8 +68,11 @@ def convert(
         refuse_existing(folder, force=force, remedy=REMEDY)
     spec = replace(source.spec, streams=view_names(source.spec.streams))
     identity = Identity(KIND, 0, spec, {"source": dict(source.describe())})
-    make_folder(folder)
     count = source.spec.length
+    for stream in range(len(spec.streams)):  # what is refused is so before anything is written
+        source.seek(0)
+        source.take(stream, 1)
+    make_folder(folder)
     with ExitStack() as unfinished:
         unfinished.enter_context(held(folder))
         if force:
@@ -91,10 +95,15 @@ def convert(
 
 
 def view_names(topics: Sequence[str]) -> tuple[str, ...]:
-    """Topics as names of views, which are names of files, too: "/cam/left" is cam_left."""
+    """Topics as names of views, which are names of files, too: "/cam/left" is cam_left.
+
+    Letters lose their accents, those of other scripts stay.
+    """
     names: list[str] = []
     for topic in topics:
-        plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", topic).strip("._") or "stream"
+        letters = unicodedata.normalize("NFKD", topic)
+        bare = "".join(c for c in letters if not unicodedata.combining(c))
+        plain = re.sub(r"[^\w.-]+", "_", bare).strip("._") or "stream"
         taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
         names.append(f"{plain}-{taken + 1}" if taken else plain)
     return tuple(names)
