@@ -159,7 +159,9 @@ class RunLayout:
         """What comes down until a module is saved."""
         threshold = self._clusters_below()
         if threshold is None:
-            return self._convergence("What it feels: η̇ below δ, nearly all blocks novel: a module is saved")
+            return self._convergence(
+                "What it feels: η̇ below δ, nearly all blocks novel: a module is saved"
+            )
         return self._lines(
             f"What it feels: a module is saved when the clustering error's mean is below "
             f"{threshold:g}",
