@@ -82,7 +82,8 @@ class ForeignSource:
         """Open the logs and find their images.
 
         Raises:
-            UsageError: no such log or topic, or streams that need `align`.
+            UsageError: no such log or topic, images smaller than a frame, or streams that
+                need `align`.
             LogDamagedError: a log is damaged.
         """
         if rate is not None and not 1e-3 <= rate <= 1e6:
@@ -108,6 +109,8 @@ class ForeignSource:
                 s.times if len(s.times) else even_times(s.count, self._fps) for s in self._streams
             ]
             self._aligned = self._put_on_clock(align)
+            for stream, aligned in enumerate(self._aligned):  # refused before anything is written
+                self._frame(stream, int(aligned.rows[0]))
         except BaseException:
             self.close()
             raise

@@ -161,8 +161,12 @@ def write(
     *,
     schema: str = "foxglove.RawImage",
     width: int = 8,
+    wide_from: int = 0,
 ) -> None:
-    """A log with `count` images on each topic, `step` milliseconds apart; all are of one value."""
+    """A log with `count` images on each topic, `step` milliseconds apart; all are of one value.
+
+    From image `wide_from` on they claim to be `width` wide.
+    """
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=3000)
         writer.start()
@@ -171,8 +175,9 @@ def write(
         for topic, (count, step) in streams.items():
             channel = writer.register_channel(topic, "protobuf", number)
             for i in range(count):
+                claimed = width if i >= wide_from else 8
                 image = RawImage(
-                    width=width, height=6, step=8, encoding="mono8", data=bytes([i]) * 48
+                    width=claimed, height=6, step=8, encoding="mono8", data=bytes([i]) * 48
                 )
                 messages.append((1000 + i * step, channel, image.SerializeToString()))
         for time, channel, data in sorted(messages):
@@ -243,12 +248,13 @@ def test_topics_are_named_where_they_are_wrong(tmp_path: Path) -> None:
 def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write(path, {"/left": (3, 20)})
-    source = ForeignSource(path, size=(60, 80))
     with pytest.raises(UsageError, match=r"a\.mcap: .* 8x6 is smaller than 80x60.*--size"):
-        source.take(0, 1)
-    assert source.t == 0
+        ForeignSource(path, size=(60, 80))
     write(path, {"/left": (3, 20)}, width=9)
-    source = ForeignSource(path, size=(3, 4))
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns"):
-        source.take(0, 1)
+        ForeignSource(path, size=(3, 4))
+    write(path, {"/left": (3, 20)}, width=9, wide_from=1)
+    source = ForeignSource(path, size=(3, 4))
+    with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1020000000 ns"):
+        source.take(0, 2)
     assert source.t == 0

@@ -69,9 +69,6 @@ def convert(
     spec = replace(source.spec, streams=view_names(source.spec.streams))
     identity = Identity(KIND, 0, spec, {"source": dict(source.describe())})
     count = source.spec.length
-    for stream in range(len(spec.streams)):  # what is refused is so before anything is written
-        source.seek(0)
-        source.take(stream, 1)
     make_folder(folder)
     with ExitStack() as unfinished:
         unfinished.enter_context(held(folder))
