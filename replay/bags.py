@@ -42,7 +42,6 @@ class BagImages:
         self._reader: Any = None
         self._messages: Iterator[tuple[int, bytes]] = iter(())
         self._next = -1
-        self._last: tuple[int, Bytes] | None = None
         ros1 = path.suffix == ".bag" and path.is_file()
         reader = _reader_of(path, ros1=ros1)
         with _explained(path):
@@ -77,8 +76,6 @@ class BagImages:
         Raises:
             LogDamagedError: the message is no image that is read, or the bag is damaged.
         """
-        if self._last is not None and self._last[0] == row:
-            return self._last[1]
         with _explained(self.path):
             if row != self._next:
                 self._messages = self._from(int(self.times[row]))
@@ -87,11 +84,9 @@ class BagImages:
                 stamp, data = next(self._messages, (0, b""))
                 self._next += 1
         try:
-            image = shrink(self._decode(data), *self._size)
+            return shrink(self._decode(data), *self._size)
         except MalformedRecord as error:
             raise LogDamagedError(f"{self.path}: {self.topic} at {stamp} ns: {error}") from None
-        self._last = (row, image)
-        return image
 
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""

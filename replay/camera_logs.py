@@ -215,7 +215,6 @@ class McapImages:
         self.path = path
         self.size = size
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
-        self._last: tuple[int, Bytes] | None = None
         self.count = 0
         try:
             self.channel, self._decode = self._find(topic)
@@ -241,16 +240,12 @@ class McapImages:
         Raises:
             LogDamagedError: the message is no image that is read.
         """
-        if self._last is not None and self._last[0] == row:
-            return self._last[1]
         try:
-            image = shrink(self._decode(self._payload(row)), *self.size)
+            return shrink(self._decode(self._payload(row)), *self.size)
         except MalformedRecord as error:
             raise LogDamagedError(
                 f"{self.path}: {self.topic} at {self.times[row]} ns: {error}"
             ) from None
-        self._last = (row, image)
-        return image
 
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""

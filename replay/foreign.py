@@ -98,6 +98,7 @@ class ForeignSource:
         self._size = size
         self._goal = goal
         self._streams: list[ImageStream] = []
+        self._shown: dict[int, tuple[int, Bytes]] = {}
         try:
             for path, topic in _pairs(self._files, topics):
                 self._streams.append(open_images(path, topic, size, salvage=salvage))
@@ -206,11 +207,17 @@ class ForeignSource:
             stream.close()
 
     def _frame(self, stream: int, row: int) -> Bytes:
+        """A stream's image as a frame; decoded once where it is repeated."""
+        shown = self._shown.get(stream)
+        if shown is not None and shown[0] == row:
+            return shown[1]
         images = self._streams[stream]
         try:
-            return images.frame(row)
+            frame = images.frame(row)
         except UsageError as error:
             raise UsageError(f"{images.path}: {error}") from None
+        self._shown[stream] = (row, frame)
+        return frame
 
     def _put_on_clock(self, align: Align | None) -> list[Aligned]:
         if align == "time":

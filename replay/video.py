@@ -52,7 +52,6 @@ class VideoImages:
         self._av = _pyav(path)
         self._next = _NOWHERE
         self._frames: Iterator[Any] = iter(())
-        self._last: tuple[int, Bytes] | None = None
         self._container: Any = None
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a video has no topics, leave {topic} out")
@@ -84,8 +83,6 @@ class VideoImages:
         Raises:
             LogDamagedError: the video is broken there, or has other frames than it states.
         """
-        if self._last is not None and self._last[0] == row:
-            return self._last[1]
         stamp = int(self._stamps[row])
         where = f"{self.path}: at {float(stamp * self._tick):g} s"
         with _explained(self.path):
@@ -98,11 +95,9 @@ class VideoImages:
                 self._next = _NOWHERE
                 raise LogDamagedError(f"{where}: the video is broken, no frame can be decoded")
             try:
-                image = shrink(self._gray(found), *self._size)
+                return shrink(self._gray(found), *self._size)
             except MalformedRecord as error:
                 raise LogDamagedError(f"{where}: {error}") from None
-        self._last = (row, image)
-        return image
 
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
