@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.report import interleaved, ratio, save
-from cdmisfa.config import LearnerConfig
-from cdmisfa.expansion import quadratic
-from cdmisfa.incsfa import Params, State, gram, new_state, parameters, strict
-from cdmisfa.streams import one_period
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.expansion import quadratic
+from cdmisfa.features.incsfa import Params, State, gram, new_state, parameters, strict
+from recorder.world.oscillatory import one_period
 
 PIXELS = 6144
 CASES = [(7, 1, 40), *((k, 5, t) for k in (16, 32, 64) for t in (10, 40, 100)), (32, 1, 40)]

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from benchmarks.recordings import SAMPLE
 from benchmarks.report import ratio, save
-from cdmisfa.config import LearnerConfig
+from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.run import learn
-from replay.recorded import RecordedSource
+from replay.recordings.source import RecordedSource
 
 CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40, expansion="none")
 CLOCKS = {"learning thread": time.thread_time_ns, "all threads": time.process_time_ns}

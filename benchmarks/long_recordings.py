@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.report import save
-from cdmisfa.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.viewlog import Identity, ViewLog
+from recorder.log.viewlog import Identity, ViewLog
 
 SHAPE = (240, 320)
 TAU = 40
@@ -39,7 +39,7 @@ def write_long(folder: Path, size: int) -> Path:
 
 def play(path: Path) -> None:
     """Take every block of a recording."""
-    from replay.recorded import RecordedSource
+    from replay.recordings.source import RecordedSource
 
     with contextlib.closing(RecordedSource(path)) as source:
         for _ in range(source.frames // TAU):
@@ -48,7 +48,7 @@ def play(path: Path) -> None:
 
 def messages(path: Path) -> None:
     """Go over every message of a log."""
-    from replay.reader import LogReader
+    from replay.mcap.reader import LogReader
 
     with LogReader(path) as reader:
         for _ in reader.messages():
@@ -57,14 +57,14 @@ def messages(path: Path) -> None:
 
 def info(path: Path) -> None:
     """Describe a log."""
-    from replay.info import describe
+    from replay.integrity.info import describe
 
     describe(path)
 
 
 def verify(path: Path) -> None:
     """Check all of a log."""
-    from replay.verify import verify
+    from replay.integrity.verify import verify
 
     if not verify(path)["ok"]:
         raise SystemExit(f"{path} is damaged")

@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from benchmarks import long_recordings
 from benchmarks.recordings import SAMPLE, write_pictures
 from benchmarks.report import interleaved, ratio, save
-from replay.recorded import RecordedSource
+from replay.recordings.source import RecordedSource
 
 TAU = 40
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from benchmarks.report import interleaved, ratio, save
 from recorder.recording import record
-from recorder.rendering import render_here, requests
-from recorder.scenes import open_scene
+from recorder.world.rendering import render_here, requests
+from recorder.world.scenes import open_scene
 
 
 def rendering(scene: str, frames: int) -> Callable[[], int]:

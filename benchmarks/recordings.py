@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.viewlog import Identity, ViewLog
+from recorder.log.viewlog import Identity, ViewLog
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 

@@ -14,12 +14,12 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from benchmarks.report import interleaved, ratio, save
-from cdmisfa.agent import OUTCOME, Agent, Rules, new_agent, rules, think
-from cdmisfa.compiled import compiled
-from cdmisfa.config import LearnerConfig
-from cdmisfa.gate import NOVEL
-from cdmisfa.learner import CuriousLearner
-from cdmisfa.streams import OscillatorySource
+from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules, think
+from cdmisfa.agents.gate import NOVEL
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.core.compiled import compiled
+from cdmisfa.core.config import LearnerConfig
+from recorder.world.oscillatory import OscillatorySource
 
 STREAMS = (10, 100, 1000, 10_000)
 

@@ -1,50 +1,30 @@
-"""Curiosity-driven modular incremental slow feature analysis (CD-MISFA 2.0).
+"""Curiosity-driven modular incremental slow feature analysis (CD-MISFA 2.0)."""
 
-The names below load on first use, so that the command line starts without compiling.
-"""
+from typing import TYPE_CHECKING
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from cdmisfa.core.faces import face
 
 if TYPE_CHECKING:
-    from cdmisfa.blocks import Block, FrameSource, SourceSpec
-    from cdmisfa.config import LearnerConfig
-    from cdmisfa.errors import CdmisfaError
-    from cdmisfa.learner import CuriousLearner
-    from cdmisfa.modules import Module
-    from cdmisfa.signals import SIGNALS, BlockSignals
-    from cdmisfa.streams import OscillatorySource
+    from cdmisfa.agents.learner import CuriousLearner as CuriousLearner
+    from cdmisfa.core.blocks import Block as Block
+    from cdmisfa.core.blocks import FrameSource as FrameSource
+    from cdmisfa.core.blocks import SourceSpec as SourceSpec
+    from cdmisfa.core.config import LearnerConfig as LearnerConfig
+    from cdmisfa.core.errors import CdmisfaError as CdmisfaError
+    from cdmisfa.core.modules import Module as Module
+    from cdmisfa.core.signals import SIGNALS as SIGNALS
+    from cdmisfa.core.signals import BlockSignals as BlockSignals
+    from recorder.world.oscillatory import OscillatorySource as OscillatorySource
 
-__all__ = [
-    "SIGNALS",
-    "Block",
-    "BlockSignals",
-    "CdmisfaError",
-    "CuriousLearner",
-    "FrameSource",
-    "LearnerConfig",
-    "Module",
-    "OscillatorySource",
-    "SourceSpec",
-]
-
-_HOMES = {
-    "Block": "blocks",
-    "FrameSource": "blocks",
-    "SourceSpec": "blocks",
-    "LearnerConfig": "config",
-    "CdmisfaError": "errors",
-    "CuriousLearner": "learner",
-    "Module": "modules",
-    "SIGNALS": "signals",
-    "BlockSignals": "signals",
-    "OscillatorySource": "streams",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'cdmisfa' has no attribute {name!r}")
-    return getattr(import_module(f"cdmisfa.{_HOMES[name]}"), name)
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "cdmisfa.agents.learner": "CuriousLearner",
+        "cdmisfa.core.blocks": "Block FrameSource SourceSpec",
+        "cdmisfa.core.config": "LearnerConfig",
+        "cdmisfa.core.errors": "CdmisfaError",
+        "cdmisfa.core.modules": "Module",
+        "cdmisfa.core.signals": "SIGNALS BlockSignals",
+        "recorder.world.oscillatory": "OscillatorySource",
+    },
+)

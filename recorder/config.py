@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-from cdmisfa.config import as_table, positive, within
-from cdmisfa.errors import UsageError
-from cdmisfa.streams import START_NS
+from cdmisfa.core.blocks import START_NS
+from cdmisfa.core.config import as_table, positive, within
+from cdmisfa.core.errors import UsageError
 
 Range = tuple[float, float]
 

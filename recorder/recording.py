@@ -13,17 +13,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, cast
 
-from cdmisfa.blocks import FrameSource, SourceSpec
-from cdmisfa.config import as_table
-from cdmisfa.errors import CdmisfaError, UsageError
+from cdmisfa.core.blocks import FrameSource, HeadPose, SourceSpec
+from cdmisfa.core.config import as_table
+from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.folder import Asked, answered, ask, asked, held
-from recorder.logfile import LogWriteError
-from recorder.messages import HeadPose
-from recorder.parts import Split, ViewParts, view_logs
-from recorder.rendering import render_here, render_in_processes, requests
-from recorder.scenes import open_scene
-from recorder.viewlog import FramesHeld, Identity, frames_held, sha256
+from recorder.log.folder import Asked, answered, ask, asked, held
+from recorder.log.parts import Split, ViewParts, view_logs
+from recorder.log.viewlog import FramesHeld, Identity, frames_held, sha256
+from recorder.world.rendering import render_here, render_in_processes, requests
+from recorder.world.scenes import open_scene
 
 MAX_JOBS = 256
 

@@ -22,9 +22,9 @@ import mcap_files as files
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cdmisfa.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.viewlog import Identity, ViewLog
+from recorder.log.viewlog import Identity, ViewLog
 
 FRAMES = 20
 SHAPE = (2, 3)
@@ -186,7 +186,7 @@ def _chunk_parts(content: bytes) -> tuple[bytes, int, str, bytes]:
 
 
 def _inner(content: bytes) -> list[Record]:
-    from replay.records import decompress
+    from replay.mcap.records import decompress
 
     _, size, name, stored = _chunk_parts(content)
     return _records(decompress(stored, name, size), 0, size)

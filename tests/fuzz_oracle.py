@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 from fuzz_mutations import Case, bases
 
-from cdmisfa.blocks import Block
-from cdmisfa.errors import CdmisfaError
-from replay.info import describe
-from replay.reader import LogReader, Message
-from replay.recorded import RecordedSource
-from replay.records import MAX_CHUNK
-from replay.recover import recover
-from replay.verify import verify
-from replay.viewfile import ViewFile
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.errors import CdmisfaError
+from replay.integrity.info import describe
+from replay.integrity.recover import recover
+from replay.integrity.verify import verify
+from replay.mcap.reader import LogReader, Message
+from replay.mcap.records import MAX_CHUNK
+from replay.recordings.source import RecordedSource
+from replay.recordings.view_file import ViewFile
 
 MEMORY = MAX_CHUNK + 32 * 1024 * 1024
 """Most bytes that a small file may make us ask for: a chunk at the limit, and ourselves."""

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.blocks import Block, SourceSpec, freeze
-from cdmisfa.signals import BlockSignals
-from replay.runlog import RunWriter
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.signals import BlockSignals
+from replay.runs.log import RunWriter
 
 START_NS = 1_451_606_400_000_000_000
 DELTA = 0.0008

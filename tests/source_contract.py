@@ -12,8 +12,8 @@ import json
 import numpy as np
 import pytest
 
-from cdmisfa.blocks import Block, FrameSource
-from cdmisfa.errors import LogExhaustedError
+from cdmisfa.core.blocks import Block, FrameSource
+from cdmisfa.core.errors import LogExhaustedError
 
 
 def same(a: Block, b: Block) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.agent import (
+from cdmisfa.agents.agent import (
     IDLE_EPSILON,
     OUTCOME,
     Agent,
@@ -23,11 +23,11 @@ from cdmisfa.agent import (
     rules,
     think,
 )
-from cdmisfa.config import LearnerConfig
-from cdmisfa.gate import CONSTANT, NOVEL
-from cdmisfa.lspi import action_values
-from cdmisfa.signals import DENSE_STREAMS
-from cdmisfa.slowness import instantaneous_slowness
+from cdmisfa.agents.gate import CONSTANT, NOVEL
+from cdmisfa.agents.policy import action_values
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.signals import DENSE_STREAMS
+from cdmisfa.features.slowness import instantaneous_slowness
 
 TAU = 50
 SLOW = np.sin(2 * np.pi * np.arange(5000) / 250)

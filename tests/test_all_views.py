@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import UsageError
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.run import learn
 from recorder.config import SceneConfig
 from recorder.recording import record
-from replay.recorded import RecordedSource
-from replay.recording_view import head_poses, yaw_of
-from replay.runlog import read_signals
-from replay.view import build_view
+from replay.recordings.source import RecordedSource
+from replay.runs.log import read_signals
+from replay.view.build import build_view
+from replay.view.recording import head_poses, yaw_of
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
 from source_contract import SourceContract
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.foreign import ForeignSource
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.source import ForeignSource
 
 pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2

@@ -82,7 +82,7 @@ def test_pictures_in_folders_are_streams(cdmisfa: Cdmisfa, tmp_path: Path) -> No
 
 
 def test_pictures_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    from replay.foreign import ForeignSource
+    from replay.camera_logs.source import ForeignSource
 
     values = write_pictures(tmp_path / "left", 12)
     frames = ForeignSource(tmp_path / "left", size=(12, 16), rate=10).take(0, 12).frames

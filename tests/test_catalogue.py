@@ -15,8 +15,16 @@ from rerun.chunk import Chunk, ChunkStore, RrdReader
 from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
 
-from cdmisfa.errors import CdmisfaError, UsageError
-from replay.catalogue import (
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.runs.outline import read_outline
+from replay.view.properties import (
+    properties_of,
+    property_chunks,
+    read_properties,
+    run_identity,
+    write_rows,
+)
+from replay.viewer.catalogue import (
     LAYER,
     ROWS,
     _created,
@@ -28,16 +36,8 @@ from replay.catalogue import (
     serve_catalogue,
     set_layout,
 )
-from replay.outline import read_outline
-from replay.program import free_port, running
-from replay.properties import (
-    properties_of,
-    property_chunks,
-    read_properties,
-    run_identity,
-    write_rows,
-)
-from replay.viewer import headless_viewer, missing_driver
+from replay.viewer.program import free_port, running
+from replay.viewer.window import headless_viewer, missing_driver
 
 
 @pytest.fixture

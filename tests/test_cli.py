@@ -144,7 +144,7 @@ class TestJson:
         assert "ended after 20 iterations: the recording ended" in cdmisfa(*words).out
 
     def test_signals(self, cdmisfa: Cdmisfa) -> None:
-        from cdmisfa.signals import SIGNALS
+        from cdmisfa.core.signals import SIGNALS
 
         document = cdmisfa("signals", "--json").json
         assert [signal["name"] for signal in document["signals"]] == list(SIGNALS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 
-from cdmisfa.experiments.demo import correlations
+from cdmisfa.paper.demo import correlations
 
 HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
 

@@ -12,7 +12,7 @@ import pytest
 from conftest import Cdmisfa
 
 from recorder.config import SceneConfig
-from recorder.parts import Split
+from recorder.log.parts import Split
 from recorder.recording import record
 
 PNG = b"\x89PNG"

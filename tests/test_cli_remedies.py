@@ -11,9 +11,9 @@ import pytest
 from conftest import Cdmisfa
 from web_server import serving
 
-from cdmisfa.cli.doctor import EXTRAS
-from cdmisfa.errors import LogDamagedError
-from replay.catalogue import runs_in
+from cdmisfa.cli.commands.doctor import EXTRAS
+from cdmisfa.core.errors import LogDamagedError
+from replay.viewer.catalogue import runs_in
 
 SHORT = ("--set", "learner.tau=10", "--no-rerun")
 

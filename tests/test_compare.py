@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from run_data import VECTOR, run_of, write_run
 
-from replay.compare import compare
-from replay.runlog import RunWriter
+from replay.runs.compare import compare
+from replay.runs.log import RunWriter
 
 
 def write_changed(path, iteration, name, change):

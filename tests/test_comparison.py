@@ -7,9 +7,9 @@ import pytest
 from rerun.chunk import RrdReader
 from run_data import VECTOR, write_run
 
-from cdmisfa.errors import UsageError
-from replay.comparison import build_overlay
-from replay.survey import survey
+from cdmisfa.core.errors import UsageError
+from replay.runs.table import survey
+from replay.view.overlay import build_overlay
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numba
 import pytest
 
-from cdmisfa.compiled import compiled, needs_compiling
+from cdmisfa.core.compiled import compiled, needs_compiling
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -18,7 +18,7 @@ def test_without_a_folder_for_results_it_compiles_all_the_same(
             raise RuntimeError("cannot cache function: no locator available")
         return numba.njit(**options)
 
-    monkeypatch.setattr("cdmisfa.compiled.numba", SimpleNamespace(njit=no_folder))
+    monkeypatch.setattr("cdmisfa.core.compiled.numba", SimpleNamespace(njit=no_folder))
 
     @compiled
     def double(x: float) -> float:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.config import (
+from cdmisfa.core.config import (
     LearnerConfig,
     as_table,
     build,
@@ -23,7 +23,7 @@ from cdmisfa.config import (
     parse_settings,
     presets,
 )
-from cdmisfa.errors import UsageError
+from cdmisfa.core.errors import UsageError
 
 KEYS = [f.name for f in dataclasses.fields(LearnerConfig)]
 

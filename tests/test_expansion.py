@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cdmisfa.expansion import expanded_size, quadratic
+from cdmisfa.core.expansion import expanded_size, quadratic
 
 
 def test_two_inputs_expand_in_the_order_of_the_paper():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.exploration import choose, decay, other_stream
+from cdmisfa.agents.exploration import choose, decay, other_stream
 
 unit = st.floats(0, 1, exclude_max=True)
 

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 from run_data import VECTOR, write_run
 
-from cdmisfa.errors import UsageError
-from cdmisfa.signals import SIGNALS
-from replay import export as module
-from replay.export import export
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.signals import SIGNALS
+from replay.export import recordings as module
+from replay.export.recordings import export
 
 
 @pytest.fixture

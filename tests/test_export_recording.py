@@ -9,12 +9,14 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from cdmisfa.blocks import Block, SourceSpec, freeze
-from cdmisfa.errors import CdmisfaError, UsageError
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
-from recorder.viewlog import Identity, ViewLog
-from replay import film, folder_export, frames
-from replay.export import export
+from recorder.log.viewlog import Identity, ViewLog
+from replay.export import folder as folder_export
+from replay.export import images as frames
+from replay.export import videos as film
+from replay.export.recordings import export
 
 FRAMES = 53
 FIRST = 7
@@ -224,7 +226,7 @@ def test_lerobot_itself_loads_the_dataset(dataset):
 
 
 def test_values_become_a_dataset_without_videos(oscillatory_recording, tmp_path):
-    from replay.recorded import RecordedSource
+    from replay.recordings.source import RecordedSource
 
     assert export(oscillatory_recording, tmp_path / "robot", "lerobot") == 2000
     info = json.loads((tmp_path / "robot/meta/info.json").read_text())

@@ -7,10 +7,10 @@ import pytest
 from PIL import Image
 from run_data import IMAGE, VECTOR, write_run
 
-from cdmisfa.errors import UsageError
-from replay import figures
-from replay.figures import decision, draw_figures, polynomial_fit
-from replay.history import Output, read_history
+from cdmisfa.core.errors import UsageError
+from replay.export import figures
+from replay.export.figures import decision, draw_figures, polynomial_fit
+from replay.export.history import Output, read_history
 
 
 @pytest.mark.parametrize(("spec", "count"), [(IMAGE, 4), (VECTOR, 3)], ids=["images", "vectors"])

@@ -17,13 +17,13 @@ import pytest
 from conftest import Cdmisfa
 from source_contract import SourceContract, same
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import LogExhaustedError, UsageError
-from cdmisfa.streams import OscillatorySource
-from recorder.parts import Split
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from recorder.log.parts import Split
 from recorder.recording import record
-from replay.follow import FollowedSource
-from replay.store import FileStore
+from recorder.world.oscillatory import OscillatorySource
+from replay.recordings.followed import FollowedSource
+from replay.storage.store import FileStore
 
 FRAMES = 600
 RECORDER = """

@@ -19,11 +19,11 @@ from mcap.writer import Writer
 from PIL import Image
 from source_contract import SourceContract
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import LogDamagedError, UsageError
-from replay.foreign import ForeignSource
-from replay.images import ENCODINGS, RawPixels, gray, image_decoder, shrink
-from replay.records import MalformedRecord
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.camera_logs.pixels import ENCODINGS, RawPixels, gray, image_decoder, shrink
+from replay.camera_logs.source import ForeignSource
+from replay.mcap.records import MalformedRecord
 
 RANDOM = np.random.default_rng(5)
 GRAY = RANDOM.integers(0, 256, (6, 8), np.uint8)

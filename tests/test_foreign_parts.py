@@ -16,8 +16,8 @@ from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 
-from cdmisfa.errors import UsageError
-from replay.foreign import ForeignSource
+from cdmisfa.core.errors import UsageError
+from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)
 BOTH = ("--topic", "/left", "--topic", "/right", "--size", f"{WIDTH}x{HEIGHT}")

@@ -10,8 +10,8 @@ import fuzz_mutations
 import fuzz_oracle
 import pytest
 
-from cdmisfa.errors import LogDamagedError
-from replay.reader import LogReader
+from cdmisfa.core.errors import LogDamagedError
+from replay.mcap.reader import LogReader
 
 CASES = 10_000
 BATCHES = 20
@@ -58,7 +58,7 @@ def test_the_cases_reach_every_corner_of_the_reader(tmp_path: Path) -> None:
 def test_a_reader_that_believes_everything_is_found_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from replay import reader
+    from replay.mcap import reader
 
     monkeypatch.setattr(reader, "crc32", lambda data, value=0: 0)
     monkeypatch.setattr(reader.LogReader, "_check_data_crc", lambda self: None)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.gate import BAND, CONSTANT_VARIANCE, NOVEL, is_constant, verdict
-from cdmisfa.slowness import instantaneous_slowness
+from cdmisfa.agents.gate import BAND, CONSTANT_VARIANCE, NOVEL, is_constant, verdict
+from cdmisfa.features.slowness import instantaneous_slowness
 
 RNG = np.random.default_rng(3)
 Y = np.ascontiguousarray(RNG.standard_normal((3, 40, 2)))

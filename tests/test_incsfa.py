@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from cdmisfa.blocks import freeze
-from cdmisfa.config import LearnerConfig
-from cdmisfa.expansion import quadratic
-from cdmisfa.incsfa import IncSFA, copy_into, gram, new_state, parameters, project, strict
-from cdmisfa.incsfa.state import PIXEL, State, rank_floor
-from cdmisfa.sfa import batch_sfa, direction_cosine, slowness
-from cdmisfa.streams import OscillatorySource, one_period
+from cdmisfa.core.blocks import freeze
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.expansion import quadratic
+from cdmisfa.features.incsfa import IncSFA, copy_into, gram, new_state, parameters, project, strict
+from cdmisfa.features.incsfa.state import PIXEL, State, rank_floor
+from cdmisfa.features.sfa import batch_sfa, direction_cosine, slowness
+from recorder.world.oscillatory import OscillatorySource, one_period
 
 
 class PlainIncSFA:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdmisfa.blocks import Block, SourceSpec, freeze
-from cdmisfa.config import LearnerConfig, build, load_preset
-from cdmisfa.errors import CdmisfaError, UsageError
-from cdmisfa.gate import BAND, CONSTANT
-from cdmisfa.learner import CuriousLearner
-from cdmisfa.signals import BlockSignals, SignalsHash, values
-from cdmisfa.streams import OscillatorySource
+from cdmisfa.agents.gate import BAND, CONSTANT
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.config import LearnerConfig, build, load_preset
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.signals import BlockSignals, SignalsHash, values
+from recorder.world.oscillatory import OscillatorySource
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
 

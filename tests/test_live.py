@@ -12,14 +12,16 @@ import rerun as rr
 from PIL import Image
 from run_data import IMAGE, VECTOR, run_of
 
-from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import CdmisfaError
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.experiments import run
 from cdmisfa.experiments.run import learn
-from cdmisfa.streams import OscillatorySource
-from replay import live, scan, viewer
-from replay.live import LiveView
-from replay.runlog import read_signals
+from recorder.world.oscillatory import OscillatorySource
+from replay.recordings import kernels as scan
+from replay.runs.log import read_signals
+from replay.viewer import live
+from replay.viewer import window as viewer
+from replay.viewer.live import LiveView
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
 
@@ -43,7 +45,7 @@ def test_every_record_is_handed_over(spec, monkeypatch):
     def keep(self, times, values):
         sent.setdefault(self.path, []).append(np.array(values))
 
-    monkeypatch.setattr("replay.columns.Column.send", keep)
+    monkeypatch.setattr("replay.view.columns.Column.send", keep)
     monkeypatch.setattr(live, "MOST_BLOCKS", 7)
     with LiveView(spec, MANIFEST, 40, 1) as view:
         feed(view, spec)
@@ -95,7 +97,7 @@ def test_a_run_that_goes_on_shows_what_went_before(tmp_path, monkeypatch):
 
     folder = tmp_path / "run"
     learn(OscillatorySource(), config, folder, max_iterations=30, rerun=False)
-    monkeypatch.setattr("replay.columns.Column.send", keep)
+    monkeypatch.setattr("replay.view.columns.Column.send", keep)
     learn(
         OscillatorySource(),
         config,

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
-from cdmisfa.errors import UsageError
-from recorder import logfile
-from recorder.logfile import LogFile, LogWriteError, partial_path
+from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.log import logfile
+from recorder.log.logfile import LogFile, partial_path
 
 SECOND = 1_000_000_000
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdmisfa.lspi import action_values, policy_iteration, value_sum
+from cdmisfa.agents.policy import action_values, policy_iteration, value_sum
 
 ACTIONS = 2
 

@@ -12,13 +12,13 @@ import pytest
 from conftest import Cdmisfa
 from source_contract import SourceContract, same
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import UsageError
-from cdmisfa.streams import OscillatorySource
-from recorder.parts import Split
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import UsageError
+from recorder.log.parts import Split
 from recorder.recording import record
-from replay.recorded import RecordedSource
-from replay.verify import verify
+from recorder.world.oscillatory import OscillatorySource
+from replay.integrity.verify import verify
+from replay.recordings.source import RecordedSource
 
 FRAMES = 700
 BY_TIME = Split(seconds=3)
@@ -89,7 +89,7 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
 ) -> None:
     words = "3s" if split == BY_TIME else "12kB"
     program = (
-        "import sys, time; from pathlib import Path; from recorder.parts import Split;"
+        "import sys, time; from pathlib import Path; from recorder.log.parts import Split;"
         "from recorder.recording import record;"
         "record('oscillatory', Path(sys.argv[1]), frames=700, split=Split.parse(sys.argv[2]),"
         " progress=lambda _: time.sleep(0.03))"

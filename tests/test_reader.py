@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cdmisfa.errors import LogDamagedError
-from replay.reader import LogReader
+from cdmisfa.core.errors import LogDamagedError
+from replay.mcap.reader import LogReader
 
 
 def written(

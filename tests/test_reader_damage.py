@@ -17,9 +17,9 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cdmisfa.errors import LogDamagedError, UsageError
-from replay.reader import LogReader
-from replay.records import MAX_CHUNK
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.mcap.reader import LogReader
+from replay.mcap.records import MAX_CHUNK
 
 MESSAGES = 40
 
@@ -285,8 +285,8 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 
 READ = """
 import pathlib, sys
-from cdmisfa.errors import LogDamagedError
-from replay.reader import LogReader
+from cdmisfa.core.errors import LogDamagedError
+from replay.mcap.reader import LogReader
 try:
     with LogReader(sys.argv[1]) as reader:
         list(reader.messages())

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from source_contract import SourceContract, same
 
-from cdmisfa.blocks import Block, FrameSource, SourceSpec
-from cdmisfa.errors import LogDamagedError, LogExhaustedError, UsageError
-from cdmisfa.streams import OscillatorySource
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from recorder.config import RecordConfig
+from recorder.log.viewlog import Identity, ViewLog
 from recorder.recording import record
-from recorder.viewlog import Identity, ViewLog
-from replay.info import describe
-from replay.reader import LogReader
-from replay.recorded import RecordedSource
-from replay.recover import recover
-from replay.verify import verify
+from recorder.world.oscillatory import OscillatorySource
+from replay.integrity.info import describe
+from replay.integrity.recover import recover
+from replay.integrity.verify import verify
+from replay.mcap.reader import LogReader
+from replay.recordings.source import RecordedSource
 
 FRAMES = 330
 IMAGES = SourceSpec(("left", "right"), (12, 16), "uint8", ("x", "y"), 50.0, 10**18)

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from source_contract import SourceContract
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.config import build, load_preset
-from cdmisfa.errors import CdmisfaError, UsageError
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.config import build, load_preset
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import EyesConfig, RecordConfig, SceneConfig, SphereConfig
-from recorder.eyes import LUMA, eye_matrix, grey, look, perspective
-from recorder.motions import Motions
-from recorder.scenes import SCENES, open_scene
+from recorder.world.eyes import LUMA, eye_matrix, grey, look, perspective
+from recorder.world.motions import Motions
+from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")
 
-from recorder.live import TRUTH, LiveSource
-from recorder.picture import SIZE, scene_picture
-from recorder.world import World
+from recorder.world.live import TRUTH, LiveSource
+from recorder.world.picture import SIZE, scene_picture
+from recorder.world.world import World
 
 SCENE = SceneConfig(seed=1)
 FRAMES = 80
@@ -144,7 +144,7 @@ def test_grey_is_rounded_luma():
 
 def test_the_simulator_says_nothing():
     code = (
-        "from recorder.scenes import open_scene\n"
+        "from recorder.world.scenes import open_scene\n"
         "s = open_scene('icub'); s.take(0, 2); s.close(); print('done')"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

@@ -9,8 +9,8 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.errors import UsageError
-from recorder.messages import (
+from cdmisfa.core.errors import UsageError
+from recorder.log.messages import (
     ImageEncoder,
     Payload,
     PoseEncoder,

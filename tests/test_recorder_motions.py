@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdmisfa.errors import UsageError
+from cdmisfa.core.errors import UsageError
 from recorder.config import BoxConfig, SceneConfig, SphereConfig
-from recorder.motions import CHUNK, Motions, reflect
+from recorder.world.motions import CHUNK, Motions, reflect
 
 SCENE = SceneConfig()
 WHOLE = Motions(SCENE, 3).take(2 * CHUNK + 100)

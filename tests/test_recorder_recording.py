@@ -14,18 +14,19 @@ import pytest
 from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import UsageError
-from cdmisfa.streams import OscillatorySource
-from recorder import recording, viewlog
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder import recording
 from recorder.config import RecordConfig, SceneConfig
-from recorder.folder import ASKED, held
-from recorder.logfile import LogWriteError, partial_path
-from recorder.parts import Split
+from recorder.log import viewlog
+from recorder.log.folder import ASKED, held
+from recorder.log.logfile import partial_path
+from recorder.log.parts import Split
+from recorder.log.viewlog import METADATA, frames_held, sha256
 from recorder.recording import record
-from recorder.rendering import BLOCK, requests
-from recorder.scenes import open_scene
-from recorder.viewlog import METADATA, frames_held, sha256
+from recorder.world.oscillatory import OscillatorySource
+from recorder.world.rendering import BLOCK, requests
+from recorder.world.scenes import open_scene
 
 ROOT = Path(__file__).parent.parent
 STREAMS = ("x1", "x2", "x3")

@@ -27,12 +27,12 @@ from mcap_files import (
 )
 from web_server import Fault, WebServer, serving
 
-from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.foreign import ForeignSource
-from replay.reader import LogReader
-from replay.recorded import RecordedSource
-from replay.remote import RemoteError, RemoteStore
-from replay.store import Url, location
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.source import ForeignSource
+from replay.mcap.reader import LogReader
+from replay.recordings.source import RecordedSource
+from replay.storage.location import Url, location
+from replay.storage.remote import RemoteError, RemoteStore
 
 pytest.importorskip("aiohttp")
 

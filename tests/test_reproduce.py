@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from cdmisfa.cli.app import run as cdmisfa
-from cdmisfa.errors import NotReproducedError, UsageError
-from cdmisfa.experiments import difficulty, icub, nonstationary, reproduce
-from cdmisfa.experiments.reproduce import Request, Trial
+from cdmisfa.core.errors import NotReproducedError, UsageError
 from cdmisfa.experiments.run import versions
-from cdmisfa.streams import OscillatorySource
+from cdmisfa.paper import difficulty, icub, nonstationary, reproduce
+from cdmisfa.paper.reproduce import Request, Trial
+from recorder.world.oscillatory import OscillatorySource
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 
@@ -123,7 +123,7 @@ def test_two_processes_give_the_rows_of_one(tmp_path: Path) -> None:
 def test_a_claim_that_fails_exits_4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cdmisfa.experiments import stability
+    from cdmisfa.paper import stability
 
     monkeypatch.setattr(stability, "run", _unstable)
     assert cdmisfa(["reproduce", "stability", "--trials", "1", "-o", str(tmp_path)]) == 4
@@ -194,7 +194,7 @@ def test_the_order_of_table_1_is_judged() -> None:
 
 def test_the_icub_trial_watches_learns_and_keeps_what_its_figures_show() -> None:
     source = OscillatorySource()
-    from cdmisfa.config import LearnerConfig
+    from cdmisfa.core.config import LearnerConfig
 
     row, arrays = icub.watch(source, LearnerConfig(), seed=0, iterations=1600)
     assert row["streams"] == [0, 1, 2]

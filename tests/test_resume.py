@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.agents.learner import CuriousLearner, LearnerState
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.experiments.checkpoint import (
     SET_ASIDE,
     checkpoints,
@@ -28,13 +29,12 @@ from cdmisfa.experiments.checkpoint import (
     newest_covered,
 )
 from cdmisfa.experiments.run import Progress, RunResult, learn
-from cdmisfa.learner import CuriousLearner, LearnerState
-from cdmisfa.streams import OscillatorySource
 from recorder.config import RecordConfig, SceneConfig
 from recorder.recording import record
-from replay.compare import compare
-from replay.recorded import RecordedSource
-from replay.runlog import read_events, read_signals
+from recorder.world.oscillatory import OscillatorySource
+from replay.recordings.source import RecordedSource
+from replay.runs.compare import compare
+from replay.runs.log import read_events, read_signals
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
@@ -108,7 +108,7 @@ def test_a_recording_that_ended_goes_on_to_the_same_end(tmp_path: Path) -> None:
 
 def test_a_simulator_goes_on(tmp_path: Path) -> None:
     pytest.importorskip("pybullet")
-    from recorder.scenes import open_scene
+    from recorder.world.scenes import open_scene
 
     def live() -> FrameSource:
         return open_scene("icub", SceneConfig(kind="icub", seed=1), RecordConfig())
@@ -128,7 +128,7 @@ SLOW = """
 import sys, time
 from pathlib import Path
 import test_resume as case
-from cdmisfa.streams import OscillatorySource
+from recorder.world.oscillatory import OscillatorySource
 case.go(OscillatorySource(), Path(sys.argv[1]), case.LENGTH, resume=sys.argv[2] == "resume",
         progress=lambda _: time.sleep(.02))
 """
@@ -304,7 +304,8 @@ def test_differences_name_the_key() -> None:
 
 def test_compiling_is_announced_only_when_it_will_happen(tmp_path: Path) -> None:
     script = (
-        "from cdmisfa.compiled import needs_compiling as n; from cdmisfa.exploration import decay;"
+        "from cdmisfa.core.compiled import needs_compiling as n;"
+        "from cdmisfa.agents.exploration import decay;"
         "print(n(decay)); decay(1.0, .9, .5, .5); print(n(decay))"
     )
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.config import LearnerConfig
-from cdmisfa.reward import add_reward, curiosity_reward, expert_reward
+from cdmisfa.agents.reward import add_reward, curiosity_reward, expert_reward
+from cdmisfa.core.config import LearnerConfig
 
 small = st.floats(-1, 1)
 

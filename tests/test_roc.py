@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from cdmisfa import roc
-from cdmisfa.blocks import SourceSpec
-from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import UsageError
-from cdmisfa.learner import CuriousLearner
-from cdmisfa.reward import add_reward_locally
-from cdmisfa.streams import OscillatorySource
-from cdmisfa.trial import run_trial
+from cdmisfa.agents import roc
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.agents.reward import add_reward_locally
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
+from cdmisfa.experiments.trial import run_trial
+from recorder.world.oscillatory import OscillatorySource
 
 
 def node(streams: int = 2, places: int = 3, n: int = 4) -> tuple[np.ndarray, np.ndarray]:

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdmisfa.blocks import Block
-from cdmisfa.config import LearnerConfig, build, load_preset
-from cdmisfa.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.config import LearnerConfig, build, load_preset
+from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.signals import SignalsHash
 from cdmisfa.experiments.run import ENDINGS, RunResult, learn, write_json
-from cdmisfa.signals import SignalsHash
-from cdmisfa.streams import OscillatorySource
-from replay.modules import load_modules
-from replay.runlog import read_events, read_signals
+from recorder.world.oscillatory import OscillatorySource
+from replay.runs.log import read_events, read_signals
+from replay.runs.modules import load_modules
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
 
@@ -250,6 +250,6 @@ def test_the_folder_is_held_until_the_view_is_built(
         assert (folder / "run.mcap").is_file()
         seen.append(view)
 
-    monkeypatch.setattr("replay.view.build_view", build)
+    monkeypatch.setattr("replay.view.build.build_view", build)
     run(tmp_path / "run", rerun=True)
     assert seen == [tmp_path / "run" / "run.rrd"]

@@ -18,13 +18,12 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from run_data import IMAGE, VECTOR, run_of, signals_of, write_run
 
-from cdmisfa.blocks import SourceSpec
-from cdmisfa.errors import LogDamagedError, UsageError
-from cdmisfa.modules import Module
-from cdmisfa.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
-from replay import matrix_message, signals_message
-from replay.modules import load_modules, save_modules
-from replay.runlog import (
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
+from replay.runs import matrix_message, signals_message
+from replay.runs.log import (
     RunWriter,
     is_run,
     read_events,
@@ -34,6 +33,7 @@ from replay.runlog import (
     read_truth,
     read_watched,
 )
+from replay.runs.modules import load_modules, save_modules
 
 
 @given(
@@ -137,7 +137,7 @@ def test_the_log_opens_without_us_and_tells_its_units(tmp_path):
 def test_a_header_that_no_source_has_is_damage(tmp_path, monkeypatch, key, value, words):
     path = tmp_path / "run.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("replay.runlog.asdict", lambda spec: asdict(spec) | {key: value})
+        patch.setattr("replay.runs.log.asdict", lambda spec: asdict(spec) | {key: value})
         write_run(path, VECTOR, 2)
     with pytest.raises(LogDamagedError, match=f"its metadata cdmisfa.run is broken .*{words}"):
         list(read_signals(path))
@@ -147,7 +147,7 @@ def test_a_header_that_no_source_has_is_damage(tmp_path, monkeypatch, key, value
 def test_a_version_that_is_none_is_damage(tmp_path, monkeypatch, version):
     path = tmp_path / "run.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("replay.runlog.SCHEMA_VERSION", version)
+        patch.setattr("replay.runs.log.SCHEMA_VERSION", version)
         write_run(path, VECTOR, 2)
     with pytest.raises(LogDamagedError, match=r"metadata cdmisfa\.run is broken"):
         list(read_signals(path))
@@ -160,7 +160,7 @@ def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
         from pathlib import Path
         import numpy as np
         from run_data import VECTOR, run_of
-        from replay import runlog
+        from replay.runs import log as runlog
         runlog.FLUSH_SECONDS = 0.2
         writer = runlog.RunWriter(Path(sys.argv[1]), VECTOR, {})
         for signals, block in run_of(VECTOR, 22):
@@ -183,7 +183,7 @@ def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
 
 
 def test_a_partial_log_reads_wherever_it_was_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("replay.runlog.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("replay.runs.log.CHUNK_BYTES", 4096)
     whole = tmp_path / "whole.mcap"
     expected = [canonical_bytes(s) for s in write_run(whole, VECTOR, 20)]
     data = whole.read_bytes()

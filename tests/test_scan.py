@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cdmisfa.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
+from recorder.log.viewlog import Identity, ViewLog
 from recorder.recording import record
-from recorder.viewlog import Identity, ViewLog
-from replay.chunks import ChunkScanner
-from replay.reader import LogReader
-from replay.records import MalformedRecord, decompress
-from replay.scan import scan
-from replay.tables import indexed_table
-from replay.viewfile import ViewFile
+from replay.mcap.reader import LogReader
+from replay.mcap.records import MalformedRecord, decompress
+from replay.mcap.tables import indexed_table
+from replay.recordings.kernels import scan
+from replay.recordings.scanner import ChunkScanner
+from replay.recordings.view_file import ViewFile
 
 FRAMES = 200
 PICTURES = SourceSpec(("left",), (6, 8), "uint8", ("x", "y"), 50.0, 10**18)
@@ -193,7 +193,7 @@ def test_a_flipped_bit_is_found(pictures: dict[str, Path], tmp_path: Path) -> No
 
 def test_looking_at_a_log_compiles_nothing(pictures: dict[str, Path]) -> None:
     code = (
-        "import sys; from pathlib import Path; from replay.info import describe; "
+        "import sys; from pathlib import Path; from replay.integrity.info import describe; "
         f"describe(Path({str(pictures['zstd'])!r})); sys.exit('numba' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

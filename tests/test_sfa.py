@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cdmisfa.expansion import quadratic
-from cdmisfa.sfa import batch_sfa, direction_cosine, slowness
-from cdmisfa.streams import one_period
+from cdmisfa.core.expansion import quadratic
+from cdmisfa.features.sfa import batch_sfa, direction_cosine, slowness
+from recorder.world.oscillatory import one_period
 
 
 @pytest.mark.parametrize(("name", "cycles"), [("x1", 4), ("x2", 3), ("x3", 2)])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cdmisfa.signals import (
+from cdmisfa.core.signals import (
     SCHEMA_VERSION,
     SIGNALS,
     BlockSignals,

@@ -15,14 +15,15 @@ import pyarrow.parquet as pq
 import pytest
 from run_data import VECTOR, write_run
 
-from cdmisfa.blocks import Block
-from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
 from cdmisfa.experiments.checkpoint import refuse_difference
-from cdmisfa.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
-from replay import layout, signals_message
-from replay.compare import compare
-from replay.outline import read_outline
-from replay.runlog import RunWriter, read_header, read_phi, read_signals, read_truth, read_watched
+from replay.runs import signals_message
+from replay.runs.compare import compare
+from replay.runs.log import RunWriter, read_header, read_phi, read_signals, read_truth, read_watched
+from replay.runs.outline import read_outline
+from replay.view import layout
 
 OLD = Path(__file__).parent / "data" / "signals_v1"
 SIGNALS_SHA256 = "b86ab92af6b8ba255cb239dd54c187a1adbdccc9b43f096a348ad4f83bd85a2f"
@@ -117,7 +118,7 @@ def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
 @pytest.mark.parametrize("command", ["view", "plot", "compare"])
 def test_a_later_version_is_refused_in_one_line(cdmisfa, tmp_path, monkeypatch, command) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("replay.runlog.SCHEMA_VERSION", 9)
+        patch.setattr("replay.runs.log.SCHEMA_VERSION", 9)
         newer = written(tmp_path / "newer", list(read_signals(OLD)))
     more = {"view": ["--save", tmp_path / "x.rrd"], "plot": [], "compare": [OLD]}[command]
     refused = cdmisfa(command, newer, *more)

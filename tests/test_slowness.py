@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cdmisfa.slowness import (
+from cdmisfa.features.slowness import (
     block_moments,
     converged,
     instantaneous_slowness,

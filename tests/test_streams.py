@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from source_contract import SourceContract
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import UsageError
-from cdmisfa.streams import PERIOD, START_NS, OscillatorySource
+from cdmisfa.core.blocks import START_NS, FrameSource
+from cdmisfa.core.errors import UsageError
+from recorder.world.oscillatory import PERIOD, OscillatorySource
 
 
 class TestOscillatory(SourceContract):

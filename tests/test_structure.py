@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import click
@@ -14,8 +15,13 @@ from conftest import Cdmisfa
 from cdmisfa.cli.app import COMMANDS, cli
 
 ROOT = Path(__file__).parents[1]
-PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PACKAGES = ("cdmisfa", "recorder", "replay")
+
+
+def inits(package: str) -> list[Path]:
+    return sorted((ROOT / package).rglob("__init__.py"))
+
+
 HEAVY = ("numpy", "numba", "rerun", "pybullet", "matplotlib", "pyarrow", "mcap", "rich")
 
 
@@ -25,32 +31,83 @@ def python(*args: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_imports_run_one_way() -> None:
+FORBIDDEN = {
+    "cdmisfa": ("cdmisfa.cli.app",),
+    "cdmisfa.agents": ("cdmisfa.experiments.run", "replay.palette", "recorder.config", "mcap"),
+    "cdmisfa.cli": ("numba", "rerun", "mcap", "pybullet"),
+    "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
+    "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
+    "cdmisfa.experiments": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
+    "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
+    "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),
+    "cdmisfa.paper": ("cdmisfa.cli.app",),
+    "cdmisfa.presets": ("cdmisfa.core.config",),
+    "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),
+    "recorder.log": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner"),
+    "recorder.world": ("recorder.log.logfile", "replay.palette", "cdmisfa.features.sfa", "mcap"),
+    "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.world"),
+    "replay.camera_logs": ("replay.recordings.source", "replay.view.config", "rerun"),
+    "replay.export": ("replay.view.config", "replay.integrity.info", "rerun"),
+    "replay.integrity": ("replay.export.images", "replay.viewer.program", "rerun"),
+    "replay.mcap": ("replay.runs.log", "replay.recordings.source", "cdmisfa.agents.learner"),
+    "replay.recordings": ("replay.camera_logs.source", "replay.view.config", "recorder.recording"),
+    "replay.runs": ("replay.recordings.source", "replay.view.config", "cdmisfa.agents.learner"),
+    "replay.storage": ("replay.mcap.records", "recorder.config", "rerun"),
+    "replay.view": ("replay.viewer.program", "replay.export.images", "pybullet"),
+    "replay.viewer": ("cdmisfa.experiments.run", "recorder.world.world"),
+}
+"""Imports that each room must not have, of which the rules must catch every single one."""
+
+
+def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
     code = (
         "from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))"
     )
-    done = python("-c", code)
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root), "COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_imports_run_one_way_and_never_in_a_circle() -> None:
+    done = lint_imports(ROOT)
     assert done.returncode == 0, done.stdout
 
 
-def test_no_module_of_the_mind_escapes_the_rules() -> None:
-    contracts = PYPROJECT["tool"]["importlinter"]["contracts"]
-    ruled = next(c["source_modules"] for c in contracts if c["name"].startswith("The mind"))
-    found = {
-        f"cdmisfa.{path.stem}"
-        for path in (ROOT / "cdmisfa").iterdir()
-        if (path.suffix == ".py" or (path / "__init__.py").exists()) and path.stem[0] != "_"
-    }
-    assert found - {"cdmisfa.cli", "cdmisfa.experiments"} == set(ruled)
+def test_every_room_has_forbidden_imports_that_the_rules_catch(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.pyc"))
+    rooms = {".".join(f.parent.relative_to(ROOT).parts) for p in PACKAGES for f in inits(p)}
+    assert rooms == set(FORBIDDEN)
+    probes = []
+    for room, targets in FORBIDDEN.items():
+        for number, target in enumerate(targets):
+            probe = tmp_path.joinpath(*room.split("."), f"probe_{number}.py")
+            probe.write_text(f"import {target}\n")
+            probes.append((f"{room}.{probe.stem}", target))
+    done = lint_imports(tmp_path)
+    assert done.returncode == 1
+    caught = [(f"{name} -> {target} (l.1)", f"- {name}\n") for name, target in probes]
+    assert [lines[0] for lines in caught if not any(line in done.stdout for line in lines)] == []
 
 
-def test_every_package_is_listed() -> None:
-    found = {
-        ".".join(file.parent.relative_to(ROOT).parts)
-        for name in PACKAGES
-        for file in (ROOT / name).rglob("__init__.py")
-    }
-    assert set(PYPROJECT["tool"]["setuptools"]["packages"]) == found
+def test_a_package_hands_on_names_that_exist() -> None:
+    code = (
+        "import importlib, sys\n"
+        "for name in sys.argv[1:]:\n"
+        "    package = importlib.import_module(name)\n"
+        "    assert package.__doc__, name\n"
+        "    for public in getattr(package, '__all__', ()):\n"
+        "        getattr(package, public)\n"
+    )
+    done = python("-W", "ignore", "-c", code, *FORBIDDEN)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("package", PACKAGES)

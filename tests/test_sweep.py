@@ -29,18 +29,18 @@ from engine_tasks import trace
 from pyarrow import parquet
 
 from cdmisfa.cli.app import run as cdmisfa
-from cdmisfa.cli.results import results_command
-from cdmisfa.cli.sweep import parse_grid, parse_seeds, sweep_command
-from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.cli.commands.results import results_command
+from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, sweep_command
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments import engines
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.run import learn
 from cdmisfa.experiments.sweep import ROWS, plan, read_rows, sweep
-from cdmisfa.streams import OscillatorySource
 from recorder.recording import record
+from recorder.world.oscillatory import OscillatorySource
 
 GRID = {"learner.sigma": [0, 0.0009]}
 

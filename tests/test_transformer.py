@@ -8,14 +8,14 @@ import sys
 import numpy as np
 import pytest
 
-from cdmisfa.config import LearnerConfig
-from cdmisfa.errors import UsageError
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.modules import Module
 from cdmisfa.experiments.run import learn
-from cdmisfa.modules import Module
-from cdmisfa.streams import OscillatorySource
-from replay.modules import save_modules
-from replay.runlog import read_signals, read_watched
-from replay.transformer import SlowFeatures
+from recorder.world.oscillatory import OscillatorySource
+from replay.runs.log import read_signals, read_watched
+from replay.runs.modules import save_modules
+from replay.runs.transformer import SlowFeatures
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +92,8 @@ def test_it_is_a_step_of_a_pipeline():
 
 def test_neither_learner_nor_sklearn_is_loaded():
     code = (
-        "import sys, replay.transformer; "
-        "print([m for m in sys.modules if m in ('cdmisfa.learner', 'sklearn', 'rerun')])"
+        "import sys, replay.runs.transformer; "
+        "print([m for m in sys.modules if m in ('cdmisfa.agents.learner', 'sklearn', 'rerun')])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cdmisfa.config import LearnerConfig
-from cdmisfa.learner import CuriousLearner
-from cdmisfa.signals import BlockSignals
-from cdmisfa.streams import OscillatorySource
-from cdmisfa.trial import CHUNK, Swap, TrialResult, run_trial
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.trial import CHUNK, Swap, TrialResult, run_trial
+from recorder.world.oscillatory import OscillatorySource
 
 QUICK = LearnerConfig(epsilon_decay=0.99, tau=50, eta_dot_window=20)
 """Learns its modules in a few hundred short iterations."""

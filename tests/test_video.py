@@ -15,10 +15,10 @@ from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
 from source_contract import SourceContract
 
-from cdmisfa.blocks import FrameSource
-from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.foreign import ForeignSource
-from replay.video import VideoImages
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.source import ForeignSource
+from replay.camera_logs.video import VideoImages
 
 av = pytest.importorskip("av")
 

@@ -18,21 +18,23 @@ from PIL import Image
 from rerun.chunk import RrdReader
 from run_data import DELTA, IMAGE, VECTOR, run_of, write_run
 
-from cdmisfa.blocks import SourceSpec
-from cdmisfa.errors import CdmisfaError, UsageError
-from cdmisfa.modules import Module
-from cdmisfa.signals import SIGNALS
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import SIGNALS
 from recorder.config import SceneConfig
 from recorder.recording import record
-from replay import layout, run_view, viewer
-from replay.columns import tensor_array
-from replay.config import ViewConfig
-from replay.modules import save_modules
-from replay.outline import read_outline
-from replay.program import check_limit, environment, program, run_program
-from replay.runlog import read_signals
-from replay.summary import summary_text
-from replay.view import build_view
+from replay.runs.log import read_signals
+from replay.runs.modules import save_modules
+from replay.runs.outline import read_outline
+from replay.view import layout
+from replay.view import run as run_view
+from replay.view.build import build_view
+from replay.view.columns import tensor_array
+from replay.view.config import ViewConfig
+from replay.view.summary import summary_text
+from replay.viewer import window as viewer
+from replay.viewer.program import check_limit, environment, program, run_program
 
 ITERATIONS = 24
 TAU = 40
@@ -185,7 +187,7 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
 def test_the_share_of_the_recent_blocks_is_there(shown, monkeypatch):
     spec, records, _, folder = shown
     monkeypatch.setattr(run_view, "RECENT", 5)
-    monkeypatch.setattr("replay.stretch.ITERATIONS", 4)
+    monkeypatch.setattr("replay.runs.stretches.ITERATIONS", 4)
     build_view(folder, folder / "short.rrd", every=20)
     found = scalars(rows_of(folder / "short.rrd")["/decision/attention"])
     streams = np.array([s.stream for s in records])
@@ -255,7 +257,7 @@ def test_many_streams_show_the_most_watched(tmp_path):
 
 
 def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("replay.runlog.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("replay.runs.log.CHUNK_BYTES", 4096)
     write_run(tmp_path / "run.mcap", VECTOR, 0)
     build_view(tmp_path, tmp_path / "empty.rrd")
     assert "/signals/y" not in rows_of(tmp_path / "empty.rrd")
@@ -409,7 +411,7 @@ def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
     program.write_text(f"#!/bin/sh\necho $$ > {told}.part\nmv {told}.part {told}\nexec sleep 60\n")
     program.chmod(0o755)
     code = (
-        "import sys, pathlib, replay.program as v\n"
+        "import sys, pathlib, replay.viewer.program as v\n"
         f"v.program = lambda: pathlib.Path({str(program)!r})\n"
         "v.run_program([])\n"
     )
@@ -430,7 +432,7 @@ def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
     script = tmp_path / "program"
     script.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
     script.chmod(0o755)
-    monkeypatch.setattr("replay.program.program", lambda: script)
+    monkeypatch.setattr("replay.viewer.program.program", lambda: script)
     with pytest.raises(CdmisfaError, match="code 3: no luck"):
         run_program([])
     assert capfd.readouterr().err == ""

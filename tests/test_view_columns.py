@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from run_data import IMAGE, VECTOR, run_of, write_run
 
-from cdmisfa.errors import LogDamagedError
-from cdmisfa.signals import SIGNALS
-from replay import matrix_message, signals_message, stretch
-from replay.outline import read_outline
-from replay.records import MalformedRecord
-from replay.runlog import read_events, read_header, read_phi, read_truth, read_watched
-from replay.signal_columns import columns_of_messages, columns_of_records
-from replay.stretch import read_stretches
-from replay.view import build_view
-from replay.wire import alike, spans
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.signals import SIGNALS
+from replay.mcap.records import MalformedRecord
+from replay.runs import matrix_message, signals_message
+from replay.runs import stretches as stretch
+from replay.runs.columns import columns_of_messages, columns_of_records
+from replay.runs.log import read_events, read_header, read_phi, read_truth, read_watched
+from replay.runs.outline import read_outline
+from replay.runs.stretches import read_stretches
+from replay.runs.wire import alike, spans
+from replay.view.build import build_view
 
 ITERATIONS = 30
 

@@ -20,9 +20,9 @@ import pytest
 from PIL import Image
 from run_data import VECTOR, write_run
 
-from replay import webpage
-from replay.program import free_port
-from replay.webpage import policy, serve_page
+from replay.viewer import webpage
+from replay.viewer.program import free_port
+from replay.viewer.webpage import policy, serve_page
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")

@@ -18,7 +18,7 @@ from typing import NoReturn
 import click
 
 from cdmisfa.cli.interrupts import interruptible
-from cdmisfa.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene shows, one MCAP file per view."),
@@ -61,7 +61,7 @@ class LazyGroup(click.Group):
         """Import the command."""
         if cmd_name not in COMMANDS:
             return None
-        module = importlib.import_module(f"cdmisfa.cli.{COMMANDS[cmd_name][0]}")
+        module = importlib.import_module(f"cdmisfa.cli.commands.{COMMANDS[cmd_name][0]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 

@@ -10,7 +10,7 @@ import click
 from cdmisfa.cli.options import Command
 
 if TYPE_CHECKING:
-    from cdmisfa.blocks import FrameSource
+    from cdmisfa.core.blocks import FrameSource
 
 
 def _height_and_width(

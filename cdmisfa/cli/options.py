@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 
 import click
 
-from cdmisfa.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -120,8 +120,8 @@ def fetched_argument(name: str) -> Callable[[Command], Command]:
 def _fetched(ctx: click.Context, param: click.Parameter, value: str) -> Path:
     if "://" not in value:
         return Path(value)
-    from replay.fetch import fetched
-    from replay.store import location
+    from replay.storage.copied import fetched
+    from replay.storage.location import location
 
     place = location(value)
     copy = ctx.with_resource(fetched(place))

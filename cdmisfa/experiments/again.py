@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.errors import UsageError
+from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.checkpoint import COMMAND, log_to_go_on_with
 
 OPTIONS = (
@@ -48,7 +48,7 @@ def recall(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
         UsageError: there is no run, or it does not say.
         LogDamagedError: its log cannot be read.
     """
-    from replay.runlog import read_header
+    from replay.runs.log import read_header
 
     command = read_header(log_to_go_on_with(run)).manifest.get(COMMAND)
     if not isinstance(command, dict) or not isinstance(command.get("source"), list):
@@ -66,7 +66,7 @@ def recall(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 def _relative(word: str, run: Path) -> str:
     """A path seen from a run's folder; names of scenes and URLs stay."""
-    from recorder.scenes import SCENES
+    from recorder.world.scenes import SCENES
 
     if word in SCENES or "://" in word:
         return word

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.blocks import SourceSpec
-from cdmisfa.errors import LogDamagedError, UsageError
-from cdmisfa.learner import CuriousLearner, LearnerState
-from cdmisfa.modules import Module
-from cdmisfa.signals import SCHEMA_VERSION
+from cdmisfa.agents.learner import CuriousLearner, LearnerState
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import SCHEMA_VERSION
 
 SCHEMA = 1
 """Version of the file; rises when the state of a learner changes its meaning."""
@@ -171,8 +171,8 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path 
     Raises:
         UsageError: there is no run, or it was made with another configuration or source.
     """
-    from recorder.logfile import partial_path
-    from replay.runlog import RUN_FILE
+    from recorder.log.logfile import partial_path
+    from replay.runs.log import RUN_FILE
 
     whole, aside = run / RUN_FILE, run / SET_ASIDE
     found = log_to_go_on_with(run)
@@ -189,8 +189,8 @@ def log_to_go_on_with(run: Path) -> Path:
     Raises:
         UsageError: there is no run.
     """
-    from recorder.logfile import partial_path
-    from replay.runlog import RUN_FILE
+    from recorder.log.logfile import partial_path
+    from replay.runs.log import RUN_FILE
 
     whole = run / RUN_FILE
     for found in (run / SET_ASIDE, partial_path(whole), whole):
@@ -200,7 +200,7 @@ def log_to_go_on_with(run: Path) -> Path:
 
 
 def _has_header(log: Path) -> bool:
-    from replay.runlog import read_header
+    from replay.runs.log import read_header
 
     try:
         read_header(log)
@@ -215,7 +215,7 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
     Raises:
         UsageError: something differs.
     """
-    from replay.runlog import read_header
+    from replay.runs.log import read_header
 
     header = read_header(log)
     before = {

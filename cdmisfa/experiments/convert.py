@@ -10,10 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from cdmisfa.errors import UsageError
+from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
-from recorder.folder import held
-from recorder.parts import ViewParts
+from recorder.log.folder import held
+from recorder.log.parts import ViewParts
+from recorder.log.viewlog import Identity
 from recorder.recording import (
     ViewRecording,
     make_folder,
@@ -21,8 +22,7 @@ from recorder.recording import (
     remove_views,
     written,
 )
-from recorder.viewlog import Identity
-from replay.foreign import ForeignSource
+from replay.camera_logs.source import ForeignSource
 
 KIND: Final = "foreign"
 """What the recording states as its scene."""

@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from cdmisfa.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

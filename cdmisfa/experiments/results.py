@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments.statistics import Summary, summary
 from cdmisfa.experiments.sweep import DONE, FAILED, REQUEST, read_rows
 

@@ -18,11 +18,14 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.agent import think
-from cdmisfa.blocks import FrameSource
-from cdmisfa.compiled import needs_compiling
-from cdmisfa.config import LearnerConfig, as_table
-from cdmisfa.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.agents.agent import think
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.compiled import needs_compiling
+from cdmisfa.core.config import LearnerConfig, as_table
+from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
 from cdmisfa.experiments.checkpoint import (
     COMMAND,
     SET_ASIDE,
@@ -33,11 +36,8 @@ from cdmisfa.experiments.checkpoint import (
     save_checkpoint,
     set_aside,
 )
-from cdmisfa.incsfa import strict
-from cdmisfa.learner import CuriousLearner
-from cdmisfa.modules import Module
-from cdmisfa.signals import SCHEMA_VERSION, SignalsHash
-from recorder.folder import held
+from cdmisfa.features.incsfa import strict
+from recorder.log.folder import held
 
 ENDINGS: Mapping[str, str] = {
     "max_modules": "as many modules as asked for were learned",
@@ -278,7 +278,7 @@ def _run_log(
             raise UsageError("which run to go on with? name its folder")
         yield None
         return
-    from replay.runlog import RunWriter
+    from replay.runs.log import RunWriter
 
     manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
     if command is not None:
@@ -322,7 +322,7 @@ def _live_view(
     if not live:
         yield None
         return
-    from replay.live import LiveView
+    from replay.viewer.live import LiveView
 
     manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
     with LiveView(source.spec, manifest, config.tau, config.outputs) as shown:
@@ -338,7 +338,7 @@ def _no_folder(out: Path, error: OSError) -> UsageError:
 
 def _go_on(log: Any, learner: CuriousLearner, source: FrameSource, digest: SignalsHash) -> None:
     """Bring log, learner, source and digest to where the run's newest checkpoint stands."""
-    from replay.runlog import count_iterations
+    from replay.runs.log import count_iterations
 
     run = log.path.parent
     before = run / SET_ASIDE
@@ -375,7 +375,7 @@ def _say_if_compiling() -> None:
     if not sys.stderr.isatty():
         return
     functions: list[Callable[..., Any]] = [think, strict.update]
-    if scan := sys.modules.get("replay.scan"):  # of a source that reads recordings
+    if scan := sys.modules.get("replay.recordings.kernels"):  # of a source that reads recordings
         functions += [scan.scan, scan.gather]
     if any(needs_compiling(function) for function in functions):
         print("compiling the learner, this first time only (some 10 to 30 s)", file=sys.stderr)
@@ -388,7 +388,7 @@ def _write_run(
     rerun: bool,
     command: Mapping[str, Any] | None,
 ) -> None:
-    from replay.modules import save_modules
+    from replay.runs.modules import save_modules
 
     save_modules(out / "modules.npz", result.modules)
     document = {
@@ -406,7 +406,7 @@ def _write_run(
         document[COMMAND] = dict(command)
     write_json(out / "run.json", document)
     if rerun:
-        from replay.view import build_view
+        from replay.view.build import build_view
 
         build_view(out, out / "run.rrd")
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.blocks import FrameSource, SourceSpec
-from cdmisfa.config import LearnerConfig, as_table, build, load_preset, parse_settings
-from cdmisfa.errors import UsageError
+from cdmisfa.core.blocks import FrameSource, SourceSpec
+from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
+from cdmisfa.core.errors import UsageError
 from recorder.config import SCENE_KEYS, RecordConfig, SceneConfig, scene_table
 
 if TYPE_CHECKING:
-    from replay.foreign import Align, ForeignSource
-    from replay.store import Location
+    from replay.camera_logs.source import Align, ForeignSource
+    from replay.storage.location import Location
 
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
@@ -121,7 +121,7 @@ def configure_scene(
     Raises:
         UsageError: no such scene, or as for `configure`.
     """
-    from recorder.scenes import SCENES
+    from recorder.world.scenes import SCENES
 
     if name not in SCENES:
         close = difflib.get_close_matches(name, SCENES, n=1)
@@ -135,7 +135,7 @@ def preset_for(spec: SourceSpec, described: Mapping[str, Any], preset: str | Non
 
     What shows another scene takes the kind of the `preset` chosen, else by what a frame is.
     """
-    from recorder.scenes import SCENES
+    from recorder.world.scenes import SCENES
 
     scene = str(described.get("scene", ""))
     if scene in SCENES:
@@ -174,7 +174,7 @@ def open_source(
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
-    from recorder.scenes import SCENES, open_scene
+    from recorder.world.scenes import SCENES, open_scene
 
     cameras = cameras or CameraOptions()
     if follow is not None and (
@@ -192,7 +192,7 @@ def open_source(
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
-    from replay.store import Url, location
+    from replay.storage.location import Url, location
 
     paths = [location(word) for word in words]
     for path in paths:
@@ -203,7 +203,7 @@ def open_source(
             )
     source: FrameSource
     if follow is not None:
-        from replay.follow import FollowedSource
+        from replay.recordings.followed import FollowedSource
 
         if isinstance(paths[0], Url):
             raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
@@ -237,9 +237,9 @@ def open_log(
         UsageError: no such log, or streams that need to be aligned.
         LogDamagedError: it is damaged.
     """
-    from replay.camera_logs import only_foreign
-    from replay.recorded import RecordedSource
-    from replay.viewfile import NoRecordingError
+    from replay.camera_logs.stream import only_foreign
+    from replay.recordings.source import RecordedSource
+    from replay.recordings.view_file import NoRecordingError
 
     cameras = cameras or CameraOptions()
     if cameras == CameraOptions():
@@ -255,10 +255,10 @@ def open_log(
 
 def _refuse_what_is_no_log(path: Location) -> None:
     """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
-    from replay.camera_logs import only_foreign
-    from replay.files import starts_as_log
-    from replay.runlog import RUN_FILE, is_run
-    from replay.store import Url
+    from replay.camera_logs.stream import only_foreign
+    from replay.mcap.identity import starts_as_log
+    from replay.runs.log import RUN_FILE, is_run
+    from replay.storage.location import Url
 
     if isinstance(path, Url):  # opened only once: see `_refuse_remote_run`
         return
@@ -276,9 +276,9 @@ def _refuse_what_is_no_log(path: Location) -> None:
 
 def _refuse_remote_run(path: Location) -> None:
     """Refuse a run behind a URL, once it is known to be no recording."""
-    from replay.info import kind_of
-    from replay.reader import LogReader
-    from replay.store import Url
+    from replay.integrity.info import kind_of
+    from replay.mcap.reader import LogReader
+    from replay.storage.location import Url
 
     if isinstance(path, Url) and not path.folder:
         with LogReader(path) as reader:
@@ -307,7 +307,7 @@ def open_cameras(
         UsageError: no such log, or streams that need to be aligned.
         LogDamagedError: it is damaged.
     """
-    from replay.foreign import ForeignSource
+    from replay.camera_logs.source import ForeignSource
 
     return ForeignSource(
         paths,

@@ -16,17 +16,17 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from cdmisfa.config import as_table
-from cdmisfa.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.config import as_table
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.run import learn, module_table, write_json
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
-from recorder.folder import held
-from recorder.scenes import SCENES, open_scene
+from recorder.log.folder import held
+from recorder.world.scenes import SCENES, open_scene
 
 ROWS = "rows.jsonl"
 """A line for each trial that ended; the last line of a trial counts."""
@@ -263,12 +263,13 @@ def _hash(value: Any) -> str:
 
 @cache
 def code() -> str:
-    """Version of what a trial computes: the package's, and a hash of core and recorder."""
+    """Version of what a trial computes: the package's, and a hash of learner and recorder."""
+    root = Path(__file__).parents[2]
+    rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")
+    files = [file for room in rooms for file in (root / room).rglob("*.py")]
     digest = hashlib.sha256()
-    for package in ("cdmisfa", "cdmisfa.incsfa", "recorder"):
-        for file in sorted(resources.files(package).iterdir(), key=lambda f: f.name):
-            if file.name.endswith(".py"):
-                digest.update(f"{package}/{file.name}\0".encode() + file.read_bytes())
+    for file in sorted([*files, root / "cdmisfa/experiments/trial.py"]):
+        digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
     return f"{metadata.version('cdmisfa')}+{digest.hexdigest()[:12]}"
 
 
@@ -295,7 +296,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 
 
 def _compiled_trial(trial: Trial) -> dict[str, Any]:
-    from cdmisfa.trial import run_trial as run_oscillatory
+    from cdmisfa.experiments.trial import run_trial as run_oscillatory
 
     streams = trial.configuration.scene.streams
     result = run_oscillatory(

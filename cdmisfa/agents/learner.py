@@ -1,0 +1,327 @@
+"""`CuriousLearner`: blocks in, signals out.
+
+The learner knows neither where its blocks come from nor where its signals go. The same
+blocks give the same signals, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.agents.agent import (
+    OUTCOME,
+    begin_abstraction,
+    has_gap,
+    mean_change,
+    new_agent,
+    rules,
+    think,
+)
+from cdmisfa.agents.gate import Frozen, mean_output, recognise
+from cdmisfa.agents.policy import action_values
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.expansion import expanded_size, quadratic
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.features.incsfa import IncSFA, project
+
+Float = NDArray[np.float64]
+
+POLICY_KEY, WEIGHTS_KEY = 1, 2
+"""Spawn keys of the learner's two random generators, beneath the run's seed."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerState:
+    """Everything that changes in a learner, so that it can be put away and taken up again.
+
+    Attributes:
+        arrays: the agent's memory and the adaptive abstraction, by name.
+        modules: what was learned so far.
+        policy_rng: state of the policy's random generator, as its `bit_generator.state`.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    modules: tuple[Module, ...]
+    policy_rng: Mapping[str, Any]
+
+
+MAX_INPUTS = 2_000_000
+"""An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused."""
+
+
+class CuriousLearner:
+    """The paper's agent: adaptive abstraction, gating system and curiosity-driven learner.
+
+    Attributes:
+        config: what it was told.
+        spec: the source it learns from.
+        seed: where its random generators started.
+        modules: what it learned so far.
+        scale: factor from a frame's values to the learner's (1/255 for pixels).
+        policy_rng: three draws an iteration, whatever is done with them.
+        rules: the configuration's numbers, for compiled code.
+        agent: memory of the agent; changed in place.
+        abstraction: the adaptive abstraction.
+        frozen: the modules in one stack.
+        out: (1,) of `OUTCOME`, what the last iteration came to.
+
+    Example:
+        >>> from recorder.world.oscillatory import OscillatorySource
+        >>> source = OscillatorySource()
+        >>> learner = CuriousLearner(LearnerConfig(), source.spec, seed=0)
+        >>> signals = learner.step(source.take(learner.stream, learner.tau))
+        >>> signals.y.shape
+        (100, 1)
+    """
+
+    def __init__(self, config: LearnerConfig, spec: SourceSpec, seed: int) -> None:
+        self.config = config
+        self.spec = spec
+        self.seed = seed
+        self.modules: list[Module] = []
+        self._n_inputs = self._count_inputs()
+        self.scale = 1.0 / 255.0 if spec.dtype == "uint8" else 1.0
+        self.policy_rng = np.random.Generator(
+            np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
+        )
+        n_streams = len(spec.streams)
+        first = int(self.policy_rng.random() * n_streams)
+        self.rules = rules(config, n_streams)
+        self.agent = new_agent(config, n_streams, first)
+        self.out = np.zeros(1, OUTCOME)
+        self._freeze()
+        self.abstraction = self._new_abstraction()
+
+    @property
+    def tau(self) -> int:
+        """Frames the learner wants in each block."""
+        return self.config.tau
+
+    @property
+    def stream(self) -> int:
+        """Stream the learner wants to watch next."""
+        return int(self.agent.memory["stream"][0])
+
+    @property
+    def iteration(self) -> int:
+        """Iterations so far."""
+        return int(self.agent.memory["iteration"][0])
+
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random action in the last iteration."""
+        return float(self.agent.memory["epsilon"][0])
+
+    @property
+    def policy(self) -> NDArray[np.int64]:
+        """The policy being learned, (S,): 0 stay, 1 switch."""
+        return self.agent.policy.copy()
+
+    @property
+    def phi(self) -> Float:
+        """Weights of the adaptive abstraction, (J, I), a copy."""
+        return self.abstraction.phi.copy()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether exploration has ended long ago and still nothing converged."""
+        return bool(self.agent.memory["idle"][0] > self.config.patience)
+
+    @property
+    def state(self) -> LearnerState:
+        """The learner's state, a copy."""
+        return LearnerState(
+            arrays={name: array.copy() for name, array in self._arrays().items()},
+            modules=tuple(self.modules),
+            policy_rng=self.policy_rng.bit_generator.state,
+        )
+
+    def restore(self, state: LearnerState) -> None:
+        """Go on from a state of a learner with the same configuration, spec and seed.
+
+        Raises:
+            ValueError: an array is missing or of another shape or type.
+        """
+        self.modules = list(state.modules)
+        self._freeze()
+        self.abstraction = self._new_abstraction()
+        for name, own in self._arrays().items():
+            array = state.arrays.get(name)
+            if array is None or array.shape != own.shape or array.dtype != own.dtype:
+                raise ValueError(f"{name} is missing or of another shape or type")
+            own[...] = array
+        self.policy_rng.bit_generator.state = dict(state.policy_rng)
+
+    def step(self, block: Block) -> BlockSignals:
+        """One iteration: look at tau frames, learn, and decide what to watch next.
+
+        Args:
+            block: tau frames of the stream the learner asked for.
+
+        Raises:
+            ValueError: the block is of another stream, length, frame shape or type.
+            CdmisfaError: it holds a value that is no finite number.
+        """
+        self._check(block)
+        agent = self.agent
+        frames = block.frames.reshape(len(block), -1)
+        x = quadratic(frames) if self.config.expansion == "quadratic" else frames
+        outputs, count = self.config.outputs, len(self.modules)
+        y_frozen = np.empty((count, len(block), outputs))
+        eta_frozen, roc_error_frozen = np.empty((count, outputs)), np.empty(count)
+        known_by = recognise(
+            self.frozen,
+            self.rules.roc_error,
+            block.stream,
+            frames,
+            x,
+            self.scale,
+            y_frozen,
+            eta_frozen,
+            roc_error_frozen,
+        )
+        y = np.full((len(block), outputs), np.nan)
+        xi = np.nan
+        if known_by == 0:
+            gap = has_gap(agent, block.stream, block.t)
+            xi = mean_change(self.abstraction.update(x, gap))
+            phi = self.abstraction.phi
+            y = project(phi, mean_output(phi, self.abstraction.mean), x)
+        think(
+            agent,
+            self.rules,
+            self.out,
+            known_by,
+            xi,
+            y,
+            block.t + len(block),
+            self.policy_rng.random(3),
+        )
+        signals = self._signals(block, y, y_frozen, eta_frozen, roc_error_frozen)
+        if self.out["saved"][0]:
+            self.save_abstraction()
+        return signals
+
+    def _count_inputs(self) -> int:
+        """Number of inputs after expansion.
+
+        Raises:
+            UsageError: too many to hold, or fewer than components.
+        """
+        values = int(np.prod(self.spec.frame_shape))
+        inputs = expanded_size(self.config.expansion, values)
+        if inputs > MAX_INPUTS:
+            raise UsageError(
+                f"learner.expansion {self.config.expansion} makes {inputs:,} inputs of {values:,}, "
+                f"more than {MAX_INPUTS:,}: set learner.expansion=none or take smaller frames"
+            )
+        if self.config.components > inputs:
+            raise UsageError(
+                f"learner.components is {self.config.components}, more than the {inputs} inputs"
+            )
+        return inputs
+
+    def _check(self, block: Block) -> None:
+        """Refuse a block that was not asked for, or that would spoil every estimate."""
+        if block.stream != self.stream or len(block) != self.tau:
+            raise ValueError(
+                f"the learner asked for {self.tau} frames of stream {self.stream}, "
+                f"not {len(block)} of stream {block.stream}"
+            )
+        shape, dtype = block.frames.shape[1:], block.frames.dtype
+        if shape != self.spec.frame_shape or dtype != self.spec.dtype:
+            raise ValueError(
+                f"the learner asked for frames of {self.spec.frame_shape} {self.spec.dtype}, "
+                f"not {shape} {dtype}"
+            )
+        if dtype.kind == "f" and not np.isfinite(block.frames).all():
+            raise CdmisfaError(
+                f"stream {self.spec.streams[block.stream]} holds a value that is no finite number "
+                f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
+            )
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Every array that changes in place, by name."""
+        parts: dict[str, Any] = {"agent": self.agent, "abstraction": self.abstraction.state}
+        return {
+            f"{part}.{name}": array
+            for part, arrays in parts.items()
+            for name, array in zip(arrays._fields, arrays, strict=True)
+        }
+
+    def _signals(
+        self, block: Block, y: Float, y_frozen: Float, eta_frozen: Float, roc_error_frozen: Float
+    ) -> BlockSignals:
+        agent = self.agent
+        out: dict[str, Any] = dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))
+        Q = np.empty((len(agent.policy), 2))
+        scale = agent.memory["scale"][0]
+        action_values(agent.stay_sum, agent.switch_sum, scale, self.config.gamma, agent.policy, Q)
+        return BlockSignals(
+            iteration=self.iteration - 1,
+            t=block.t,
+            log_time=self.spec.time_ns(block.t),
+            y=y,
+            y_frozen=y_frozen,
+            eta=agent.eta.copy(),
+            eta_dot=agent.eta_dot.copy(),
+            variance=agent.recent_square - agent.recent_mean**2,
+            eta_inst=agent.eta_inst.copy() if out["novel"] else np.full(len(agent.eta), np.nan),
+            gate_mean=agent.gate_mean.copy(),
+            gate_sd=np.sqrt(agent.gate_variance),
+            eta_inst_frozen=eta_frozen,
+            band_mean=self.frozen.band_mean.copy(),
+            band_sd=self.frozen.band_sd.copy(),
+            roc_error_frozen=roc_error_frozen,
+            R=agent.dense / (scale or 1.0),
+            Q=Q,
+            policy=agent.policy.copy(),
+            **out,
+        )
+
+    def save_abstraction(self) -> None:
+        """Freeze the abstraction that the last iteration found ready, and begin a new one."""
+        agent, memory = self.agent, self.agent.memory[0]
+        module = Module(
+            index=len(self.modules) + 1,
+            stream=int(memory["last_stream"]),
+            iteration=int(memory["iteration"]) - 1,
+            phi=self.abstraction.phi.copy(),
+            mean=self.abstraction.mean.copy(),
+            band_mean=agent.gate_mean.copy(),
+            band_sd=np.sqrt(agent.gate_variance),
+            eta=agent.eta.copy(),
+            policy=agent.policy.copy(),
+            centres=agent.centres.copy(),
+            counts=agent.counts.copy(),
+        )
+        self.modules.append(module)
+        self._freeze()
+        begin_abstraction(agent, self.rules.epsilon_start)
+        self.abstraction = self._new_abstraction()
+
+    def _freeze(self) -> None:
+        """Stack the frozen modules' rows, so that one pass over a block serves all of them."""
+        count, outputs, modules = len(self.modules), self.config.outputs, self.modules
+        agent = self.agent
+        self.frozen = Frozen(
+            phi=np.array([m.phi for m in modules]).reshape(-1, self._n_inputs),
+            offset=np.array([mean_output(m.phi, m.mean) for m in modules]).reshape(-1),
+            band_mean=np.array([m.band_mean for m in modules]).reshape(count, outputs),
+            band_sd=np.array([m.band_sd for m in modules]).reshape(count, outputs),
+            centres=np.array([m.centres for m in modules]).reshape(count, *agent.centres.shape),
+            counts=np.array([m.counts for m in modules]).reshape(count, *agent.counts.shape),
+        )
+
+    def _new_abstraction(self) -> IncSFA:
+        key = (WEIGHTS_KEY, len(self.modules))
+        seed = np.random.SeedSequence(self.seed, spawn_key=key)
+        return IncSFA(self.config, self._n_inputs, np.random.Generator(np.random.PCG64(seed)))

@@ -1,0 +1,77 @@
+"""`cdmisfa convert`: make a recording of other people's camera logs."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.cameras import camera_options, say_about
+from cdmisfa.cli.commands.record import print_recording
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.progress import bar
+from cdmisfa.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from replay.camera_logs.source import Align
+
+
+@click.command("convert")
+@click.argument("source", nargs=-1, required=True)
+@options.out("Folder of the recording.", required=True)
+@camera_options
+@click.option("--salvage", is_flag=True, help="Go on over damaged parts of a log.")
+@click.option("--resume", is_flag=True, help="Go on where an earlier attempt was stopped.")
+@options.force
+@options.as_json
+@click.pass_context
+def convert_command(
+    ctx: click.Context,
+    source: tuple[str, ...],
+    out: Path,
+    topics: tuple[str, ...],
+    size: tuple[int, int] | None,
+    align: Align | None,
+    rate: float | None,
+    salvage: bool,
+    resume: bool,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Write camera logs of others as a recording.
+
+    SOURCE is MCAP files or their URLs, ROS bags, or a video or a folder of pictures for each
+    stream. Interrupted, it goes on with --resume.
+    """
+    from cdmisfa.experiments.convert import REMEDY, convert
+    from cdmisfa.experiments.sources import CameraOptions, open_cameras
+    from recorder.recording import refuse_existing
+    from replay.storage.location import Url, location
+
+    places = [location(word) for word in source]
+    for place in places:
+        if not isinstance(place, Url) and not place.exists():
+            raise UsageError(f"{place}: no such file or folder")
+    if not resume:
+        refuse_existing(out, force=force, remedy=REMEDY)
+    cameras = CameraOptions(topics, size, align, rate)
+    goal = ("convert", str(out))
+    with contextlib.closing(open_cameras(places, cameras, salvage=salvage, goal=goal)) as frames:
+        say_about(frames)
+        length = frames.spec.length or 0
+        with bar("converting", "frames") as shown, stoppable() as stop:
+
+            def advance(done: float) -> None:
+                shown.update(done, length)
+                if stop():
+                    raise KeyboardInterrupt
+
+            try:
+                files = convert(frames, out, force=force, resume=resume, progress=advance)
+            except KeyboardInterrupt:
+                click.echo(f"cdmisfa: {out} is not finished: go on with --resume", err=True)
+                ctx.exit(stop.exit_code)
+    print_recording(out, length, files, as_json=as_json)

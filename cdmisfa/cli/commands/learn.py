@@ -1,0 +1,232 @@
+"""`cdmisfa learn`: learn modules from a live scene or a recording."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.cameras import camera_options, say_about
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.progress import Bar, bar
+
+if TYPE_CHECKING:
+    from cdmisfa.experiments.run import Progress, RunResult
+    from replay.camera_logs.source import Align
+
+TICK = 0.1
+"""Seconds between two updates of the bar: a block may take only microseconds."""
+
+
+@click.command("learn")
+@click.argument("source", nargs=-1)
+@options.out("Folder of the run; without it nothing is written.")
+@options.seed
+@options.preset
+@options.settings
+@click.option(
+    "--algorithm",
+    type=click.Choice(["1.0", "2.0"]),
+    help="CD-MISFA version, short for --set learner.algorithm=.",
+)
+@click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
+@click.option(
+    "--max-modules",
+    type=click.IntRange(1),
+    help="End after so many modules; by default as many as there are streams.",
+)
+@click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@click.option("--resume", is_flag=True, help="Go on with the run in -o where it was stopped.")
+@click.option("--salvage", is_flag=True, help="Go on over damaged parts of a recording.")
+@click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
+@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
+@click.option(
+    "--follow-timeout",
+    type=click.FloatRange(0.1, 1e6),
+    default=60.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="With --follow, give up when no frame came for so long.",
+)
+@camera_options
+@options.force
+@options.as_json
+@click.pass_context
+def learn_command(
+    ctx: click.Context,
+    source: tuple[str, ...],
+    out: Path | None,
+    seed: int,
+    preset: str | None,
+    settings: tuple[str, ...],
+    algorithm: str | None,
+    max_iterations: int | None,
+    max_modules: int | None,
+    loop: bool,
+    resume: bool,
+    salvage: bool,
+    live_view: bool,
+    no_rerun: bool,
+    follow: bool,
+    follow_timeout: float,
+    topics: tuple[str, ...],
+    size: tuple[int, int] | None,
+    align: Align | None,
+    rate: float | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Learn slow feature modules from a scene or a recording.
+
+    SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
+    files of its views. The same seed gives the same signals, bit for bit, from each.
+    It may also be other people's logs of cameras: MCAP files, ROS bags, or a video or a
+    folder of pictures for each stream. Logs may be URLs: s3://, http:// and https://.
+    With --resume it is that of the run, and need not be given.
+    """
+    if resume and out is None:
+        raise click.UsageError("--resume needs -o RUN, the run to go on with")
+    if resume and force:
+        raise click.UsageError("--force starts anew and --resume goes on: use one of them")
+    if not source:
+        go_on(ctx, out if resume else None)
+        return
+    from cdmisfa.experiments.again import remember
+    from cdmisfa.experiments.run import RunExhaustedError, learn
+    from cdmisfa.experiments.sources import CameraOptions, open_source
+
+    if algorithm is not None:
+        settings = (*settings, f"learner.algorithm={algorithm}")
+    frames, configuration = open_source(
+        source,
+        preset=preset,
+        settings=settings,
+        seed=seed,
+        loop=loop,
+        salvage=salvage,
+        cameras=CameraOptions(topics, size, align, rate),
+        follow=follow_timeout if follow else None,
+    )
+    say_about(frames)
+    try:
+        with bar("learning", "blocks") as shown, stoppable() as stop:
+            if hasattr(frames, "stop"):
+                frames.stop = stop  # waiting for frames ends with a signal, too
+            reporter = Reporter(shown)
+            result = learn(
+                frames,
+                configuration.learner,
+                out,
+                seed=seed,
+                max_iterations=max_iterations,
+                max_modules=max_modules,
+                sections=configuration.tables(),
+                force=force,
+                rerun=not no_rerun,
+                progress=reporter,
+                stop=stop,
+                resume=resume,
+                live=live_view,
+                announce=announce,
+                command=None if out is None else remember(source, ctx.params, out),
+            )
+    except RunExhaustedError as error:
+        show(error.result, as_json=as_json)
+        raise
+    finally:
+        frames.close()
+    if resume and not reporter.called and not stop():
+        click.echo("nothing was left to do: the run had come as far before", err=True)
+    show(result, as_json=as_json)
+    if stop():
+        ctx.exit(stop.exit_code)
+
+
+def go_on(ctx: click.Context, run: Path | None) -> None:
+    """Learn on from the source of a run, as it was begun; options that are given win."""
+    from cdmisfa.experiments.again import recall
+
+    if run is None:
+        source = next(param for param in ctx.command.params if param.name == "source")
+        raise click.MissingParameter(ctx=ctx, param=source)
+    words, options_then = recall(run)
+    given = {
+        name
+        for name in options_then
+        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    }
+    kept = {name: value for name, value in options_then.items() if name not in given}
+    ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
+
+
+def announce(address: str) -> None:
+    """Say where a live view is, and open it where there is a display."""
+    from replay.viewer.live import open_live
+    from replay.viewer.program import has_display
+
+    click.echo(f"live view {address}    look at it: rerun --connect {address}", err=True)
+    if has_display():
+        open_live(address)
+
+
+class Reporter:
+    """Shows a run's progress: every module once, the rest a few times a second.
+
+    Attributes:
+        called: whether anything was learned.
+    """
+
+    def __init__(self, shown: Bar) -> None:
+        self._shown = shown
+        self.called = False
+        self._modules = 0
+        self._next = 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        """Take in where the run stands."""
+        self.called = True
+        if progress.modules > self._modules:
+            self._modules = progress.modules
+            self._shown.say(
+                f"module {progress.modules} saved at iteration {progress.iteration - 1}"
+            )
+        now = time.monotonic()
+        if now >= self._next:
+            self._next = now + TICK
+            note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
+            self._shown.update(progress.iteration, progress.max_iterations, note)
+
+
+def show(result: RunResult, *, as_json: bool) -> None:
+    """Print what a run came to."""
+    if as_json:
+        options.print_json(result.as_json())
+    else:
+        click.echo(summary(result))
+
+
+def summary(result: RunResult) -> str:
+    """What a run came to, in words for a person."""
+    from cdmisfa.experiments.run import ENDINGS
+
+    rows = [
+        (
+            module.index,
+            result.streams[module.stream],
+            module.iteration,
+            " ".join(("stay", "switch")[action] for action in module.policy),
+            ", ".join(f"{eta:.4f}" for eta in module.eta),
+        )
+        for module in result.modules
+    ]
+    head = ("module", "stream", "iteration", "policy", "eta")
+    lines = [options.table(head, rows)] if rows else ["no module was learned"]
+    lines.append(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
+    lines.append(f"signals sha256 {result.signals_sha256}")
+    if result.run is not None:
+        lines.append(f"run {result.run}    look at it: cdmisfa view {options.quoted(result.run)}")
+    return "\n".join(lines)

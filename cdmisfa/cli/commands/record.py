@@ -1,0 +1,141 @@
+"""`cdmisfa record`: write what a scene shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from click.core import ParameterSource
+
+from cdmisfa.cli import options
+from cdmisfa.cli.progress import bar
+
+if TYPE_CHECKING:
+    from recorder.recording import ViewRecording
+
+
+@click.command("record")
+@click.argument("scene", required=False)
+@options.out("Folder of the recording.")
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    help="Frames of each view; by default 1000, with --resume as many as first asked for.",
+)
+@options.seed
+@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
+@options.jobs
+@options.preset
+@options.settings
+@click.option(
+    "--scene-picture",
+    type=click.Path(path_type=Path),
+    metavar="F.png",
+    help="Draw the scene from outside instead of recording it.",
+)
+@click.option("--resume", is_flag=True, help="Go on where an interrupted recording ended.")
+@click.option(
+    "--split",
+    metavar="LIMIT",
+    help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
+    "--resume as first asked for.",
+)
+@options.force
+@options.as_json
+@click.pass_context
+def record_command(
+    ctx: click.Context,
+    scene: str | None,
+    out: Path | None,
+    frames: int,
+    seed: int,
+    views: tuple[str, ...],
+    jobs: int,
+    preset: str | None,
+    settings: tuple[str, ...],
+    scene_picture: Path | None,
+    force: bool,
+    resume: bool,
+    split: str | None,
+    as_json: bool,
+) -> None:
+    """Record what a scene shows, one MCAP file per view.
+
+    SCENE is icub or oscillatory; --resume knows it, the seed and the split of what was begun. The
+    same seed gives the same bytes.
+    """
+    from cdmisfa.experiments.sources import configure_scene
+    from recorder.log.folder import Asked, asked
+    from recorder.world.scenes import SCENES
+
+    begun = asked(out) if resume and out is not None else Asked()
+    scene = scene or begun.scene
+    if not scene:
+        where = f"{out} does not say of what it is: " if resume and out is not None else ""
+        raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
+    if begun.seed is not None and ctx.get_parameter_source("seed") is ParameterSource.DEFAULT:
+        seed = begun.seed
+    configuration = configure_scene(scene, preset, settings, seed)
+    if scene_picture is not None:
+        if scene != "icub":
+            raise click.UsageError(f"the scene {scene} has no picture: --scene-picture is for icub")
+        from recorder.world.picture import scene_picture as draw
+
+        draw(configuration.scene, scene_picture, force=force)
+        click.echo(f"picture {scene_picture}", err=True)
+        if out is None:
+            if as_json:
+                options.print_json({"schema": options.SCHEMA, "picture": str(scene_picture)})
+            return
+    if out is None:
+        raise click.UsageError("say -o FOLDER, where the recording goes")
+    from recorder.log.parts import Split
+    from recorder.recording import DEFAULT_FRAMES, record
+
+    parts = None if split is None else Split.parse(split)
+    recorded = False
+
+    def report(done: float) -> None:
+        nonlocal recorded
+        recorded = True
+        shown.update(done, max(done, frames or DEFAULT_FRAMES))
+
+    try:
+        with bar("recording", "frames") as shown:
+            files = record(
+                scene,
+                out,
+                configuration.scene,
+                configuration.record,
+                frames=frames,
+                views=views or None,
+                jobs=jobs,
+                force=force,
+                resume=resume,
+                split=parts,
+                progress=report,
+            )
+    except KeyboardInterrupt as error:
+        raise KeyboardInterrupt(f"{out} is not finished: go on with --resume") from error
+    if resume and not recorded:
+        click.echo(f"{out} is complete: nothing was left to record", err=True)
+    held = sum(file.frames for file in files if file.name == files[0].name)
+    print_recording(out, held, files, as_json=as_json)
+
+
+def print_recording(
+    folder: Path, frames: int, files: Sequence[ViewRecording], *, as_json: bool
+) -> None:
+    """Say what was written: each view's file."""
+    if as_json:
+        rows = [file.as_json() for file in files]
+        options.print_json(
+            {"schema": options.SCHEMA, "recording": str(folder), "frames": frames, "views": rows}
+        )
+        return
+    options.print_table(
+        ("view", "file", "frames", "bytes", "sha256"),
+        [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files],
+    )

@@ -1,0 +1,109 @@
+"""`cdmisfa reproduce`: the paper's experiments, with the paper's numbers beside ours."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.progress import Bar, bar
+
+
+@click.command("reproduce")
+@click.argument("name", required=False)
+@options.out("Folder of the results [default: reproduction].")
+@click.option("--trials", type=click.IntRange(1), help="Trials per condition, not the paper's.")
+@options.jobs
+@click.option(
+    "--engine",
+    type=click.Choice(["local", "dask", "ray"]),
+    default="local",
+    show_default=True,
+    help="Where trials run.",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Of the dask scheduler or ray cluster.")
+@click.option("--recording", type=click.Path(path_type=Path), help="Recording of the iCub scene.")
+@click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
+@click.option(
+    "--page", type=click.Path(path_type=Path), help="Write this Markdown page of all results."
+)
+@click.option("--force", is_flag=True, help="Replace results of more or other trials.")
+@options.as_json
+def reproduce_command(
+    name: str | None,
+    out: Path | None,
+    trials: int | None,
+    jobs: int,
+    engine: str,
+    scheduler: str | None,
+    recording: Path | None,
+    quick: bool,
+    page: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Reproduce an experiment of the paper: numbers, tables and figures.
+
+    NAME is oscillatory, stability, nonstationary, icub, difficulty or all. Finished trials
+    are kept and not run again; results of more or other trials than are asked for now are
+    not replaced without --force. Exit code 4 says that a claim of the paper did not come out.
+    Without NAME, --page makes the page from the results that are there.
+    """
+    from cdmisfa.core.errors import UsageError
+    from cdmisfa.paper.page import write_page
+    from cdmisfa.paper.reproduce import NAMES, Request, check, reproduce
+
+    root = out or Path("reproduction")
+    if name is None and page is None:
+        raise UsageError(f"say which experiment: {', '.join(NAMES)} or all")
+    names = NAMES if name == "all" else (name,) if name else ()
+    documents: list[dict[str, Any]] = []
+    for each in names:
+        request = Request(trials, quick, recording, root / each, jobs, force)
+        if each == "icub" and recording is None:
+            click.echo(f"icub: records the scene into {root}/icub-recording first", err=True)
+        started, finished = time.monotonic(), [0]
+        with bar(each, "trials") as shown:
+
+            def told(done: int, total: int, shown: Bar = shown, seen: list[int] = finished) -> None:
+                seen.append(done)
+                shown.update(done, total)
+
+            document = reproduce(each, request, engine=engine, scheduler=scheduler, progress=told)
+        seconds = time.monotonic() - started
+        ran = finished[-1] - finished[1]
+        click.echo(
+            f"{each}: {document['trials']} trials, {ran} of them now, {seconds:.1f} s, "
+            f"{ran / seconds:.1f} trials/s, "
+            f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}",
+            err=True,
+        )
+        documents.append(document)
+    if page is not None:
+        write_page(root, page)
+        click.echo(f"page {page}", err=True)
+    if as_json:
+        options.print_json({"schema": options.SCHEMA, "experiments": documents})
+    else:
+        sys.stdout.write(_words(documents))
+    for document in documents:
+        check(document)
+
+
+def _words(documents: list[dict[str, Any]]) -> str:
+    from cdmisfa.paper.reproduce import markdown_table
+
+    parts = []
+    for document in documents:
+        claims = [
+            f"{'yes' if c['holds'] else 'NO '}  {c['claim']}: {c['detail']}"
+            for c in document["claims"]
+        ]
+        parts.append(
+            "\n".join([document["title"], "", markdown_table(document["table"]), *claims, ""])
+        )
+    return "\n".join(parts)

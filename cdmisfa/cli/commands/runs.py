@@ -1,0 +1,119 @@
+"""`cdmisfa compare`, `plot` and `export`: what to do with finished runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.core.errors import NotReproducedError
+
+
+@click.command("compare")
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--save",
+    type=click.Path(path_type=Path),
+    metavar="F.rrd",
+    help="Also write their curves, one over the other, as a view.",
+)
+@options.force
+@options.as_json
+@click.pass_context
+def compare_command(
+    ctx: click.Context, runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool
+) -> None:
+    """Check that runs' signals are the same bits, and show their curves.
+
+    Of two runs it says where they first differ, and exits with 4 if they do. Of more it
+    prints a table, each run compared with the first, and exits with 0.
+    """
+    if len(runs) < 2:
+        raise click.UsageError("name two runs, or more")
+    from replay.runs.table import HEAD, survey
+
+    rows = survey(runs)
+    if save is not None:
+        from replay.view.overlay import build_overlay  # takes half a second
+
+        build_overlay(runs, rows, save, force=force)
+    different = [row.difference for row in rows if row.difference is not None]
+    if as_json:
+        options.print_json(
+            {
+                "schema": options.SCHEMA,
+                "identical": not different,
+                "first_difference": different[0].as_json() if different else None,
+                "runs": [row.as_json() for row in rows],
+                "view": save,
+            }
+        )
+    elif len(runs) == 2:
+        click.echo(str(different[0]) if different else "identical, bit for bit")
+    else:
+        options.print_table(HEAD, [row.cells() for row in rows])
+    if save is not None and not as_json:
+        click.echo(f"view {save}    look at it: cdmisfa view {options.quoted(save)}", err=True)
+    if different and len(runs) == 2:
+        ctx.exit(NotReproducedError.exit_code)
+
+
+@click.command("plot")
+@options.path_argument("run")
+@options.out("Folder of the figures; by default the run's own folder figures.")
+@options.force
+@options.as_json
+def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> None:
+    """Draw the figures of a run."""
+    from replay.export.figures import draw_figures
+
+    files = draw_figures(run, out, force=force)
+    if as_json:
+        options.print_json(
+            {"schema": options.SCHEMA, "run": str(run), "figures": [str(f) for f in files]}
+        )
+        return
+    for file in files:
+        click.echo(file)
+
+
+@click.command("export")
+@options.fetched_argument("path")
+@click.option(
+    "--to",
+    "form",
+    type=click.Choice(["parquet", "npz", "csv", "arrow", "images", "mp4", "lerobot"]),
+    help="Form; by default what the file's name ends in.",
+)
+@options.out("The file to write, for a recording the folder.", required=True)
+@click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
+@options.force
+@options.as_json
+def export_command(
+    path: Path, form: str | None, out: Path, lossless: bool, force: bool, as_json: bool
+) -> None:
+    """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
+
+    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
+    outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
+    PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0.
+    """
+    from replay.export.recordings import CSV_LEAVES_OUT, RECORDINGS, export
+
+    if str(out) == "-":
+        raise click.UsageError("-o - would be a file of this name: name another")
+    form = form or out.suffix.removeprefix(".")
+    rows = export(path, out, form, force=force, lossless=lossless)
+    if form == "csv":
+        left_out = " and ".join(CSV_LEAVES_OUT)
+        click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)
+    if form in ("mp4", "lerobot") and not lossless:
+        click.echo("H.264 changes pixels a little: --lossless keeps them all", err=True)
+    if as_json:
+        options.print_json(
+            {"schema": options.SCHEMA, "path": str(path), "file": str(out), "rows": rows}
+        )
+        return
+    kind = "iterations" if form not in RECORDINGS else "images" if form == "images" else "frames"
+    click.echo(f"{rows} {kind} written to {out}")

@@ -1,0 +1,81 @@
+"""`cdmisfa view`: look at a run in Rerun."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.progress import bar
+from cdmisfa.core.errors import UsageError
+
+FILE = click.Path(path_type=Path)
+
+
+@click.command("view")
+@options.fetched_argument("run")
+@click.option("--save", type=FILE, metavar="F.rrd", help="Write the view to a file and end.")
+@click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
+@click.option("--screenshot", type=FILE, metavar="F.png", help="Draw the view without a screen.")
+@click.option("--at", type=click.IntRange(0), metavar="FRAME", help="Frame of the screenshot.")
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=10,
+    show_default=True,
+    help="Show every so many watched frames.",
+)
+@click.option(
+    "--all-views",
+    type=FILE,
+    metavar="RECORDING",
+    help="Also show what was not watched, from the recording that the run learned from.",
+)
+@click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
+@options.force
+def view_command(
+    run: Path,
+    save: Path | None,
+    web: bool,
+    screenshot: Path | None,
+    at: int | None,
+    every: int,
+    all_views: Path | None,
+    memory_limit: str,
+    force: bool,
+) -> None:
+    """Open a run in the Rerun viewer, or save, serve or picture it.
+
+    RUN is the folder of a run, or its run.mcap, a recording, or an .rrd file; of a log behind
+    a URL a copy is made. A sweep that kept its logs is served as a table, one row per run
+    that it was asked for last, until interrupted.
+    """
+    if sum((save is not None, web, screenshot is not None)) > 1:
+        raise click.UsageError("choose one of --save, --web and --screenshot")
+    if at is not None and screenshot is None:
+        raise click.UsageError("--at goes with --screenshot")
+    from replay.viewer.catalogue import is_sweep, runs_in, serve_catalogue
+    from replay.viewer.program import check_limit
+
+    check_limit(memory_limit)
+    if runs_in(run):
+        if save is not None or web or screenshot is not None:
+            raise click.UsageError(f"{run} holds many runs, which are only served: name one run")
+        with bar("preparing views", "runs") as shown:
+            serve_catalogue(run, progress=shown.update)
+        return
+    if is_sweep(run):
+        raise UsageError(f"{run}: this sweep kept no logs: sweep again with --keep-logs")
+    import replay.viewer.window as viewer  # only here: it takes half a second
+
+    if save is not None:
+        viewer.save(run, save, every=every, all_views=all_views, force=force)
+        click.echo(f"view {save}", err=True)
+    elif screenshot is not None:
+        viewer.screenshot(run, screenshot, at=at, every=every, all_views=all_views, force=force)
+        click.echo(f"picture {screenshot}", err=True)
+    elif web:
+        viewer.serve(run, every=every, all_views=all_views, memory_limit=memory_limit)
+    else:
+        viewer.open_window(run, every=every, all_views=all_views, memory_limit=memory_limit)

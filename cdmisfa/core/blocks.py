@@ -1,0 +1,163 @@
+"""Frames on their way to the learner: `Block`, and where they come from: `FrameSource`.
+
+All streams share one clock: a frame counter t that runs on for every stream,
+whichever is watched, as the channels of a television do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+
+NANOSECONDS = 1_000_000_000
+
+START_NS = 1_451_606_400_000_000_000
+"""Log time of frame 0 where nothing else is set: 2016-01-01, the year of the paper."""
+
+SLOWEST = 1e-6
+"""Frames a second of the slowest clock; the fastest has one a nanosecond, the unit of time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """The frames one stream shows from t on.
+
+    Attributes:
+        stream: index of the stream, from 0.
+        t: global frame counter of the first frame.
+        frames: (n, *frame_shape), uint8 pixels or float64 values; C-contiguous,
+            read-only, and never written again by the source.
+        truth: (n, D) float64, what the world knows and the learner must not:
+            one column per name in `SourceSpec.truth`. D may be 0.
+    """
+
+    stream: int
+    t: int
+    frames: NDArray[Any]
+    truth: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSpec:
+    """What every block of a source has in common.
+
+    Attributes:
+        streams: a name for each stream (the view's name in a recording).
+        frame_shape: (height, width) of an image, (I,) of a vector.
+        dtype: "uint8" for pixels, "float64" for values.
+        truth: a name for each column of `Block.truth`.
+        fps: frames per second of the common clock.
+        start_ns: log time of frame 0, in nanoseconds.
+        length: number of frames, or None where the stream does not end.
+
+    Raises:
+        UsageError: there is no clock of so many frames a second.
+    """
+
+    streams: tuple[str, ...]
+    frame_shape: tuple[int, ...]
+    dtype: str
+    truth: tuple[str, ...] = ()
+    fps: float = 50.0
+    start_ns: int = 0
+    length: int | None = None
+
+    def __post_init__(self) -> None:
+        if not SLOWEST <= self.fps <= NANOSECONDS:
+            raise UsageError(
+                f"a source of {self.fps} frames a second has no clock: give it an fps in "
+                f"[{SLOWEST:g}, {NANOSECONDS:g}]"
+            )
+
+    def time_ns(self, t: int) -> int:
+        """Log time of frame t in nanoseconds: the start plus t frames, never the wall clock."""
+        return self.start_ns + round(t * NANOSECONDS / self.fps)
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """Streams of frames on one clock: simulated, synthetic or recorded, all the same.
+
+    Blocks do not depend on how they are cut: `take(s, 40)` gives the frames of
+    `take(s, 15)` followed by `take(s, 25)`. Which stream is watched never changes
+    what the streams show.
+    """
+
+    @property
+    def spec(self) -> SourceSpec:
+        """What the source delivers."""
+
+    @property
+    def t(self) -> int:
+        """Global counter of the next frame."""
+
+    def take(self, stream: int, n: int) -> Block:
+        """The n frames that `stream` shows at t .. t+n-1; moves t by n.
+
+        Raises:
+            LogExhaustedError: a recording has fewer than n frames left; t stays.
+            ValueError: no such stream, or n < 1.
+        """
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t, so that the next block starts there.
+
+        Raises:
+            ValueError: there is no frame before 0.
+        """
+
+    def describe(self) -> Mapping[str, Any]:
+        """What identifies the source, as JSON values: its kind, seed or file hashes."""
+
+    def close(self) -> None:
+        """Let go of files and simulators; harmless when called twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadPose:
+    """Where the head is in the robot's root frame.
+
+    Attributes:
+        position: (x, y, z) of the neck yaw joint, metres.
+        quaternion: (x, y, z, w) of its turn about the vertical.
+    """
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
+def check_request(spec: SourceSpec, stream: int, n: int) -> None:
+    """Refuse a block that no source can give.
+
+    Raises:
+        ValueError: no such stream, or fewer than one frame.
+    """
+    if not 0 <= stream < len(spec.streams):
+        raise ValueError(f"stream {stream} does not exist: there are {len(spec.streams)}")
+    if n < 1:
+        raise ValueError(f"a block has at least one frame, not {n}")
+
+
+def check_frame(t: int) -> None:
+    """Refuse a place on the clock that no source has.
+
+    Raises:
+        ValueError: before frame 0.
+    """
+    if t < 0:
+        raise ValueError(f"there is no frame {t}: the first is 0")
+
+
+def freeze(array: NDArray[Any]) -> NDArray[Any]:
+    """Mark an array as never to be written again, and return it."""
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,85 @@
+"""Compiling hot functions with numba, and nothing about what they do."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+MARKS = (b"@compiled", b"@inlined", b"@reordered", b"@_intrinsic")
+"""What files that hold compiled functions contain."""
+
+
+def compiled(function: Function) -> Function:
+    """Compile strictly (no reordering of floating point) and keep the result on disk."""
+    return _compile(function)
+
+
+def inlined(function: Function) -> Function:
+    """Compile strictly, into every function that calls it: for the small ones of a hot loop."""
+    return _compile(function, forceinline=True)
+
+
+def reordered(function: Function) -> Function:
+    """Compile with sums in whichever order is fastest on this processor, and keep the result.
+
+    One machine gives the same bits every time; other processors may differ in the last ones.
+    """
+    return _compile(function, fastmath={"reassoc", "contract"})
+
+
+def _compile(function: Function, **options: Any) -> Function:
+    options["error_model"] = "numpy"  # no test at every division whether an error is to be raised
+    try:
+        return cast(Function, kept_while_sources_last(numba.njit(cache=True, **options)(function)))
+    except RuntimeError:  # numba found no folder that it may write to
+        return cast(Function, numba.njit(**options)(function))
+
+
+def kept_while_sources_last(dispatcher: Any) -> Any:
+    """Let a result on disk count only as long as no compiled function has changed.
+
+    A compiled function holds what it calls in other files; numba by itself compiles it again
+    only when its own file has changed.
+    """
+    kept: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if hasattr(kept, "_source_stamp"):
+        kept._source_stamp = (kept._source_stamp, _sources())
+    return dispatcher
+
+
+@cache
+def _sources() -> str:
+    """Hash of the sources of all packages that hold compiled functions."""
+    root = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for package in ("cdmisfa", "recorder", "replay"):
+        for path in sorted((root / package).rglob("*.py")):
+            source = path.read_bytes()
+            if any(word in source for word in MARKS):
+                digest.update(source)
+    return digest.hexdigest()
+
+
+def needs_compiling(function: Callable[..., Any]) -> bool:
+    """Whether the first call of a compiled function will compile it, which takes seconds.
+
+    It will not where this process has done so, or left its result on disk since the
+    source changed.
+    """
+    dispatcher: Any = function
+    if dispatcher.signatures:
+        return False
+    if dispatcher.stats.cache_path is None:  # nothing can be kept here
+        return True
+    source = Path(inspect.getfile(dispatcher.py_func))
+    index = f"{source.stem}.{dispatcher.py_func.__qualname__}-*.nbi"
+    kept = Path(dispatcher.stats.cache_path).glob(index)
+    return all(file.stat().st_mtime < source.stat().st_mtime for file in kept)

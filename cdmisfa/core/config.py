@@ -1,0 +1,297 @@
+"""Configuration: strict frozen dataclasses, filled from TOML presets and `--set` words.
+
+A key that does not exist is an error that names the nearest one that does. Each
+package owns the dataclass of its own section (`learner` here, `scene` and `record`
+in `recorder`, `view` in `replay`); this module fills any of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, Literal, TypeVar
+
+from cdmisfa.core.errors import UsageError
+
+Section = TypeVar("Section")
+
+LARGEST = 2**63 - 1
+"""Largest whole number a key takes."""
+
+
+MAX_COMPONENTS = 1000
+"""More whitening components than this would take minutes a frame."""
+
+MAX_TAU = 100_000
+"""A block of more frames than this does not fit into memory beside its images."""
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerConfig:
+    """Everything the learner can be told (keys `learner.*`).
+
+    The defaults are those of the oscillatory experiment; the presets hold every
+    value again with its source.
+    """
+
+    algorithm: Literal["2.0", "1.0"] = "2.0"
+    nu: float = 0.05
+    tau: int = 100
+    sigma: float = 0.0009
+    delta: float = 0.0006
+    beta: float | None = None
+    components: int = 5
+    outputs: int = 1
+    expansion: Literal["none", "quadratic"] = "quadratic"
+    epsilon_start: float = 1.2
+    epsilon_decay: float = 0.999
+    epsilon_knee: float = 0.8
+    epsilon_tail_decay: float = 0.95
+    gamma: float = 0.99
+    mean_window: int = 1000
+    slowness_window: int = 600
+    eta_dot_window: int = 40
+    gate_window: int = 20
+    warm_up: int = 80
+    min_variance: float = 0.1
+    novel_share: float = 0.9
+    patience: int = 1000
+    alpha: float = 0.005
+    roc_centres: int = 10
+    roc_radius: float = 0.3
+    roc_memory: int = 40
+    roc_error: float = 0.1
+
+    def __post_init__(self) -> None:
+        positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
+        positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
+        positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
+        within(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
+        within(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
+        within(self, "learner", 0.0, 1.0, "nu")
+        within(self, "learner", 1e-6, 1.0, "alpha")
+        within(self, "learner", 0.0, math.inf, "epsilon_knee")
+        within(self, "learner", 1, MAX_COMPONENTS, "components")
+        within(self, "learner", 3, MAX_TAU, "tau")
+        within(self, "learner", 0.0, 0.999999, "gamma")
+        if self.beta is not None:
+            within(self, "learner", 0.0, math.inf, "beta")
+        if self.outputs > self.components:
+            raise UsageError(
+                f"learner.outputs is {self.outputs}, more than learner.components {self.components}"
+            )
+
+    def reward_beta(self, n_streams: int) -> float:
+        """Weight of the expert reward: as set, or the paper's nu ln 2 / (2 (n-1)).
+
+        Source: paper, Hyper Parameters.
+        """
+        if self.beta is not None:
+            return self.beta
+        return self.nu * math.log(2.0) / (2.0 * max(n_streams - 1, 1))
+
+
+def positive(section: Any, prefix: str, *names: str) -> None:
+    """Refuse values that are not above zero and finite, naming the key.
+
+    Raises:
+        UsageError: at the first such value.
+    """
+    for name in names:
+        value = getattr(section, name)
+        if not (value > 0 and math.isfinite(value)):
+            raise UsageError(f"{prefix}.{name} is {value}: it must be above 0 and finite")
+
+
+def within(section: Any, prefix: str, low: float, high: float, *names: str) -> None:
+    """Refuse values outside [low, high], naming the key.
+
+    Raises:
+        UsageError: at the first such value.
+    """
+    for name in names:
+        value = getattr(section, name)
+        if not low <= value <= high or (value == math.inf):
+            raise UsageError(f"{prefix}.{name} is {value}: it must be in [{low:g}, {high:g}]")
+
+
+def presets() -> tuple[str, ...]:
+    """Names of the presets that come with the package."""
+    folder = resources.files("cdmisfa.presets")
+    return tuple(sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml")))
+
+
+def load_preset(name: str) -> dict[str, dict[str, Any]]:
+    """The sections of a preset, or of a TOML file where `name` ends in .toml.
+
+    Raises:
+        UsageError: no such preset or file, or it is not TOML.
+    """
+    try:
+        if name.endswith(".toml"):
+            with open(name, "rb") as file:
+                document = tomllib.load(file)
+        else:
+            if name not in presets():
+                raise UsageError(f"no preset {name!r}{_nearest(name, presets())}")
+            text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
+            document = tomllib.loads(text)
+    except OSError as error:
+        raise UsageError(f"{name}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{name}: not TOML: {error}") from error
+    for key, value in document.items():
+        if not isinstance(value, dict):
+            raise UsageError(f"{name}: {key} stands outside a [section]")
+    return document
+
+
+def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Turn `section.key=value` words into sections of texts.
+
+    Raises:
+        UsageError: a word of another form.
+    """
+    sections: dict[str, dict[str, str]] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        section, dot, name = key.strip().partition(".")
+        if not (equals and section and dot and name):
+            raise UsageError(f"--set {word}: write it as section.key=value, as learner.nu=0.02")
+        sections.setdefault(section, {})[name] = value.strip()
+    return sections
+
+
+def build(
+    cls: type[Section], prefix: str, *layers: Mapping[str, Any], base: Section | None = None
+) -> Section:
+    """Fill a section's dataclass from layers of values, the last one winning.
+
+    Values may be of the field's type or text of it (as given to `--set`); nested
+    dataclasses take tables or dotted names.
+
+    Raises:
+        UsageError: an unknown key (with the nearest valid one) or a value of the wrong type.
+    """
+    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(cls)
+    values: dict[str, Any] = {}
+    nested: dict[str, list[Mapping[str, Any]]] = {}
+    for layer in layers:
+        for key, value in layer.items():
+            name, dot, rest = key.partition(".")
+            if name not in fields:
+                raise UsageError(f"unknown key {prefix}.{key}{_nearest(name, fields, prefix)}")
+            if dataclasses.is_dataclass(hints[name]):
+                if not dot and not isinstance(value, Mapping):
+                    raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
+                nested.setdefault(name, []).append({rest: value} if dot else value)
+            elif dot:
+                raise UsageError(
+                    f"unknown key {prefix}.{key}: {prefix}.{name} has no keys of its own"
+                )
+            else:
+                values[name] = convert(value, hints[name], f"{prefix}.{name}")
+    for name, parts in nested.items():
+        start = getattr(base, name) if base is not None else _default(fields[name])
+        values[name] = build(hints[name], f"{prefix}.{name}", *parts, base=start)
+    if base is not None:
+        return dataclasses.replace(base, **values)  # type: ignore[type-var]
+    return cls(**values)
+
+
+def convert(value: Any, hint: Any, key: str) -> Any:
+    """A value, or its text, as the type of a field.
+
+    Raises:
+        UsageError: the value does not fit.
+    """
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        if value in arguments:
+            return value
+        choices = ", ".join(str(a) for a in arguments)
+        raise UsageError(f"{key} is {value}: choose one of {choices}")
+    if origin is types.UnionType or origin is typing.Union:
+        if value is None or value in ("auto", "none"):
+            return None
+        return convert(value, next(a for a in arguments if a is not types.NoneType), key)
+    if origin is tuple:
+        parts = (
+            [p.strip() for p in value.strip("()[] ").split(",") if p.strip()]
+            if isinstance(value, str)
+            else value
+        )
+        if not isinstance(parts, list | tuple):
+            raise UsageError(f"{key} is {value}: it must be a list")
+        inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
+        if len(inner) != len(parts):
+            raise UsageError(f"{key} is {value}: it must have {len(inner)} values")
+        return tuple(convert(p, h, key) for p, h in zip(parts, inner, strict=True))
+    try:
+        if hint is bool:
+            if isinstance(value, str):
+                return {"true": True, "false": False}[value.lower()]
+            if not isinstance(value, bool):
+                raise ValueError
+            return value
+        if hint is int:
+            if isinstance(value, bool | float):
+                raise ValueError
+            whole = int(value)
+            if abs(whole) > LARGEST:
+                raise ValueError
+            return whole
+        if hint is float:
+            if isinstance(value, bool):
+                raise ValueError
+            number = float(value)
+            if math.isnan(number):
+                raise ValueError
+            return number
+        if hint is str:
+            if not isinstance(value, str):
+                raise ValueError
+            return value
+    except (ValueError, TypeError, KeyError, OverflowError):
+        raise UsageError(f"{key} is {value!r}: it must be {_WORDS[hint]}") from None
+    raise TypeError(f"{key}: fields of type {hint} cannot be configured")
+
+
+def as_table(section: Any) -> dict[str, Any]:
+    """A section as plain JSON values, nested sections as tables, `None` as "auto"."""
+    table: dict[str, Any] = {}
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if dataclasses.is_dataclass(value):
+            table[field.name] = as_table(value)
+        elif value is None:
+            table[field.name] = "auto"
+        else:
+            table[field.name] = list(value) if isinstance(value, tuple) else value
+    return table
+
+
+_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+
+
+def _default(field: Any) -> Any:
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    return field.default_factory() if field.default_factory is not dataclasses.MISSING else None
+
+
+def _nearest(name: str, known: Iterable[str], prefix: str = "") -> str:
+    dotted = f"{prefix}." if prefix else ""
+    known = list(known)
+    match = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    if match:
+        return f": did you mean {dotted}{match[0]}?"
+    return f": there are {', '.join(known)}"

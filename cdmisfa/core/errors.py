@@ -1,0 +1,37 @@
+"""What can go wrong, in words a user can act on.
+
+The message is built where the fact is known and names the file or key and the
+remedy. Only the command line turns these into exit codes.
+"""
+
+
+class CdmisfaError(Exception):
+    """Something the user can mend; the message is one line that says how."""
+
+    exit_code = 1
+
+
+class UsageError(CdmisfaError):
+    """A wrong option, configuration key or value, or a path that must not be used."""
+
+    exit_code = 2
+
+
+class LogDamagedError(CdmisfaError):
+    """A log that is not what its format, its checksums or its own index say."""
+
+    exit_code = 3
+
+
+class LogWriteError(CdmisfaError):
+    """A log could not be written: a full disk, a lost mount, missing rights."""
+
+
+class LogExhaustedError(CdmisfaError):
+    """A recording ended before the learner did, and looping was not asked for."""
+
+
+class NotReproducedError(CdmisfaError):
+    """A result differs from the one it was compared with."""
+
+    exit_code = 4

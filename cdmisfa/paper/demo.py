@@ -1,0 +1,204 @@
+"""The demonstration: record the iCub scene, learn from the log, check, and show."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import NotReproducedError
+from cdmisfa.core.modules import Module
+from cdmisfa.experiments.run import Progress, RunResult, learn
+from cdmisfa.experiments.sources import Configuration, configure, open_source
+
+SCENE = "icub"
+MODULES = 2
+"""Views whose object has something slow about it: the one in the centre is pure noise."""
+
+CHECKED_ITERATIONS = 200
+"""Length of the stretch on which live and recorded signals are compared."""
+
+SCORED_FRAMES = 4000
+"""Frames on which a module's output is compared with the object's true position."""
+
+
+class Bar(Protocol):
+    """What a stage of the demonstration reports to."""
+
+    def update(self, done: float, total: float | None = None, note: str = "") -> None:
+        """So much is done."""
+
+    def say(self, line: str) -> None:
+        """Show a line that stays."""
+
+
+Stage = Callable[[str, str], AbstractContextManager[Bar]]
+"""Opens a stage by its title and the unit that it counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """A module, and what in the world its output follows.
+
+    Attributes:
+        module: index, from 1.
+        view: name of the view it was learned on.
+        policy: "stay" or "switch" for each view.
+        iteration: at which it was saved.
+        follows: name of the true quantity that its first output follows best.
+        correlation: of the two, without sign.
+    """
+
+    module: int
+    view: str
+    policy: tuple[str, ...]
+    iteration: int
+    follows: str
+    correlation: float
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What the demonstration showed."""
+
+    recording: Path
+    run: Path
+    figures: tuple[Path, ...]
+    iterations: int
+    live_equals_recorded: bool
+    modules: tuple[Learned, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """The report as `demo --json` prints it."""
+        return {"schema": 1, **asdict(self)}
+
+
+def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Report:
+    """Record the scene, learn from the recording, compare with live, draw figures.
+
+    Args:
+        out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
+        seed: of world and learner.
+        frames: of the recording; the learner starts it again at its end.
+        jobs: processes that render.
+        stage: where progress goes.
+
+    Raises:
+        CdmisfaError: there is no simulator, or files cannot be written.
+        NotReproducedError: live and recorded signals differ.
+    """
+    from recorder.recording import record
+    from replay.export.figures import draw_figures
+
+    configuration = configure(SCENE, seed=seed)
+    recording, run = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
+    with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
+        record(
+            SCENE,
+            recording,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            jobs=jobs,
+            force=True,
+            progress=lambda done: bar.update(done, frames),
+        )
+    with stage("2/4 learning from the recording", "blocks") as bar:
+        result = _learn([recording], configuration, run, seed, bar, max_modules=MODULES)
+    with stage("3/4 checking live against recorded", "blocks") as bar:
+        _check(recording, configuration, seed, min(CHECKED_ITERATIONS, frames // 40), bar)
+    with stage("4/4 drawing figures", "modules") as bar, _opened([recording], seed) as source:
+        learned = tuple(_score(module, source) for module in result.modules)
+        figures = tuple(draw_figures(run, None, force=True))
+    return Report(recording, run, figures, result.iterations, True, learned)
+
+
+def _learn(
+    words: list[str | Path],
+    configuration: Configuration,
+    out: Path | None,
+    seed: int,
+    bar: Bar,
+    max_iterations: int | None = None,
+    max_modules: int | None = None,
+) -> RunResult:
+    def shown(progress: Progress) -> None:
+        note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
+        if progress.iteration % 10 == 0:
+            bar.update(progress.iteration, progress.max_iterations, note)
+
+    with _opened(words, seed) as source:
+        return learn(
+            source,
+            configuration.learner,
+            out,
+            seed=seed,
+            sections=configuration.tables(),
+            force=True,
+            progress=shown,
+            max_iterations=max_iterations,
+            max_modules=max_modules,
+        )
+
+
+@contextlib.contextmanager
+def _opened(words: list[str | Path], seed: int) -> Iterator[FrameSource]:
+    source, _ = open_source(words, seed=seed, loop=True)
+    with contextlib.closing(source):
+        yield source
+
+
+def _check(
+    recording: Path, configuration: Configuration, seed: int, iterations: int, bar: Bar
+) -> None:
+    live, recorded = (
+        _learn([word], configuration, None, seed, bar, max_iterations=iterations).signals_sha256
+        for word in (SCENE, recording)
+    )
+    if live != recorded:
+        raise NotReproducedError(
+            f"live and recorded signals differ within {iterations} iterations of seed {seed}: "
+            "see `cdmisfa doctor`"
+        )
+    bar.say(f"live and recorded signals of {iterations} iterations are the same, bit for bit")
+
+
+def _score(module: Module, source: FrameSource) -> Learned:
+    """Find the true quantity that a module's first output follows best."""
+    y, truth = _outputs(module, source)
+    r = correlations(y[:, 0], truth)
+    best = int(np.argmax(r))
+    return Learned(
+        module.index,
+        source.spec.streams[module.stream],
+        tuple(("stay", "switch")[action] for action in module.policy),
+        module.iteration,
+        source.spec.truth[best],
+        float(r[best]),
+    )
+
+
+def _outputs(
+    module: Module, source: FrameSource
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Outputs (n, J) of a module on its own view, and what was true then (n, D)."""
+    from cdmisfa.features.incsfa import project
+
+    source.seek(0)
+    block = source.take(module.stream, SCORED_FRAMES)
+    y = project(module.phi, module.phi @ module.mean, block.frames.reshape(len(block), -1))
+    return y, block.truth
+
+
+def correlations(y: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Absolute Pearson correlation of y (n,) with each column of truth (n, D); 0 if constant."""
+    y, truth = y - y.mean(), truth - truth.mean(axis=0)
+    norm = np.sqrt((y @ y) * (truth * truth).sum(axis=0))
+    return np.abs(y @ truth) / np.where(norm > 0, norm, np.inf)

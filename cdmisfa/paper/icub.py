@@ -1,0 +1,201 @@
+"""The vision-enabled iCub: two modules from pixels, and nothing from what cannot be learned."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.config import LearnerConfig, build, load_preset
+from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.experiments.statistics import correlation, summary, wilson
+from cdmisfa.paper import panels
+from cdmisfa.paper.oscillatory import summary_of
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Request, Settings, Trial
+
+TITLE = "Curiosity-driven, vision-enabled iCub"
+
+OPTIMAL = ((0, "011"), (2, "110"))
+"""Stream and policy of both modules, as the paper gives them."""
+
+ITERATIONS = 1400
+"""The second module is saved near 1160; the rest shows that no third one is."""
+
+SHOWN = 200
+"""Frames before a module is frozen whose output is drawn (paper)."""
+
+OBJECTS = ("object1_y", "object3_y")
+"""What each module should encode."""
+
+LIVE = "live"
+"""In place of a recording: render what each trial looks at."""
+
+
+def learner_config() -> LearnerConfig:
+    """The iCub preset."""
+    return build(LearnerConfig, "learner", load_preset("icub")["learner"])
+
+
+def plan(request: Request) -> list[dict[str, Any]]:
+    """10 trials that differ in their seed, on one recording; it is made where none is given."""
+    seeds = range(request.count(10, 2))
+    if str(request.recording) == LIVE:
+        return [{"recording": LIVE, "identity": None, "seed": seed} for seed in seeds]
+    path = str(recording_of(request))
+    return [{"recording": path, "identity": identity(path), "seed": seed} for seed in seeds]
+
+
+def recording_of(request: Request) -> Path:
+    """The recording that was given, or one made in the folder of the results."""
+    if request.recording is not None:
+        return request.recording
+    folder = request.folder.parent / "icub-recording"
+    finished = folder / "finished.json"
+    if not finished.exists():
+        from cdmisfa.experiments.run import write_json
+        from recorder.recording import record
+
+        views = record(
+            "icub",
+            folder,
+            frames=ITERATIONS * learner_config().tau,
+            jobs=request.jobs,
+            resume=folder.exists(),
+        )
+        write_json(finished, {"views": [view.as_json() for view in views]})
+    return folder
+
+
+def identity(path: str) -> dict[str, Any]:
+    """What a recording is, wherever it lies."""
+    from replay.recordings.source import RecordedSource
+
+    with contextlib.closing(RecordedSource(path)) as source:
+        described: dict[str, Any] = json.loads(json.dumps(source.describe(), default=str))
+    return {key: value for key, value in described.items() if key not in ("path", "files")}
+
+
+def open_world(settings: Settings) -> FrameSource:
+    """The recording, or a live scene of the trial's own seed."""
+    if settings["recording"] == LIVE:
+        from recorder.config import RecordConfig, SceneConfig
+        from recorder.world.scenes import open_scene
+
+        scene = build(SceneConfig, "scene", {"kind": "icub", "seed": settings["seed"]})
+        return open_scene("icub", scene, RecordConfig())
+    from replay.recordings.source import RecordedSource
+
+    return RecordedSource(settings["recording"])
+
+
+def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """One trial: 1400 iterations, or as many as the recording has."""
+    with contextlib.closing(open_world(settings)) as source:
+        return watch(source, learner_config(), settings["seed"], ITERATIONS)
+
+
+def watch(
+    source: FrameSource, config: LearnerConfig, seed: int, iterations: int
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Learn from a source, and keep the curves and each module's last outputs."""
+    from cdmisfa.agents.learner import CuriousLearner
+
+    learner = CuriousLearner(config, source.spec, seed)
+    curves: dict[str, list[NDArray[Any]]] = {"eta_dot": [], "Q": [], "policy": []}
+    recent: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=-(-SHOWN // config.tau))
+    arrays: dict[str, NDArray[Any]] = {}
+    encoded: list[float] = []
+    while learner.iteration < iterations:
+        try:
+            block = source.take(learner.stream, learner.tau)
+        except LogExhaustedError:
+            break
+        signals = learner.step(block)
+        for name, values in curves.items():
+            values.append(np.asarray(getattr(signals, name), dtype=np.float32))
+        if signals.novel:
+            recent.append((signals.y[:, 0], block.truth))
+        if signals.saved:
+            number = len(learner.modules)
+            y = np.concatenate([r[0] for r in recent])[-SHOWN:]
+            truth = np.concatenate([r[1] for r in recent])[-SHOWN:]
+            arrays[f"y{number}"] = y
+            if number <= len(OBJECTS) and OBJECTS[number - 1] in source.spec.truth:
+                column = truth[:, source.spec.truth.index(OBJECTS[number - 1])]
+                arrays[f"truth{number}"] = column
+                encoded.append(correlation(y, column))
+            recent.clear()
+    modules = learner.modules
+    row = {
+        "streams": [m.stream for m in modules],
+        "policies": ["".join(map(str, m.policy.tolist())) for m in modules],
+        "saved_at": [m.iteration for m in modules],
+        "correlation": encoded,
+        "iterations": learner.iteration,
+    }
+    return row, {**arrays, **{name: np.stack(values) for name, values in curves.items()}}
+
+
+def evaluate(trials: Sequence[Trial]) -> Findings:
+    """Object 1, then object 3, with the optimal policies, and no third module."""
+    n = len(trials)
+    found = [tuple(zip(t.row["streams"], t.row["policies"], strict=True)) for t in trials]
+    good = sum(f[:2] == OPTIMAL for f in found)
+    ended = sum(len(f) == 2 for f in found)
+    lines = [
+        Line(
+            "trials with both modules and policies optimal",
+            "10 of 10",
+            summary_of(good, n),
+            wilson(good, n),
+        ),
+        Line("trials without a third module", "10 of 10", summary_of(ended, n), wilson(ended, n)),
+        Line("iterations in all", "-", summary([t.row["iterations"] for t in trials]), digits=0),
+    ]
+    for i, name in enumerate(OBJECTS):
+        saved = [t.row["saved_at"][i] for t in trials if len(t.row["saved_at"]) > i]
+        encoded = [t.row["correlation"][i] for t in trials if len(t.row["correlation"]) > i]
+        lines.append(Line(f"module {i + 1} saved at iteration", "-", summary(saved), digits=0))
+        lines.append(
+            Line(f"correlation of module {i + 1} with {name}", "encodes it", summary(encoded))
+        )
+    claims = [
+        Claim(
+            "object 1 with [0,1,1], then object 3 with [1,1,0]", good == n, f"{good} of {n} trials"
+        ),
+        Claim("no third module is learned", ended == n, f"{ended} of {n} trials"),
+    ]
+    return Findings(lines, claims)
+
+
+def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
+    """Value function, policy, eta-dot; the modules' outputs over time and against the objects."""
+    drawn, axes = panels.figure(1, 3)
+    values = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
+    panels.per_stream(axes[0, 0], values, "c", "Q(s, stay) - Q(s, switch)")
+    panels.policies(axes[0, 1], [t.arrays["policy"] for t in trials], "d", "policy, mean and SD")
+    panels.eta_dot(axes[0, 2], [t.arrays["eta_dot"] for t in trials], learner_config().delta, "e")
+    paths = panels.save(drawn, folder, "icub")
+    outputs, axes = panels.figure(2, 2)
+    for i, name in enumerate(OBJECTS):
+        one = next((t for t in trials if f"truth{i + 1}" in t.arrays), None)
+        if one is None:
+            continue
+        y, truth = one.arrays[f"y{i + 1}"], one.arrays[f"truth{i + 1}"]
+        axes[i, 0].plot(y, color=panels.COLOURS[0], linewidth=0.8)
+        panels.label(axes[i, 0], "f", "frame", f"y, module {i + 1}")
+        axes[i, 1].plot(truth, y, ".", color=panels.COLOURS[0], markersize=3)
+        x = np.linspace(truth.min(), truth.max(), 100)
+        degree = min(3, len(np.unique(np.round(truth, 6))) - 1)
+        if degree > 0:
+            axes[i, 1].plot(x, np.polynomial.Polynomial.fit(truth, y, degree)(x), color="red")
+        panels.label(axes[i, 1], "f", f"{name}, m", f"y, module {i + 1}")
+        axes[i, 1].locator_params(axis="x", nbins=5)
+    return paths + panels.save(outputs, folder, "icub-outputs")

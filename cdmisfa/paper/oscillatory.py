@@ -1,0 +1,136 @@
+"""The oscillatory streams: three modules in the order of difficulty, with their policies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.config import LearnerConfig, build, load_preset
+from cdmisfa.core.expansion import quadratic
+from cdmisfa.core.modules import Module
+from cdmisfa.experiments.statistics import summary, wilson
+from cdmisfa.features.slowness import instantaneous_slowness
+from cdmisfa.paper import panels
+from cdmisfa.paper.reproduce import Arrays, Claim, Findings, Line, Request, Settings, Trial
+from recorder.world.oscillatory import one_period
+
+TITLE = "Oscillatory streams"
+
+OPTIMAL = ((0, (0, 1, 1)), (1, (1, 0, 1)), (2, (1, 1, 0)))
+"""Stream and policy of each module, as the paper gives them."""
+
+STREAMS = ("x1", "x2", "x3")
+
+MAX_ITERATIONS = 10_000
+
+
+def learner_config(**keys: Any) -> LearnerConfig:
+    """The preset of the oscillatory streams with some keys set."""
+    return build(LearnerConfig, "learner", load_preset("oscillatory")["learner"], keys)
+
+
+def plan(request: Request) -> list[dict[str, Any]]:
+    """20 trials that differ in their seed."""
+    return [{"seed": seed} for seed in range(request.count(20, 4))]
+
+
+def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """One trial until three modules are learned."""
+    from cdmisfa.experiments.trial import run_trial
+
+    result = run_trial(
+        learner_config(), seed=settings["seed"], max_iterations=MAX_ITERATIONS, curves=True
+    )
+    curves: Arrays = result.curves or {}
+    found = tuple((m.stream, tuple(m.policy.tolist())) for m in result.modules)
+    row = {
+        "optimal": found == OPTIMAL,
+        "iterations": result.iterations,
+        "streams": [m.stream for m in result.modules],
+        "policies": ["".join(map(str, m.policy.tolist())) for m in result.modules],
+        "saved_at": [m.iteration for m in result.modules],
+        "eta": [slowness_on(m) for m in result.modules],
+    }
+    return row, {
+        **{name: curves[name].astype(np.float32) for name in ("eta_dot", "R", "Q")},
+        "policy": curves["policy"].astype(np.int8),
+    }
+
+
+def expanded_period(stream: int) -> NDArray[np.float64]:
+    """One period of a stream as the learner sees it, (500, 5)."""
+    return quadratic(one_period(STREAMS[stream]))
+
+
+def slowness_on(module: Module) -> float:
+    """Slowness of a module's output on one period of its own stream, in cycles per frame."""
+    x = expanded_period(module.stream)
+    return float(instantaneous_slowness((x - module.mean) @ module.phi[0]))
+
+
+def evaluate(trials: Sequence[Trial]) -> Findings:
+    """Every trial must learn x1, x2, x3 in this order with the optimal policies."""
+    good, n = sum(bool(t.row["optimal"]) for t in trials), len(trials)
+    lines = [
+        Line(
+            "trials with order and policies optimal",
+            "20 of 20",
+            summary_of(good, n),
+            wilson(good, n),
+        ),
+        Line(
+            "iterations until the third module",
+            "-",
+            summary([t.row["iterations"] for t in trials]),
+            digits=0,
+        ),
+    ]
+    for i, frequency in enumerate((4, 3, 2)):
+        saved = [t.row["saved_at"][i] for t in trials if len(t.row["saved_at"]) > i]
+        eta = [t.row["eta"][i] for t in trials if len(t.row["eta"]) > i]
+        lines.append(Line(f"module {i + 1} saved at iteration", "-", summary(saved), digits=0))
+        lines.append(
+            Line(
+                f"slowness of module {i + 1} on its stream (paper: its frequency)",
+                f"{frequency / 500:.4f}",
+                summary(eta),
+                digits=4,
+            )
+        )
+    claim = Claim(
+        "modules x1, x2, x3 in this order, policies [0,1,1], [1,0,1], [1,1,0]",
+        good == n,
+        f"{good} of {n} trials",
+    )
+    return Findings(lines, [claim])
+
+
+def summary_of(good: int, n: int) -> Any:
+    """A proportion as a summary of zeros and ones."""
+    return summary([1.0] * good + [0.0] * (n - good))
+
+
+def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
+    """The paper's four panels, and the saved policies of each module."""
+    drawn, axes = panels.figure(2, 2)
+    delta = learner_config().delta
+    panels.eta_dot(axes[0, 0], [t.arrays["eta_dot"] for t in trials], delta, "a")
+    panels.per_stream(
+        axes[0, 1], [t.arrays["R"] for t in trials], "b", "R, stay entries", each=True
+    )
+    values = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
+    panels.per_stream(axes[1, 0], values, "c", "Q(s, stay) - Q(s, switch)")
+    panels.policies(axes[1, 1], [t.arrays["policy"] for t in trials], "d", "policy, mean and SD")
+    paths = panels.save(drawn, folder, "oscillatory")
+    bars, axes = panels.figure(1, 3, width=2.3)
+    for i in range(3):
+        saved = [list(map(int, t.row["policies"][i])) for t in trials if len(t.row["policies"]) > i]
+        if saved:
+            panels.policy_bars(
+                axes[0, i], [np.array(p) for p in saved], "abc"[i], f"module {i + 1}"
+            )
+    return paths + panels.save(bars, folder, "oscillatory-policies")

@@ -1,0 +1,74 @@
+"""The page of all results, made from the results files so that it cannot drift."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.paper.reproduce import NAMES, markdown_table
+
+
+def write_page(root: Path, page: Path) -> None:
+    """Write a Markdown page of every experiment below a folder, with its figures beside it.
+
+    Args:
+        root: folder of the results, one folder an experiment.
+        page: file to write; the figures go into a folder of the page's name next to it.
+
+    Raises:
+        UsageError: there are no results.
+    """
+    documents = [
+        read_results(root / name) for name in NAMES if (root / name / "results.json").exists()
+    ]
+    if not documents:
+        raise UsageError(f"{root} has no results: run cdmisfa reproduce all -o {root} first")
+    figures = page.with_suffix("")
+    figures.mkdir(parents=True, exist_ok=True)
+    parts = [
+        "# The paper, reproduced",
+        "",
+        "Made by `cdmisfa reproduce --page`; do not edit. Numbers are means over trials; SD is the",
+        "standard deviation, n the number of trials. Where the paper leaves something open, the",
+        "readings are in [decisions](decisions/).",
+    ]
+    for document in documents:
+        name = document["experiment"]
+        parts += ["", f"## {document['title']}", ""]
+        command = f"cdmisfa reproduce {name}{' --quick' if document['quick'] else ''}"
+        parts += [f"`{command}`, {document['trials']} trials.", ""]
+        parts += [
+            f"- {'Yes' if c['holds'] else '**No**'}: {c['claim']} ({c['detail']})"
+            for c in document["claims"]
+        ]
+        parts += ["", markdown_table(document["table"]).rstrip(), ""]
+        parts += [f"{note}\n" for note in document["notes"]]
+        for figure in document["figures"]:
+            if figure.endswith(".png"):
+                shutil.copyfile(root / name / figure, figures / figure)
+                parts += [f"![{document['title']}]({figures.name}/{figure})", ""]
+    versions = documents[0]["versions"]
+    shown = ", ".join(f"{key} {versions[key]}" for key in sorted(versions))
+    parts += ["", f"Versions: {shown}.", ""]
+    page.write_text("\n".join(parts), encoding="utf-8")
+
+
+def read_results(folder: Path) -> dict[str, Any]:
+    """The results.json of an experiment.
+
+    Raises:
+        UsageError: there is none, or it is not one.
+    """
+    path = folder / "results.json"
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        if document["schema"] != 1:
+            raise ValueError(document["schema"])
+    except (OSError, ValueError, KeyError) as error:
+        raise UsageError(
+            f"{path} cannot be read: run cdmisfa reproduce {folder.name} again"
+        ) from error
+    return dict(document)

@@ -1,0 +1,358 @@
+"""The paper's experiments: plan trials, run what is missing, judge, tabulate and draw.
+
+DIR/NAME/trials/ one file per finished trial, rows.parquet, results.json, table.md, figures.
+A trial is known by its settings and the code that ran it, so a stopped reproduction goes on
+where it stopped and a change of the code starts it anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
+from cdmisfa.experiments.engines import WorkerDied, run_all
+from cdmisfa.experiments.run import versions, write_json
+from cdmisfa.experiments.statistics import Summary
+from cdmisfa.experiments.sweep import code
+
+NAMES = ("oscillatory", "stability", "nonstationary", "icub", "difficulty")
+"""The experiments, each a module of this package, in the order of the paper."""
+
+SETTING = "set_"
+"""How the columns of rows.parquet begin that hold a trial's settings."""
+
+Settings = Mapping[str, Any]
+Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What is asked of an experiment.
+
+    Attributes:
+        trials: trials per condition; None is the paper's number.
+        quick: few trials, enough to test the claim.
+        recording: folder of a recording, for the experiments that see.
+        folder: where the experiment's files go.
+        jobs: parallel processes.
+        force: results of more or other trials may be replaced.
+    """
+
+    trials: int | None
+    quick: bool
+    recording: Path | None
+    folder: Path
+    jobs: int = 1
+    force: bool = False
+
+    def count(self, paper: int, quick: int) -> int:
+        """Trials per condition."""
+        return self.trials if self.trials is not None else quick if self.quick else paper
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A finished trial.
+
+    Attributes:
+        settings: what it was told.
+        row: what it came to, in plain values.
+        arrays: curves and the like, for the figures.
+    """
+
+    settings: Settings
+    row: Mapping[str, Any]
+    arrays: Arrays
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line of an experiment's table.
+
+    Attributes:
+        quantity: what was measured.
+        paper: the paper's value, as text; "-" where it has none.
+        ours: mean over trials, standard deviation and number of trials.
+        interval: 95 % confidence interval, where one was computed.
+        digits: decimals to print.
+    """
+
+    quantity: str
+    paper: str
+    ours: Summary
+    interval: tuple[float, float] | None = None
+    digits: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A qualitative statement of the paper, and whether it came out."""
+
+    text: str
+    holds: bool
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What an experiment came to."""
+
+    lines: Sequence[Line]
+    claims: Sequence[Claim]
+    notes: Sequence[str] = field(default=())
+
+
+class Experiment(Protocol):
+    """What the module of an experiment offers."""
+
+    TITLE: str
+
+    def plan(self, request: Request) -> list[dict[str, Any]]:
+        """Settings of every trial, as JSON values."""
+
+    def run(self, settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """One trial: its row and its arrays. Called in another process, maybe elsewhere."""
+
+    def evaluate(self, trials: Sequence[Trial]) -> Findings:
+        """Table and claims."""
+
+    def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
+        """Figures, as PNG and SVG each."""
+
+
+Progress = Callable[[int, int], None]
+
+
+def experiment(name: str) -> Experiment:
+    """The module of an experiment.
+
+    Raises:
+        UsageError: there is none of this name.
+    """
+    if name not in NAMES:
+        raise UsageError(f"no experiment {name!r}: there are {', '.join(NAMES)}, all")
+    return cast(Experiment, importlib.import_module(f"cdmisfa.paper.{name}"))
+
+
+def reproduce(
+    name: str,
+    request: Request,
+    *,
+    engine: str = "local",
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run an experiment's missing trials, and write what all of them came to.
+
+    Args:
+        name: one of `NAMES`.
+        request: what is asked; its folder is made.
+        engine: where trials run, one of `engines.ENGINES`.
+        scheduler: its address.
+        progress: told finished and all trials.
+
+    Returns:
+        The document of results.json.
+
+    Raises:
+        UsageError: no such experiment or engine, or the folder holds results of trials that
+            are not asked for, and `force` is not set.
+        CdmisfaError: a trial killed every process that ran it; the others are kept.
+    """
+    module = experiment(name)
+    store = request.folder / "trials"
+    store.mkdir(parents=True, exist_ok=True)
+    planned = module.plan(request)
+    if not request.force:
+        _keep_results(request.folder, planned)
+    version = code()
+    names = [trial_name(name, settings, version) for settings in planned]
+    missing = [i for i, n in enumerate(names) if not (store / f"{n}.npz").exists()]
+    done = len(planned) - len(missing)
+    if progress is not None:
+        progress(done, len(planned))
+    tasks = [(name, planned[i]) for i in missing]
+    for k, result in run_all(run_one, tasks, jobs=request.jobs, engine=engine, scheduler=scheduler):
+        i = missing[k]
+        if isinstance(result, WorkerDied):
+            raise CdmisfaError(f"{name} trial {planned[i]}: {result.what}; the others are kept")
+        write_trial(store / f"{names[i]}.npz", Trial(planned[i], *result))
+        done += 1
+        if progress is not None:
+            progress(done, len(planned))
+    trials = [read_trial(store / f"{n}.npz") for n in names]
+    findings = module.evaluate(trials)
+    write_rows(request.folder / "rows.parquet", trials)
+    figures = module.draw(trials, request.folder)
+    table = [_plain_line(line) for line in findings.lines]
+    document = {
+        "schema": 1,
+        "experiment": name,
+        "title": module.TITLE,
+        "quick": request.quick,
+        "trials": len(trials),
+        "reproduced": all(claim.holds for claim in findings.claims),
+        "claims": [
+            {"claim": c.text, "holds": c.holds, "detail": c.detail} for c in findings.claims
+        ],
+        "table": table,
+        "notes": list(findings.notes),
+        "figures": [figure.name for figure in figures],
+        "code": version,
+        "versions": versions(),
+    }
+    write_json(request.folder / "results.json", document)
+    (request.folder / "table.md").write_text(markdown_table(table), encoding="utf-8")
+    return document
+
+
+def run_one(task: tuple[str, Settings]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """One trial of the named experiment, for any process to call."""
+    name, settings = task
+    return experiment(name).run(settings)
+
+
+def check(document: Mapping[str, Any]) -> None:
+    """Complain when a claim of the paper did not come out.
+
+    Raises:
+        NotReproducedError: naming the claims.
+    """
+    failed = [c for c in document["claims"] if not c["holds"]]
+    if failed:
+        words = "; ".join(f"{c['claim']} ({c['detail']})" for c in failed)
+        raise NotReproducedError(f"{document['experiment']} did not come out: {words}")
+
+
+def trial_name(name: str, settings: Settings, version: str) -> str:
+    """Identity of a trial: a hash of what decides its result."""
+    text = json.dumps([name, settings, version], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def write_trial(path: Path, trial: Trial) -> None:
+    """Write a finished trial; the file appears whole or not at all."""
+    buffer = io.BytesIO()
+    head = json.dumps({"settings": trial.settings, "row": trial.row})
+    arrays: dict[str, Any] = {"head": np.array(head), **trial.arrays}
+    np.savez_compressed(buffer, **arrays)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(buffer.getvalue())
+    os.replace(partial, path)
+
+
+def read_trial(path: Path) -> Trial:
+    """Read a finished trial.
+
+    Raises:
+        UsageError: the file is not one.
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+        head = json.loads(str(arrays.pop("head")))
+        return Trial(head["settings"], head["row"], arrays)
+    except Exception as error:
+        raise UsageError(f"{path} is damaged: delete it, and the trial is run again") from error
+
+
+def write_rows(path: Path, trials: Sequence[Trial]) -> None:
+    """The raw rows, settings and results side by side, as parquet."""
+    import pyarrow
+    from pyarrow import parquet
+
+    rows = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
+    partial = path.with_name(path.name + ".partial")
+    parquet.write_table(pyarrow.Table.from_pylist(rows), partial)
+    os.replace(partial, path)
+
+
+def _keep_results(folder: Path, planned: Sequence[Settings]) -> None:
+    """Refuse to replace results that hold trials which are not planned now.
+
+    Raises:
+        UsageError: they do, or cannot be read.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    path = folder / "rows.parquet"
+    if not path.is_file():
+        return
+    try:
+        rows = parquet.ParquetFile(path).read().to_pylist()
+    except (OSError, pyarrow.ArrowException) as error:
+        raise UsageError(f"{path} is damaged: write it anew with --force") from error
+    known = [_given(settings) for settings in planned]
+    there = [
+        _given({k.removeprefix(SETTING): v for k, v in row.items() if k.startswith(SETTING)})
+        for row in rows
+    ]
+    lost = sum(settings not in known for settings in there)
+    if lost:
+        raise UsageError(
+            f"{folder} holds results of {len(rows)} trials, {lost} of them not among the "
+            f"{len(planned)} asked for now: choose another -o, or replace them with --force"
+        )
+
+
+def _given(settings: Settings) -> Settings:
+    """Settings as they come back from a table, where what one trial lacks is None."""
+    return {k: v for k, v in json.loads(json.dumps(settings)).items() if v is not None}
+
+
+HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
+
+
+def markdown_table(lines: Sequence[Mapping[str, Any]]) -> str:
+    """The table of results.json as Markdown."""
+
+    def number(value: float | None, digits: int) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    rows = []
+    for line in lines:
+        digits = line["digits"]
+        low, high = line["interval"] or (None, None)
+        interval = "-"
+        if line["interval"]:
+            interval = f"{number(low, digits)} .. {number(high, digits)}"
+        rows.append(
+            (
+                line["quantity"],
+                line["paper"],
+                number(line["mean"], digits),
+                number(line["sd"], digits),
+                interval,
+                str(line["n"]),
+            )
+        )
+    cells = [HEAD, tuple("---" for _ in HEAD), *rows]
+    return "\n".join("| " + " | ".join(row) + " |" for row in cells) + "\n"
+
+
+def _plain_line(line: Line) -> dict[str, Any]:
+    def plain(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "quantity": line.quantity,
+        "paper": line.paper,
+        "mean": plain(line.ours.mean),
+        "sd": plain(line.ours.sd),
+        "n": line.ours.n,
+        "interval": [plain(v) for v in line.interval] if line.interval else None,
+        "digits": line.digits,
+    }

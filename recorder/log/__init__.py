@@ -1,0 +1,13 @@
+"""Recordings on disk: one MCAP file a view, written whole or not at all."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "recorder.log.logfile": "LogFile partial_path",
+        "recorder.log.parts": "Split ViewParts",
+        "recorder.log.viewfacts": "ViewFacts",
+        "recorder.log.viewlog": "Identity ViewLog",
+    },
+)

@@ -1,0 +1,316 @@
+"""Writing an MCAP file that survives what happens to it.
+
+A `LogFile` is `NAME.partial` until it is finished, so a file called NAME is always
+whole. What was written is readable up to the last flush after any end: an error, a
+signal, kill -9, a full disk.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Literal, Self
+
+from mcap.writer import CompressionType, Writer
+
+from cdmisfa.core.errors import LogWriteError, UsageError
+
+PARTIAL = ".partial"
+"""Ending of a file that is being written, or whose writing was cut short."""
+
+FLUSH_NS = 1_000_000_000
+"""Log time after which the chunk in progress is handed to the operating system."""
+
+Compression = Literal["zstd", "lz4", "none"]
+
+_COMPRESSION = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+
+def partial_path(path: Path) -> Path:
+    """Where a log is written until it is finished."""
+    return path.with_name(path.name + PARTIAL)
+
+
+class LogFile:
+    """One MCAP file: chunked, indexed, with CRCs and repeated schemas and channels.
+
+    As a context manager it finishes the file on success and leaves the flushed
+    `.partial` on an exception. The same calls give the same bytes.
+
+    Attributes:
+        path: the file's name once it is finished.
+        partial: its name until then.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        force: bool = False,
+        library: str = "cdmisfa",
+        profile: str = "",
+        compression: Compression = "zstd",
+        chunk_size: int = 1024 * 1024,
+        flush_ns: int = FLUSH_NS,
+    ) -> None:
+        """Open NAME.partial for writing.
+
+        Raises:
+            UsageError: the file or its partial exists and `force` is not set.
+            LogWriteError: the file cannot be opened.
+        """
+        self.path = Path(path)
+        self.partial = partial_path(self.path)
+        self._force = force
+        self._flush_ns = flush_ns
+        self._chunk_start: int | None = None
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        if not force:
+            self._refuse_existing()
+        self._stream = _LatchedStream(self.partial, self._open())
+        self._writer = Writer(
+            self._stream,  # type: ignore[arg-type]
+            chunk_size=chunk_size,
+            compression=_COMPRESSION[compression],
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        try:
+            self._writer.start(profile=profile, library=library)
+        except BaseException:
+            self._stream.close()
+            raise
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file was finished or abandoned."""
+        return self._stream.closed
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far; the chunk in progress is not among them."""
+        return self._stream.tell()
+
+    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Register a message schema; the same schema gets the same id.
+
+        Returns:
+            The schema's id.
+        """
+        key = (name, encoding, data)
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(name, encoding, data)
+        return self._schemas[key]
+
+    def add_channel(
+        self,
+        topic: str,
+        schema: int,
+        *,
+        encoding: str = "protobuf",
+        metadata: Mapping[str, str] | None = None,
+    ) -> int:
+        """Register a channel of messages on a topic; schema 0 is none.
+
+        Returns:
+            The channel's id.
+        """
+        return self._writer.register_channel(topic, encoding, schema, dict(metadata or {}))
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a named string map at once, outside the chunks.
+
+        Raises:
+            LogWriteError: the disk does not take it.
+        """
+        self._writer.add_metadata(name, dict(values))
+        self._stream.flush()
+
+    def add_attachment(
+        self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
+    ) -> None:
+        """Write a named file at once, outside the chunks; times in nanoseconds.
+
+        Raises:
+            LogWriteError: the disk does not take it.
+        """
+        self._writer.add_attachment(create_time, log_time, name, media_type, data)
+        self._stream.flush()
+
+    def write(
+        self,
+        channel: int,
+        log_time: int,
+        data: bytes,
+        sequence: int = 0,
+        publish_time: int | None = None,
+    ) -> None:
+        """Write a message; what is older than a second of log time is flushed first.
+
+        Args:
+            channel: id from `add_channel`.
+            log_time: nanoseconds.
+            data: the encoded message.
+            sequence: the publisher's counter.
+            publish_time: nanoseconds; the log time where none is given.
+
+        Raises:
+            LogWriteError: the disk does not take it, now or at any time before.
+        """
+        self._stream.check()
+        if self._chunk_start is None:
+            self._chunk_start = log_time
+        elif log_time - self._chunk_start >= self._flush_ns:
+            self.flush()
+            self._chunk_start = log_time
+        published = log_time if publish_time is None else publish_time
+        self._writer.add_message(channel, log_time, data, published, sequence)
+
+    def flush(self) -> None:
+        """Close the chunk in progress and hand everything to the operating system.
+
+        Raises:
+            LogWriteError: the disk does not take it.
+        """
+        self._stream.check()
+        self._chunk_start = None
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def finish(self) -> None:
+        """Write the index, make the file durable and give it its name.
+
+        Raises:
+            LogWriteError: any of it failed; the `.partial` stays.
+            UsageError: a file of that name appeared meanwhile; the `.partial` stays.
+        """
+        try:
+            self._stream.check()
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.sync()
+        finally:
+            self._stream.close()
+        if not self._force and self.path.exists():
+            raise UsageError(
+                f"{self.path} appeared while it was being written: "
+                f"the new log is whole in {self.partial.name}, rename it"
+            )
+        try:
+            os.replace(self.partial, self.path)
+            _sync_folder(self.path.parent)
+        except OSError as error:
+            raise _write_error(self.path, error) from error
+
+    def abandon(self) -> None:
+        """Flush what can be flushed and close, leaving a readable `.partial`."""
+        if self.closed:
+            return
+        with contextlib.suppress(LogWriteError):
+            self.flush()
+            self._stream.sync()
+        self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self.abandon()
+        elif not self.closed:
+            self.finish()
+
+    def _refuse_existing(self) -> None:
+        if self.path.exists():
+            raise UsageError(f"{self.path} exists: choose another name or overwrite with --force")
+        if self.partial.exists():
+            raise UsageError(
+                f"{self.partial} is left from a writing that was cut short: "
+                "recover or remove it, or overwrite with --force"
+            )
+
+    def _open(self) -> BinaryIO:
+        try:
+            return open(self.partial, "wb" if self._force else "xb")
+        except OSError as error:
+            raise _write_error(self.partial, error) from error
+
+
+class _LatchedStream:
+    """A binary file that, once a write failed, refuses every later one.
+
+    The MCAP writer would go on after a failed write, and the log would have a hole in it.
+    """
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self._path = path
+        self._file = file
+        self._error: OSError | None = None
+
+    @property
+    def closed(self) -> bool:
+        return self._file.closed
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise _write_error(self._path, self._error) from self._error
+        if self._file.closed:
+            raise LogWriteError(f"{self._path}: this log is closed, nothing more can be written")
+
+    def write(self, data: bytes) -> int:
+        self.check()
+        try:
+            return self._file.write(data)
+        except OSError as error:
+            raise self._latch(error) from error
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def flush(self) -> None:
+        self.check()
+        try:
+            self._file.flush()
+        except OSError as error:
+            raise self._latch(error) from error
+
+    def sync(self) -> None:
+        self.flush()
+        try:
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._latch(error) from error
+
+    def close(self) -> None:
+        # Closing flushes again; an error in it is the one already told.
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def _latch(self, error: OSError) -> LogWriteError:
+        self._error = self._error or error
+        return _write_error(self._path, self._error)
+
+
+def _write_error(path: Path, error: OSError) -> LogWriteError:
+    return LogWriteError(
+        f"{path} cannot be written: {error.strerror or error}; "
+        "check the free space and rights there, what was flushed is readable"
+    )
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,146 @@
+"""The paper's oscillatory streams as a `FrameSource`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import START_NS, Block, SourceSpec, check_frame, check_request, freeze
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+
+PERIOD = 500
+"""Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500."""
+
+Float = NDArray[np.float64]
+
+
+def x1(theta: Float) -> Float:
+    """Stream 1; its slow feature has frequency 4/500.
+
+    Equation: 7
+    """
+    fast = np.cos(44 * theta)
+    return np.stack([np.sin(4 * theta - np.pi / 4) - fast**2, fast], axis=1)
+
+
+def x2(theta: Float) -> Float:
+    """Stream 2; its slow feature has frequency 3/500.
+
+    Equation: 8
+    """
+    fast = np.cos(27 * theta)
+    return np.stack([np.sin(3 * theta) + fast**2, fast], axis=1)
+
+
+def x3(theta: Float) -> Float:
+    """Stream 3; its slow feature has frequency 2/500.
+
+    Equation: 9
+    """
+    fast = np.cos(12 * theta)
+    return np.stack([fast, np.cos(2 * theta) + fast**2], axis=1)
+
+
+def zero(theta: Float) -> Float:
+    """The stream that shows nothing, of the non-stationary environment."""
+    return np.zeros((len(theta), 2))
+
+
+STREAMS: Mapping[str, Callable[[Float], Float]] = {"x1": x1, "x2": x2, "x3": x3, "zero": zero}
+
+
+def one_period(name: str) -> Float:
+    """All PERIOD frames of a stream, (500, 2).
+
+    Taking frames from this table makes a block's bits independent of how it is cut.
+
+    Raises:
+        UsageError: no such stream.
+    """
+    if name not in STREAMS:
+        raise UsageError(f"no oscillatory stream {name!r}: there are {', '.join(STREAMS)}")
+    theta = 2 * np.pi * np.arange(PERIOD) / PERIOD
+    return freeze(np.ascontiguousarray(STREAMS[name](theta)))
+
+
+class OscillatorySource:
+    """Deterministic two-dimensional streams on the common clock.
+
+    Args:
+        streams: names from `STREAMS`.
+        fps: frames per second.
+        start_ns: log time of frame 0 in nanoseconds.
+        length: frames after which the streams end; by default they do not.
+
+    Raises:
+        UsageError: no streams, or one that does not exist.
+
+    Example:
+        >>> source = OscillatorySource()
+        >>> source.take(0, 100).frames.shape
+        (100, 2)
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[str] = ("x1", "x2", "x3"),
+        *,
+        fps: float = 50.0,
+        start_ns: int = START_NS,
+        length: int | None = None,
+    ) -> None:
+        if not streams:
+            raise UsageError("a source has at least one stream: name some of " + ", ".join(STREAMS))
+        self._shown = list(streams)
+        self._tables = [one_period(name) for name in streams]
+        self._t = 0
+        self._spec = SourceSpec(tuple(streams), (2,), "float64", ("theta",), fps, start_ns, length)
+
+    @property
+    def spec(self) -> SourceSpec:
+        """What the source delivers."""
+        return self._spec
+
+    @property
+    def t(self) -> int:
+        """Global counter of the next frame."""
+        return self._t
+
+    @property
+    def tables(self) -> Float:
+        """One period of every stream, (streams, 500, 2)."""
+        return np.stack(self._tables)
+
+    def replace(self, stream: int, name: str) -> None:
+        """From the next block on, show another signal on a stream (the abrupt swap)."""
+        self._tables[stream] = one_period(name)
+        self._shown[stream] = name
+
+    def take(self, stream: int, n: int) -> Block:
+        """The next n frames of a stream; see `FrameSource.take`."""
+        check_request(self._spec, stream, n)
+        length = self._spec.length
+        if length is not None and self._t + n > length:
+            raise LogExhaustedError(
+                f"the streams end after {length} frames: {n} more at frame {self._t} do not exist"
+            )
+        index = (self._t + np.arange(n)) % PERIOD
+        frames = self._tables[stream][index]
+        block = Block(stream, self._t, freeze(frames), freeze(2 * np.pi * index[:, None] / PERIOD))
+        self._t += n
+        return block
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t; see `FrameSource.seek`."""
+        check_frame(t)
+        self._t = t
+
+    def describe(self) -> Mapping[str, Any]:
+        """The streams shown now."""
+        return {"kind": "oscillatory", "streams": list(self._shown)}
+
+    def close(self) -> None:
+        """Nothing to let go of."""

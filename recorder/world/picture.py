@@ -1,0 +1,84 @@
+"""A picture of the scene from outside: robot, table and objects."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.config import SceneConfig
+from recorder.world.eyes import look, perspective
+from recorder.world.motions import Motions
+from recorder.world.world import World
+
+SIZE = (960, 720)
+"""Width and height of the picture, pixels."""
+
+_SAMPLES = 2
+_CAMERA = np.array([-1.15, -3.1, 0.85])
+_TARGET = np.array([-0.36, 0.0, -0.16])
+_FOV = 29.0
+_LIGHT = (-0.6, -0.8, 1.4)
+_FLOOR = -0.6
+_TABLE_BACK, _TABLE_FRONT, _TABLE_SIDE = -0.3, -0.95, 0.75
+
+
+def scene_picture(scene: SceneConfig, path: Path, *, force: bool = False) -> Path:
+    """Draw the iCub scene at its first frame, the head turned to the middle view.
+
+    The table is drawn as large as the objects need, since the real one, which fills
+    every eye image, would hide the robot's legs.
+
+    Returns:
+        The picture's path.
+
+    Raises:
+        UsageError: the file exists, or is no .png.
+        LogWriteError: the file or its folder cannot be written.
+        CdmisfaError: the simulator is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"{path}: the picture is a PNG, name it .png")
+    if path.exists() and not force:
+        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogWriteError(f"{path.parent} cannot be made: {error.strerror}") from error
+    width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
+    with World(scene, robot_seen=True) as world:
+        _furnish(world, scene)
+        world.place(Motions(scene, scene.seed or 0).take(1)[0])
+        world.turn_head(scene.eyes.yaw[len(scene.eyes.yaw) // 2])
+        colours, _ = world.render(
+            look(_CAMERA, _TARGET),
+            perspective(_FOV, width / height, 0.1, 20.0),
+            width,
+            height,
+            _LIGHT,
+        )
+    image = Image.fromarray(colours[..., :3]).resize(SIZE, Image.Resampling.LANCZOS)
+    try:
+        image.save(path, format="PNG", optimize=True)
+    except OSError as error:
+        raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
+    return path
+
+
+def _furnish(world: World, scene: SceneConfig) -> None:
+    """A floor and a table with legs in place of the endless table top."""
+    world.hide_table()
+    table = dataclasses.replace(scene.table, thickness=0.03)
+    centre = (_TABLE_BACK + _TABLE_FRONT) / 2
+    depth = (_TABLE_BACK - _TABLE_FRONT) / 2
+    middle = table.top - table.thickness / 2
+    world.add_box((centre, 0.0, middle), (depth, _TABLE_SIDE, table.thickness / 2), table.colour)
+    length = (middle - _FLOOR) / 2
+    for x in (_TABLE_BACK - 0.05, _TABLE_FRONT + 0.05):
+        for y in (-_TABLE_SIDE + 0.05, _TABLE_SIDE - 0.05):
+            world.add_box((x, y, _FLOOR + length), (0.02, 0.02, length), (0.35, 0.32, 0.3))
+    world.add_box((0.0, 0.0, _FLOOR - 0.01), (12.0, 12.0, 0.01), (0.82, 0.84, 0.86))

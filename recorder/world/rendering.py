@@ -1,0 +1,124 @@
+"""Blocks of every view in order of time, rendered here or by several processes."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+
+from cdmisfa.core.blocks import Block, FrameSource
+from cdmisfa.core.errors import CdmisfaError
+from recorder.config import RecordConfig, SceneConfig
+from recorder.world.scenes import open_scene
+
+Request = tuple[int, int, int]
+"""Stream, first frame and number of frames of a block."""
+
+BLOCK = 64
+"""Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks."""
+
+_AHEAD = 3
+"""Blocks a process may be ahead of the writer."""
+
+_source: FrameSource | None = None
+
+
+def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
+    """All blocks still missing: by time, then by stream, so that no view gets far ahead.
+
+    Args:
+        starts: the first missing frame of each stream.
+        frames: where all streams end.
+    """
+    for low in range(0, frames, BLOCK):
+        high = min(low + BLOCK, frames)
+        for stream, start in starts.items():
+            first = max(low, start)
+            if first < high:
+                yield stream, first, high - first
+
+
+def render_here(source: FrameSource, wanted: Iterable[Request]) -> Generator[Block, None, None]:
+    """The blocks, one after the other, from one source."""
+    for request in wanted:
+        yield _take(source, request)
+
+
+def render_in_processes(
+    kind: str, scene: SceneConfig, record: RecordConfig, wanted: Iterable[Request], jobs: int
+) -> Generator[Block, None, None]:
+    """The blocks in the same order, rendered by `jobs` processes with a world each.
+
+    Raises:
+        CdmisfaError: a process died, or could not open the scene.
+    """
+    pending: deque[Future[Block]] = deque()
+    pool = ProcessPoolExecutor(
+        jobs,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_start,
+        initargs=(kind, scene, record),
+    )
+    try:
+        for request in wanted:
+            with _interrupts_held():
+                pending.append(pool.submit(_render, request))
+            if len(pending) > _AHEAD * jobs:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    except BrokenProcessPool as error:
+        raise CdmisfaError(
+            "a rendering process ended: record with --jobs 1 to see why, or give it more memory"
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Deliver Ctrl-C afterwards, and never to processes started meanwhile.
+
+    They inherit the mask. A terminal sends Ctrl-C to all of them, but only the writer may
+    decide when to end.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start(kind: str, scene: SceneConfig, record: RecordConfig) -> None:
+    """Open a world in a rendering process, which ends with its parent."""
+    global _source
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _source = open_scene(kind, scene, record)
+
+
+def _end_with_parent() -> None:
+    # A parent that was killed cannot tell its children to end.
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        with contextlib.suppress(OSError):
+            wait([parent.sentinel])
+        os._exit(1)
+
+
+def _render(request: Request) -> Block:
+    if _source is None:
+        raise RuntimeError("the rendering process was not started")
+    return _take(_source, request)
+
+
+def _take(source: FrameSource, request: Request) -> Block:
+    stream, first, n = request
+    source.seek(first)
+    return source.take(stream, n)

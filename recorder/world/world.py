@@ -1,0 +1,269 @@
+"""The iCub's world in PyBullet: robot, table and objects, placed and never simulated.
+
+Objects are moved by hand each frame, so no physics step is ever made and nothing
+depends on the machine's speed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import math
+import os
+import sys
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from recorder.config import SceneConfig
+
+NECK_YAW = b"neck_yaw"
+"""The joint that turns the head to the left; the last of the neck."""
+
+_AWAY = (0.0, 0.0, -100.0)
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+class World:
+    """Robot, table and objects in a PyBullet server of their own, without a window.
+
+    Args:
+        scene: what stands where.
+        robot_seen: whether the robot is drawn. Its own eyes see the same bytes either
+            way (its head is around them), and without it 60 times as fast.
+
+    Raises:
+        CdmisfaError: PyBullet or the robot models are not installed.
+        UsageError: no such robot, or a view the neck cannot turn to.
+
+    Attributes:
+        neck: (3,) origin of the neck yaw joint in the root frame, metres.
+    """
+
+    def __init__(self, scene: SceneConfig, *, robot_seen: bool = False) -> None:
+        with silenced():
+            self._bullet, models = _import_simulator()
+            path = _robot_file(models, scene.robot)
+            self._client = self._bullet.connect(self._bullet.DIRECT)
+            try:
+                self._build(scene, path, robot_seen)
+            except self._bullet.error as error:
+                self.close()
+                raise CdmisfaError(
+                    f"PyBullet cannot build the scene: {error}; check scene.robot"
+                ) from error
+            except BaseException:
+                self.close()
+                raise
+
+    def place(self, positions: NDArray[np.float64]) -> None:
+        """Put the objects where they are in a frame.
+
+        Args:
+            positions: (objects, 2) x and y in the paper's coordinates, whose y is to the
+                robot's left, while the root frame's is to its right.
+        """
+        for body, height, (x, y) in zip(
+            self._objects, self._heights, positions.tolist(), strict=True
+        ):
+            self._move(body, (x, -y, height))
+
+    def turn_head(self, yaw: float) -> None:
+        """Turn the robot's head; degrees, to the left. Only pictures from outside show it."""
+        self._bullet.resetJointState(
+            self._robot, self._neck_joint, math.radians(yaw), physicsClientId=self._client
+        )
+
+    @contextlib.contextmanager
+    def only(self, *, table: bool) -> Iterator[None]:
+        """Within this context just the table, or just the objects, can be seen."""
+        hidden = self._objects if table else [self._table]
+        poses = [
+            self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)[0]
+            for body in hidden
+        ]
+        for body in hidden:
+            self._move(body, _AWAY)
+        try:
+            yield
+        finally:
+            for body, pose in zip(hidden, poses, strict=True):
+                self._move(body, pose)
+
+    def hide_table(self) -> None:
+        """Move the table out of sight for good."""
+        self._move(self._table, _AWAY)
+
+    def add_box(
+        self,
+        centre: tuple[float, float, float],
+        half: tuple[float, float, float],
+        colour: tuple[float, float, float],
+    ) -> None:
+        """Add a box that is only scenery; root frame, metres."""
+        self._move(self._body(self._bullet.GEOM_BOX, colour, halfExtents=half), centre)
+
+    def render(
+        self,
+        view: tuple[float, ...],
+        projection: tuple[float, ...],
+        width: int,
+        height: int,
+        light: tuple[float, float, float],
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """What a camera sees.
+
+        Returns:
+            (height, width, 4) colours and (height, width) depth.
+
+        Raises:
+            CdmisfaError: the simulator refuses.
+        """
+        bullet = self._bullet
+        try:
+            image = bullet.getCameraImage(
+                width,
+                height,
+                view,
+                projection,
+                lightDirection=light,
+                shadow=0,
+                renderer=bullet.ER_TINY_RENDERER,
+                flags=bullet.ER_NO_SEGMENTATION_MASK,
+                physicsClientId=self._client,
+            )
+        except bullet.error as error:
+            raise CdmisfaError(f"PyBullet cannot draw: {error}") from error
+        colours = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
+        return colours, np.asarray(image[3], dtype=np.float32).reshape(height, width)
+
+    def close(self) -> None:
+        """End the simulator; harmless when called twice."""
+        if self._client >= 0:
+            self._bullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _build(self, scene: SceneConfig, path: str, robot_seen: bool) -> None:
+        bullet, client = self._bullet, self._client
+        # Without merging, no link of this robot has a state: it has too many fixed joints.
+        self._robot = bullet.loadURDF(
+            path,
+            useFixedBase=True,
+            flags=bullet.URDF_MERGE_FIXED_LINKS | bullet.URDF_IGNORE_COLLISION_SHAPES,
+            physicsClientId=client,
+        )
+        joints = range(bullet.getNumJoints(self._robot, physicsClientId=client))
+        if not robot_seen:
+            for link in (-1, *joints):
+                bullet.changeVisualShape(
+                    self._robot, link, rgbaColor=(0, 0, 0, 0), physicsClientId=client
+                )
+        infos = [bullet.getJointInfo(self._robot, i, physicsClientId=client) for i in joints]
+        neck = next((info for info in infos if info[1] == NECK_YAW), None)
+        if neck is None:
+            raise UsageError(f"scene.robot {scene.robot} has no neck: choose a whole robot")
+        self._neck_joint = neck[0]
+        low, high = math.degrees(neck[8]), math.degrees(neck[9])
+        for yaw in scene.eyes.yaw:
+            if not low <= yaw <= high:
+                raise UsageError(
+                    f"scene.eyes.yaw has {yaw:g}: the neck of {scene.robot} turns "
+                    f"from {low:.0f} to {high:.0f} degrees"
+                )
+        place = bullet.getLinkState(self._robot, self._neck_joint, physicsClientId=client)[4]
+        # To the micrometre: the rest is rounding noise of the simulator's float32.
+        self.neck = np.array([round(part, 6) for part in place])
+        self._add_bodies(scene)
+
+    def _add_bodies(self, scene: SceneConfig) -> None:
+        bullet, top = self._bullet, scene.table.top
+        box, cylinder, sphere = scene.object1, scene.object2, scene.object3
+        half = (scene.table.half_size, scene.table.half_size, scene.table.thickness / 2)
+        self._table = self._body(bullet.GEOM_BOX, scene.table.colour, halfExtents=half)
+        self._move(self._table, (0.0, 0.0, top - scene.table.thickness / 2))
+        self._objects = [
+            self._body(bullet.GEOM_BOX, (box.grey,) * 3, halfExtents=(box.half_size,) * 3),
+            self._body(
+                bullet.GEOM_CYLINDER,
+                (cylinder.grey,) * 3,
+                radius=cylinder.radius,
+                length=cylinder.height,
+            ),
+            self._body(bullet.GEOM_SPHERE, (sphere.grey,) * 3, radius=sphere.radius),
+        ]
+        self._heights = (top + box.half_size, top + cylinder.height / 2, top + sphere.radius)
+
+    def _body(self, shape: int, colour: tuple[float, ...], **size: Any) -> int:
+        visual = self._bullet.createVisualShape(
+            shape, rgbaColor=(*colour, 1.0), physicsClientId=self._client, **size
+        )
+        body: int = self._bullet.createMultiBody(
+            baseMass=0, baseVisualShapeIndex=visual, physicsClientId=self._client
+        )
+        return body
+
+    def _move(self, body: int, position: tuple[float, ...]) -> None:
+        self._bullet.resetBasePositionAndOrientation(
+            body, position, _UPRIGHT, physicsClientId=self._client
+        )
+
+
+@contextlib.contextmanager
+def silenced() -> Iterator[None]:
+    """Keep what C code prints off standard output and error.
+
+    The simulator prints tens of kilobytes of warnings past Python's streams.
+    """
+    c_library = ctypes.CDLL(None)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    c_library.fflush(None)
+    saved = [os.dup(1), os.dup(2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        c_library.fflush(None)
+        for number, copy in zip((1, 2), saved, strict=True):
+            os.dup2(copy, number)
+            os.close(copy)
+
+
+def _import_simulator() -> tuple[Any, Any]:
+    try:
+        import icub_models
+        import pybullet
+    except ImportError as error:
+        raise CdmisfaError(
+            f"the icub scene needs the package {error.name}, which is not installed: "
+            "use Python 3.11 and `pip install pybullet icub-models`; "
+            "recordings and the oscillatory scene work without it"
+        ) from error
+    return pybullet, icub_models
+
+
+def _robot_file(models: Any, name: str) -> str:
+    if name not in models.get_robot_names():
+        known = ", ".join(sorted(models.get_robot_names()))
+        raise UsageError(f"scene.robot is {name}: icub-models has {known}")
+    return str(models.get_model_file(name))

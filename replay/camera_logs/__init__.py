@@ -1,0 +1,11 @@
+"""Other people's logs of cameras as sources of frames."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "replay.camera_logs.source": "ForeignSource",
+        "replay.camera_logs.stream": "ImageStream open_images",
+    },
+)

@@ -1,0 +1,146 @@
+"""ROS bags: the images of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.pixels import RECIPE, Decoder, image_decoder, shrink
+from replay.camera_logs.stream import choose_topic
+from replay.mcap.records import Bytes, MalformedRecord
+
+_ROS1_TYPES = {
+    "sensor_msgs/msg/Image": "sensor_msgs/Image",
+    "sensor_msgs/msg/CompressedImage": "sensor_msgs/CompressedImage",
+}
+
+
+class BagImages:
+    """The images on one topic of a ROS bag, in the order of its time stamps.
+
+    Args:
+        path: a .bag, a .db3, or the folder of a rosbag2.
+        topic: the topic; may be left out where there is one topic of images.
+        size: (height, width) of a frame.
+
+    Raises:
+        CdmisfaError: the package rosbags is missing.
+        UsageError: no such topic, or no images on it.
+        LogDamagedError: rosbags cannot read it.
+    """
+
+    recipe = RECIPE
+
+    def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
+        self.path = path
+        self._size = size
+        self._reader: Any = None
+        self._messages: Iterator[tuple[int, bytes]] = iter(())
+        self._next = -1
+        ros1 = path.suffix == ".bag" and path.is_file()
+        reader = _reader_of(path, ros1=ros1)
+        with _explained(path):
+            reader.open()
+        self._reader = reader
+        try:
+            self._connections, self._decode = self._find(topic, ros1=ros1)
+            with _explained(path):
+                stamps = [stamp for stamp, _ in self._from(None)]
+        except BaseException:
+            self.close()
+            raise
+        if not stamps:
+            self.close()
+            raise UsageError(f"{path}: there is no message on {self.topic}")
+        self.times = np.array(stamps, np.uint64)
+        self.count = len(stamps)
+
+    @property
+    def topic(self) -> str:
+        """The topic."""
+        return str(self._connections[0].topic)
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Bags have no checksums: damage of a pixel in one cannot be seen."""
+        return (f"{self.path}: a ROS bag has no checksums, damaged pixels would go unnoticed",)
+
+    def frame(self, row: int) -> Bytes:
+        """Decode a message into a frame, (height, width) uint8.
+
+        Raises:
+            LogDamagedError: the message is no image that is read, or the bag is damaged.
+        """
+        with _explained(self.path):
+            if row != self._next:
+                self._messages = self._from(int(self.times[row]))
+                self._next = int(np.searchsorted(self.times, self.times[row]))
+            while self._next <= row:
+                stamp, data = next(self._messages, (0, b""))
+                self._next += 1
+        try:
+            return shrink(self._decode(data), *self._size)
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self.path}: {self.topic} at {stamp} ns: {error}") from None
+
+    def close(self) -> None:
+        """Let go of the files; harmless when called twice."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            self._messages = iter(())
+            reader.close()
+
+    def _from(self, start: int | None) -> Iterator[tuple[int, bytes]]:
+        before = 0
+        for _, stamp, data in self._reader.messages(self._connections, start):
+            if stamp < before:
+                raise LogDamagedError(
+                    f"{self.path}: its messages are not in the order of time; convert it to MCAP"
+                )
+            before = stamp
+            yield stamp, data
+
+    def _find(self, topic: str | None, *, ros1: bool) -> tuple[list[Any], Decoder]:
+        decoders: dict[str, Decoder] = {}
+        others: dict[str, str] = {}
+        for connection in self._reader.connections:
+            kind = str(connection.msgtype)
+            schema = _ROS1_TYPES.get(kind, kind) if ros1 else kind
+            decoder = image_decoder(schema, "ros1" if ros1 else "cdr")
+            if decoder is None:
+                others[connection.topic] = kind
+            else:
+                decoders[connection.topic] = decoder
+        chosen = choose_topic(self.path, topic, [(name, name) for name in decoders], others)
+        # Several publishers on one topic are several connections of a ROS 1 bag.
+        connections = [c for c in self._reader.connections if c.topic == chosen]
+        return connections, decoders[chosen]
+
+
+def _reader_of(path: Path, *, ros1: bool) -> Any:
+    try:
+        from rosbags.rosbag1 import Reader as Rosbag1
+        from rosbags.rosbag2 import Reader as Rosbag2
+    except ImportError:
+        raise CdmisfaError(
+            f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
+        ) from None
+    with _explained(path):
+        return Rosbag1(path) if ros1 else Rosbag2(path)
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Say in one line what rosbags, which lets any exception through, cannot read."""
+    try:
+        yield
+    except (CdmisfaError, MemoryError):
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"[:200]
+        raise LogDamagedError(f"{path}: rosbags cannot read it ({reason})") from None

@@ -1,0 +1,107 @@
+"""Camera logs that were written in parts, read as one stream in the order of time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cdmisfa.core.errors import UsageError
+from replay.camera_logs.stream import ImageStream, McapImages
+from replay.mcap.records import Bytes
+from replay.storage.location import Location
+
+
+class JoinedImages:
+    """The images on one topic of several logs, by their times, ties in the order of the logs.
+
+    Args:
+        path: what stands for all of them.
+        parts: each has times, and the same topic.
+
+    Attributes:
+        parts: as given.
+    """
+
+    def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
+        self.path = path
+        self.recipe = parts[0].recipe
+        self.parts = list(parts)
+        times = np.concatenate([part.times for part in parts])
+        order = np.argsort(times, kind="stable")
+        self.times = times[order]
+        self.count = len(order)
+        self._part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
+        self._row_in = np.concatenate([np.arange(part.count) for part in parts])[order]
+
+    @property
+    def topic(self) -> str:
+        """The topic that all parts share."""
+        return self.parts[0].topic
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What was cut off or left out in a part, and that there are parts."""
+        joined = f"{self.path}: {self.topic} is joined from {len(self.parts)} logs, by time"
+        return [joined, *(warning for part in self.parts for warning in part.warnings)]
+
+    def frame(self, row: int) -> Bytes:
+        """Decode an image into a frame, (height, width) uint8.
+
+        Raises:
+            LogDamagedError: it is no image that is read.
+        """
+        return self.parts[int(self._part_of[row])].frame(int(self._row_in[row]))
+
+    def close(self) -> None:
+        """Let go of the files; harmless when called twice."""
+        for part in self.parts:
+            part.close()
+
+
+def open_joined(
+    path: Path,
+    files: Sequence[Path],
+    topic: str | None,
+    size: tuple[int, int],
+    *,
+    salvage: bool = False,
+) -> ImageStream:
+    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
+
+    Raises:
+        UsageError: no part has images on the topic, or they have several topics.
+        LogDamagedError: a part is damaged.
+    """
+    parts: list[ImageStream] = []
+    refusal: UsageError | None = None
+    try:
+        for file in files:
+            try:
+                parts.append(McapImages(file, topic, size, salvage=salvage))
+            except UsageError as error:
+                refusal = refusal or error
+        if refusal is not None and (topic is None or not parts):
+            raise refusal
+        topics = {part.topic for part in parts}
+        if len(topics) > 1:
+            raise UsageError(f"{path}: name one --topic; it has images on: {sorted(topics)}")
+    except BaseException:
+        for part in parts:
+            part.close()
+        raise
+    return JoinedImages(path, parts)
+
+
+def join_parts(streams: Sequence[ImageStream]) -> list[ImageStream]:
+    """Join logs with one topic of which each begins after another ends; others stay streams."""
+    ordered = sorted(streams, key=lambda s: int(s.times[0]) if len(s.times) else 0)
+    follow = all(
+        len(one.times) and len(two.times) and int(one.times[-1]) < int(two.times[0])
+        for one, two in itertools.pairwise(ordered)
+    )
+    if len(streams) < 2 or not follow or len({s.topic for s in streams}) > 1:
+        return list(streams)
+    return [JoinedImages(ordered[0].path, ordered)]

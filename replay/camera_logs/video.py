@@ -1,0 +1,199 @@
+"""A video file as a stream of images, through PyAV: FFmpeg on one thread.
+
+Grey is the luma that a video stores, so that no colour conversion of FFmpeg, whose bits depend
+on the processor, comes between; only videos without luma are taken by their colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import NANOSECONDS
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.pixels import MAX_PIXELS, RECIPE, RawPixels, gray, shrink
+from replay.mcap.records import Bytes, MalformedRecord
+
+_NOWHERE: Final = 2**62
+_FORWARD: Final = 256
+"""Frames that are decoded and passed over rather than sought."""
+_FULL_RANGE: Final = 2
+_LUMA: Final = ("yuv", "yuvj", "gray", "nv12", "nv21")
+
+
+class VideoImages:
+    """The frames of a video's first stream, at its presentation times.
+
+    Args:
+        path: the file.
+        topic: its name without the ending, or None.
+        size: (height, width) of a frame.
+
+    Raises:
+        CdmisfaError: the package av is missing.
+        UsageError: it is no topic of the file.
+        LogDamagedError: it is no video, or a broken one.
+    """
+
+    recipe = (
+        f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
+        "((Y - 16) * 510 + 219) // 438 where its range is limited"
+    )
+
+    def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
+        self.path = path
+        self._size = size
+        self._av = _pyav(path)
+        self._next = _NOWHERE
+        self._frames: Iterator[Any] = iter(())
+        self._container: Any = None
+        if topic not in (None, self.topic):
+            raise UsageError(f"{path}: a video has no topics, leave {topic} out")
+        try:
+            with _explained(path):
+                self._container = self._av.open(str(path))
+                self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def topic(self) -> str:
+        """The file's name without its ending."""
+        return self.path.stem
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """Videos have no checksums; and one may have lost its end."""
+        found = [f"{self.path}: a video has no checksums, damaged pixels may go unnoticed"]
+        last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
+        if stated > last + 1:
+            found.append(f"{self.path}: it states {stated:g} s, its last frame is at {last:g} s")
+        return found
+
+    def frame(self, row: int) -> Bytes:
+        """Decode a frame, (height, width) uint8.
+
+        Raises:
+            LogDamagedError: the video is broken there, or has other frames than it states.
+        """
+        stamp = int(self._stamps[row])
+        where = f"{self.path}: at {float(stamp * self._tick):g} s"
+        with _explained(self.path):
+            if not self._next <= row < self._next + _FORWARD:
+                self._container.seek(stamp, stream=self._stream, backward=True)
+                self._frames = self._container.decode(self._stream)
+            found = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
+            self._next = row + 1
+            if found is None or found.pts != stamp or found.is_corrupt:
+                self._next = _NOWHERE
+                raise LogDamagedError(f"{where}: the video is broken, no frame can be decoded")
+            try:
+                return shrink(self._gray(found), *self._size)
+            except MalformedRecord as error:
+                raise LogDamagedError(f"{where}: {error}") from None
+
+    def close(self) -> None:
+        """Let go of the file; harmless when called twice."""
+        container, self._container = self._container, None
+        self._frames = iter(())
+        if container is not None:
+            container.close()
+
+    def _open(self) -> None:
+        """Find the times of all frames, without decoding one."""
+        if not self._container.streams.video:
+            raise LogDamagedError(f"{self.path}: there is no video in it")
+        self._stream = stream = self._container.streams.video[0]
+        stream.thread_type = "NONE"
+        stream.codec_context.thread_count = 1
+        stream.codec_context.options = {"err_detect": "explode"}  # rather than made up pixels
+        pixels = stream.codec_context.width * stream.codec_context.height
+        if not 0 < pixels <= MAX_PIXELS:
+            raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")
+        self._tick = Fraction(stream.time_base)
+        stamps: list[int] = []
+        packets = 0
+        for packet in self._container.demux(stream):
+            packets += packet.size > 0
+            if packet.size == 0 or packet.is_discard:
+                continue
+            if packet.pts is None:
+                raise LogDamagedError(
+                    f"{self.path}: its frames have no times; copy it into an .mp4 or .mkv file"
+                )
+            stamps.append(packet.pts)
+        if not stamps:
+            raise LogDamagedError(f"{self.path}: there is no frame in it")
+        if stream.frames not in (0, packets):
+            raise LogDamagedError(
+                f"{self.path}: it states {stream.frames} frames, {packets} are there"
+            )
+        self._stamps = np.sort(np.array(stamps, np.int64))
+        if (np.diff(self._stamps) == 0).any():
+            raise LogDamagedError(f"{self.path}: two of its frames have the same time")
+        self.count = len(stamps)
+        self._stated_seconds = (self._container.duration or 0) / self._av.time_base
+        self.times = self._nanoseconds()
+        self._container.seek(0, stream=stream, backward=True)
+
+    def _nanoseconds(self) -> NDArray[np.uint64]:
+        """Times of the frames, from the video's beginning, or its first frame if that is before."""
+        scale = self._tick * NANOSECONDS
+        first = min(int(self._stamps[0]), 0)
+        exact = [round((int(stamp) - first) * scale) for stamp in self._stamps]
+        if exact[-1] >= 2**62:
+            raise LogDamagedError(f"{self.path}: it has times beyond any clock")
+        return np.array(exact, np.uint64)
+
+    def _gray(self, frame: Any) -> Bytes:
+        """The luma of a frame, or the grey of its colours, (height, width) uint8."""
+        form = frame.format
+        if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
+            colours = frame.to_ndarray(format="rgb24")
+            height, width = colours.shape[:2]
+            return gray(RawPixels(height, width, "rgb8", False, 3 * width, colours.tobytes()))
+        plane = frame.planes[0]
+        luma = gray(
+            RawPixels(frame.height, frame.width, "mono8", False, plane.line_size, memoryview(plane))
+        )
+        full = form.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
+        return luma if full else _STRETCH[luma]
+
+
+def _stretch() -> Bytes:
+    """Luma of limited range as full range, a value for each byte, (256,) uint8."""
+    stretched: Bytes = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8)
+    return stretched
+
+
+_STRETCH: Final = _stretch()
+
+
+def _pyav(path: Path) -> Any:
+    try:
+        import av
+    except ImportError:
+        raise CdmisfaError(
+            f"{path} is a video, which needs PyAV: pip install 'cdmisfa[video]'"
+        ) from None
+    av.logging.set_level(None)
+    return av
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Say in one line what FFmpeg cannot read."""
+    try:
+        yield
+    except (CdmisfaError, MemoryError):
+        raise
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise LogDamagedError(f"{path}: FFmpeg cannot read it ({reason})") from None

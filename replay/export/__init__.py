@@ -1,0 +1,12 @@
+"""Runs and recordings for other programs: tables, figures, videos, datasets."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "replay.export.recordings": "export",
+        "replay.export.figures": "draw_figures",
+        "replay.export.history": "read_history",
+    },
+)

@@ -1,0 +1,256 @@
+"""Figures of one run, without a viewer: PNG and SVG in one style, safe for every colour vision."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from recorder.log.logfile import partial_path
+from replay.export.history import History, read_history
+from replay.palette import GREY, VERMILLION, Rgb, colour
+from replay.runs.log import run_log
+
+FOLDER = "figures"
+"""Where the figures of a run go, within its folder."""
+
+INCHES = 7.0
+"""Width of a figure."""
+
+MOST_POINTS = 4000
+"""Points of a scatter plot."""
+
+FOLLOWS = 0.5
+"""Correlation from which on a fit says something."""
+
+Axes = Any
+Float = NDArray[np.float64]
+
+STYLE: dict[Any, Any] = {
+    "font.size": 8.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.0,
+    "legend.frameon": False,
+    "svg.hashsalt": "cdmisfa",
+}
+
+
+def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) -> list[Path]:
+    """Draw every figure of a run, as PNG and as SVG.
+
+    Args:
+        path: the run.
+        out: folder of the figures; by default `figures` in the run's folder.
+        force: replace existing figures.
+
+    Returns:
+        The files.
+
+    Raises:
+        UsageError: there is no such run, or a figure exists and `force` is not set.
+        LogDamagedError: the run cannot be read.
+        CdmisfaError: a figure cannot be written.
+    """
+    log = run_log(path)
+    folder = Path(out) if out is not None else log.parent / FOLDER
+    history = read_history(log)
+    files: list[Path] = []
+    for name, draw in FIGURES.items():
+        targets = [folder / f"{name}.png", folder / f"{name}.svg"]
+        for target in targets:
+            if target.exists() and not force:
+                raise UsageError(f"{target} exists: choose another folder or say --force")
+        with matplotlib.rc_context(STYLE):
+            figure = draw(history)
+            if figure is None:
+                continue
+            for target in targets:
+                _write(figure, target)
+                files.append(target)
+    return files
+
+
+def convergence(history: History) -> Figure | None:
+    """Slowness, its change against delta, and where modules were saved."""
+    if not history.iterations:
+        return None
+    figure, (top, bottom) = _panels(2, heights=(1.0, 1.4))
+    k = np.arange(history.iterations)
+    for j in range(history.eta.shape[1]):
+        label = f" of output {j + 1}" if history.eta.shape[1] > 1 else ""
+        top.plot(k, history.eta[:, j], color=_css(colour(j)), label=f"η{label}")
+        bottom.plot(k, history.eta_dot[:, j], color=_css(colour(j)), label=f"η̇{label}")
+    if history.delta is not None:
+        bottom.axhline(history.delta, color=_css(GREY), linestyle="--", label="δ")
+        settled = history.eta_dot[np.isfinite(history.eta_dot)]
+        if settled.size:
+            bottom.set_ylim(0, max(2.5 * history.delta, float(np.percentile(settled, 95))))
+    for save in history.saved:
+        bottom.plot(save.iteration, save.eta_dot[0], "D", color=_css(VERMILLION), markersize=5)
+        name = f"{save.module}: {history.streams[save.stream]}"
+        where = {"xy": (save.iteration, save.eta_dot[0]), "xytext": (-4, 8)}
+        bottom.annotate(name, textcoords="offset points", ha="right", **where)
+    top.set_ylabel("slowness η\n[cycles/frame]")
+    bottom.set_ylabel("change η̇\n[1/frame]")
+    _finish(bottom)
+    return figure
+
+
+def decision(history: History) -> Figure | None:
+    """What was watched, what staying was worth, the policy, and exploration."""
+    if not history.iterations:
+        return None
+    heights = (1.0, 1.2, 0.4 + 0.2 * len(history.shown), 0.6)
+    figure, (watched, reward, policy, epsilon) = _panels(4, heights=heights)
+    k = np.arange(history.iterations)
+    window = max(min(50, history.iterations // 4), 1)
+    for s in history.shown:
+        share = np.convolve(history.stream == s, np.ones(window) / window, mode="same")
+        watched.plot(k, share, color=_css(colour(s)), label=history.streams[s])
+    for row, s in enumerate(history.shown):
+        reward.plot(k, history.stay_reward[:, row], color=_css(colour(s)), label=history.streams[s])
+        stays = history.policy[:, row] == 0
+        policy.fill_between(
+            k, row - 0.4, row + 0.4, where=stays, step="mid", color=_css(colour(s)), linewidth=0
+        )
+    finite = history.stay_reward[np.isfinite(history.stay_reward)]
+    if finite.size:
+        low, high = np.percentile(finite, (0.5, 99.0))
+        reward.set_ylim(low - 0.1 * (high - low) - 1e-12, high + 0.2 * (high - low) + 1e-12)
+    epsilon.plot(k, np.minimum(history.epsilon, 1.0), color=_css(GREY))
+    epsilon.set_ylim(0, 1.05)
+    watched.set_ylabel(f"share of time\n({window} iterations)")
+    reward.set_ylabel("R for staying")
+    policy.set_yticks(range(len(history.shown)), [history.streams[s] for s in history.shown])
+    policy.set_ylabel("policy: stay")
+    policy.grid(False)
+    epsilon.set_ylabel("random ε")
+    for axes in (watched, reward, policy, epsilon):
+        for save in history.saved:
+            axes.axvline(save.iteration, color=_css(VERMILLION), linewidth=0.8)
+    _finish(epsilon, legends=(watched,))
+    return figure
+
+
+def modules(history: History) -> Figure | None:
+    """Each module's output over time, and against what the world knows about its stream."""
+    if not history.outputs:
+        return None
+    figure = Figure(figsize=(INCHES, 1.7 * len(history.outputs)), layout="constrained")
+    grid = figure.subplots(len(history.outputs), 2, squeeze=False, width_ratios=(2, 1))
+    for (over_time, against), output in zip(grid, history.outputs, strict=True):
+        shade = _css(colour(output.stream))
+        shown = slice(-1000, None)
+        over_time.plot(output.t[shown], output.y[shown], ".", color=shade, markersize=2)
+        over_time.set_ylabel(f"module {output.module}\n{history.streams[output.stream]}")
+        best = output.best_truth()
+        if best is None:
+            against.set_axis_off()
+            continue
+        column, correlation = best
+        truth = output.truth[:, column]
+        step = max(len(truth) // MOST_POINTS, 1)
+        against.plot(truth[::step], output.y[::step], ".", color=shade, markersize=2, alpha=0.4)
+        if abs(correlation) >= FOLLOWS:
+            line = np.linspace(truth.min(), truth.max(), 100)
+            against.plot(line, polynomial_fit(truth, output.y)(line), color="black")
+        against.set_xlabel(history.truth[column])
+        against.set_title(f"|r| = {abs(correlation):.2f}", fontsize=8)
+    grid[-1][0].set_xlabel("frame t (its stream only)")
+    grid[0][0].set_title("output y", fontsize=8)
+    return figure
+
+
+def contact_sheet(history: History) -> Figure | None:
+    """Frames that were watched, with the output of the module of their stream under them."""
+    if not history.pictures:
+        return None
+    figure = Figure(figsize=(INCHES, 1.6 * len(history.pictures)), layout="constrained")
+    heights = (3, 4) * len(history.pictures)
+    grid = figure.subplots(2 * len(history.pictures), 1, squeeze=False, height_ratios=heights)
+    for row, strip in enumerate(history.pictures):
+        above, below = grid[2 * row][0], grid[2 * row + 1][0]
+        images = [frame for _, frame, _ in strip.frames]
+        height, width = images[0].shape
+        gap = np.full((height, max(width // 16, 1)), 255, dtype=np.uint8)
+        above.imshow(
+            np.hstack([part for image in images for part in (image, gap)]),
+            cmap="gray",
+            vmin=0,
+            vmax=255,
+        )
+        above.set_axis_off()
+        step = width + gap.shape[1]
+        centres = width / 2 + step * np.arange(len(images))
+        below.bar(
+            centres, [y for *_, y in strip.frames], width / 2, color=_css(colour(strip.stream))
+        )
+        below.axhline(0, color="black", linewidth=0.5)
+        below.set_xlim(0, step * len(images))
+        below.set_xticks(centres, [f"t = {t}" for t, *_ in strip.frames], fontsize=6)
+        below.set_ylabel(f"module {strip.module}\non {history.streams[strip.stream]}")
+    return figure
+
+
+FIGURES: dict[str, Callable[[History], Figure | None]] = {
+    "convergence": convergence,
+    "decision": decision,
+    "modules": modules,
+    "contact_sheet": contact_sheet,
+}
+"""Name of each figure's files and what draws it."""
+
+
+def polynomial_fit(x: Float, y: Float, degree: int = 3) -> np.polynomial.Polynomial:
+    """The polynomial that fits y at x best; of lower degree where x has few values."""
+    degree = min(degree, len(np.unique(x)) - 1)
+    return np.polynomial.Polynomial.fit(x, y, max(degree, 0))
+
+
+def _panels(count: int, *, heights: tuple[float, ...]) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(INCHES, 1.5 * sum(heights)), layout="constrained")
+    grid = figure.subplots(count, 1, sharex=True, height_ratios=heights)
+    return figure, list(grid)
+
+
+def _finish(last: Axes, legends: tuple[Axes, ...] = ()) -> None:
+    last.set_xlabel("iteration")
+    for axes in legends or (last,):
+        axes.legend(loc="upper right", ncols=4, fontsize=7)
+
+
+def _css(rgb: Rgb) -> tuple[float, float, float]:
+    red, green, blue = rgb
+    return red / 255, green / 255, blue / 255
+
+
+def _write(figure: Figure, target: Path) -> None:
+    """Write one file, whole or not at all, the same bytes every time."""
+    partial = partial_path(target)
+    is_svg = target.suffix == ".svg"
+    canvas: Any = FigureCanvasSVG(figure) if is_svg else FigureCanvasAgg(figure)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if is_svg:
+            canvas.print_svg(partial, metadata={"Date": None})
+        else:
+            figure.set_dpi(150)
+            canvas.print_png(partial)
+        os.replace(partial, target)
+    except OSError as error:
+        raise CdmisfaError(f"{target} cannot be written: {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)

@@ -1,0 +1,272 @@
+"""A recording as a LeRobot dataset, layout v3.0: one episode, its views as videos.
+
+The layout is written as it is published (github.com/huggingface/lerobot), with PyArrow and
+PyAV: the `lerobot` package itself pins a Rerun older than the viewer's and cannot be
+installed beside it. `LeRobotDataset("name", root=FOLDER)` and Rerun open the folder.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+from replay.export.images import has_images, pieces, view_names
+from replay.export.videos import write_film
+from replay.recordings.source import RecordedSource
+
+VERSION = "v3.0"
+FILE = "chunk-000/file-000"
+"""An export is one episode, which is one file of each kind."""
+
+KEY_EVERY = 2
+"""Frames from a key frame to the next, as in LeRobot: training reads single frames."""
+
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+STATE = "observation.environment_state"
+"""What the world knows: LeRobot's name for ground truth."""
+
+ABOUT = """# {name}
+
+A recording of cdmisfa as a LeRobot dataset ({version}): one episode, {frames} frames at {fps}
+frames per second. `meta/info.json` names its features. `{state}` is the ground truth; there
+are no actions, because nothing in the recording was moved by what was seen.
+
+```python
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("cdmisfa/{name}", root="{name}")
+```
+"""
+
+Feature = dict[str, Any]
+Stats = dict[str, NDArray[np.float64]]
+
+
+def write_lerobot(
+    source: RecordedSource, folder: Path, *, name: str = "recording", lossless: bool = False
+) -> int:
+    """Write a recording as a LeRobot dataset.
+
+    Args:
+        source: the recording. Images become videos `observation.images.VIEW`, values
+            `observation.VIEW`; numbers become float32, as LeRobot's own.
+        folder: the dataset's.
+        name: of the dataset, for its card.
+        lossless: keep every value of the images.
+
+    Returns:
+        How many frames.
+
+    Raises:
+        UsageError: the frame rate is not a whole number, which LeRobot's format asks for, or
+            PyAV is not installed.
+        CdmisfaError: a file cannot be written.
+    """
+    fps = round(source.spec.fps)
+    if fps != source.spec.fps or fps < 1:
+        raise UsageError(
+            f"LeRobot knows whole frame rates only, not {source.spec.fps:g} per second: "
+            "change it with cdmisfa convert --rate"
+        )
+    columns, features = _columns(source, fps)
+    stats = {key: _number_stats(column) for key, column in columns.items()}
+    if has_images(source.spec):
+        for stream, view in enumerate(view_names(source.spec)):
+            key = f"observation.images.{view}"
+            file = _place(folder / "videos" / key, "mp4")
+            write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY)
+            features[key] = _video_feature(source.spec.frame_shape, fps)
+            stats[key] = _image_stats(source, stream)
+    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
+    task = f"what {source.scene().get('scene', 'a recording')} shows"
+    pq.write_table(_table(columns, features), _place(folder / "data", "parquet"))
+    pq.write_table(_episode(source.frames, fps, task, videos, stats), _episodes_file(folder))
+    pq.write_table(_tasks(task), folder / "meta" / "tasks.parquet")
+    _write_json(folder / "meta" / "info.json", _info(source.frames, fps, features))
+    _write_json(folder / "meta" / "stats.json", _as_lists(stats))
+    card = ABOUT.format(name=name, version=VERSION, frames=source.frames, fps=fps, state=STATE)
+    (folder / "README.md").write_text(card, "utf-8")
+    return source.frames
+
+
+def _columns(
+    source: RecordedSource, fps: int
+) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
+    """All numbers, (n,) or (n, k), and what they are."""
+    spec, n = source.spec, source.frames
+    columns: dict[str, NDArray[Any]] = {}
+    features: dict[str, Feature] = {}
+
+    def add(key: str, values: NDArray[Any], names: list[str] | None) -> None:
+        values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+        shape = list(values.shape[1:]) or [1]
+        columns[key] = values
+        features[key] = {"dtype": str(values.dtype), "shape": shape, "names": names}
+
+    if spec.truth:
+        truth = np.concatenate([block.truth for block in pieces(source, 0)])
+        add(STATE, truth.astype(np.float32), list(spec.truth))
+    if not has_images(spec):
+        for stream, view in enumerate(view_names(spec)):
+            frames = np.concatenate([block.frames for block in pieces(source, stream)])
+            names = [f"x{i + 1}" for i in range(frames.shape[1])]
+            add(f"observation.{view}", frames.astype(np.float32), names)
+    index, zero = np.arange(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    add("timestamp", (index / fps).astype(np.float32), None)
+    add("frame_index", index, None)
+    add("episode_index", zero, None)
+    add("index", index, None)
+    add("task_index", zero, None)
+    return columns, features
+
+
+def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
+    height, width = shape
+    even = height % 2 == 0 and width % 2 == 0
+    return {
+        "dtype": "video",
+        "shape": [height, width, 3],
+        "names": ["height", "width", "channels"],
+        "info": {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": "h264",
+            "video.pix_fmt": "yuv420p" if even else "yuv444p",
+            "video.is_depth_map": False,
+            "video.fps": fps,
+            "video.channels": 3,
+            "has_audio": False,
+        },
+    }
+
+
+def _number_stats(values: NDArray[Any]) -> Stats:
+    rows = values.astype(np.float64).reshape(len(values), -1)
+    return {
+        "min": rows.min(axis=0),
+        "max": rows.max(axis=0),
+        "mean": rows.mean(axis=0),
+        "std": rows.std(axis=0),
+        "count": np.array([len(rows)]),
+        **{key: np.quantile(rows, q, axis=0) for key, q in QUANTILES.items()},
+    }
+
+
+def _image_stats(source: RecordedSource, stream: int) -> Stats:
+    """Statistics of a view's pixels from 0 to 1, (3, 1, 1) each, from how often each value is."""
+    counts = np.zeros(256, dtype=np.int64)
+    for block in pieces(source, stream):
+        counts += np.bincount(block.frames.reshape(-1), minlength=256)
+    levels, total = np.arange(256) / 255, counts.sum()
+    seen, below = levels[counts > 0], np.cumsum(counts)
+    mean = (levels * counts).sum() / total
+    found = {
+        "min": seen[0],
+        "max": seen[-1],
+        "mean": mean,
+        "std": np.sqrt(((levels - mean) ** 2 * counts).sum() / total),
+        **{key: levels[np.searchsorted(below, q * total)] for key, q in QUANTILES.items()},
+    }
+    stats = {key: np.full((3, 1, 1), value) for key, value in found.items()}
+    return {**stats, "count": np.array([source.frames])}
+
+
+def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature]) -> pa.Table:
+    arrays = {}
+    for key, values in columns.items():
+        flat = pa.array(np.ascontiguousarray(values).reshape(-1))
+        width = features[key]["shape"][0]
+        arrays[key] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+    return pa.table(arrays)
+
+
+def _episode(
+    frames: int, fps: int, task: str, videos: list[str], stats: Mapping[str, Stats]
+) -> pa.Table:
+    """The one row of the table of episodes."""
+    row: dict[str, Any] = {
+        "episode_index": 0,
+        "tasks": [task],
+        "length": frames,
+        "data/chunk_index": 0,
+        "data/file_index": 0,
+        "dataset_from_index": 0,
+        "dataset_to_index": frames,
+    }
+    for key in videos:
+        row |= {
+            f"videos/{key}/chunk_index": 0,
+            f"videos/{key}/file_index": 0,
+            f"videos/{key}/from_timestamp": 0.0,
+            f"videos/{key}/to_timestamp": frames / fps,
+        }
+    for key, values in _as_lists(stats).items():
+        row |= {f"stats/{key}/{name}": value for name, value in values.items()}
+    row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+    return pa.Table.from_pylist([row])
+
+
+def _tasks(task: str) -> pa.Table:
+    """The table of tasks as pandas writes it: the text is the index of the row."""
+    index = "__index_level_0__"
+    text = {"name": None, "field_name": index, "pandas_type": "unicode", "metadata": None}
+    number = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64"}
+    pandas = {
+        "index_columns": [index],
+        "column_indexes": [],
+        "columns": [
+            {**number, "numpy_type": "int64", "metadata": None},
+            {**text, "numpy_type": "object"},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table({"task_index": pa.array([0], pa.int64()), index: pa.array([task])})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+
+def _info(frames: int, fps: int, features: Mapping[str, Feature]) -> dict[str, Any]:
+    place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+    videos = any(feature["dtype"] == "video" for feature in features.values())
+    return {
+        "codebase_version": VERSION,
+        "robot_type": None,
+        "total_episodes": 1,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": "0:1"},
+        "data_path": f"data/{place}.parquet",
+        "video_path": f"videos/{{video_key}}/{place}.mp4" if videos else None,
+        "features": features,
+    }
+
+
+def _as_lists(stats: Mapping[str, Stats]) -> dict[str, dict[str, Any]]:
+    return {k: {name: value.tolist() for name, value in v.items()} for k, v in stats.items()}
+
+
+def _episodes_file(folder: Path) -> Path:
+    return _place(folder / "meta" / "episodes", "parquet")
+
+
+def _place(folder: Path, ending: str) -> Path:
+    file = folder / f"{FILE}.{ending}"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return file
+
+
+def _write_json(file: Path, document: Mapping[str, Any]) -> None:
+    file.write_text(json.dumps(document, indent=4), "utf-8")

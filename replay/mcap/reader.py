@@ -1,0 +1,573 @@
+"""Reading any MCAP file, strictly: whole or cut, with or without an index.
+
+`LogReader` gives every message that is there, in the order of log time (ties in file
+order), and never one whose checksum does not match. Memory holds a few chunks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError
+from replay.mcap.ordering import overlapping, within
+from replay.mcap.records import (
+    INDEX_HEADER,
+    MAX_CHUNK,
+    Channel,
+    MalformedRecord,
+    Schema,
+    Statistics,
+    decompress,
+    decompress_prefix,
+)
+from replay.mcap.segments import Attachment, Metadata, Segment
+from replay.mcap.summary import confirm
+from replay.mcap.tables import MessageTable, indexed_table, walked_table
+from replay.mcap.walk import Structure
+from replay.storage.checksum import crc32
+from replay.storage.location import Location, Url, location
+from replay.storage.store import RandomFile
+
+CACHE_BYTES: Final = 32 * 1024 * 1024
+"""Decoded chunks that are kept, unless told otherwise; one is always."""
+
+Crc = Literal["ok", "absent", "bad", "unchecked"]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A damage: where it is, and what it is."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a log; times in nanoseconds."""
+
+    channel: Channel
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class LogReader:
+    """An MCAP file, read by its content and not by what its index claims.
+
+    Damage is an error that names the file, the chunk and its time range. With
+    `salvage` the damaged chunk is left out and noted in `problems` instead, and the
+    unverifiable part of a chunk in which the file ends is read too. Of a URL only what is
+    asked for is read, as far as its summary accounts for every message.
+
+    Attributes:
+        path: the file.
+        problems: what was found damaged and left out (with `salvage`), and an index that
+            contradicts its chunk.
+    """
+
+    def __init__(
+        self,
+        path: str | Location,
+        *,
+        salvage: bool = False,
+        cache_bytes: int | None = None,
+    ) -> None:
+        """Open a log and walk over its structure.
+
+        Args:
+            path: the file, or its URL.
+            salvage: go on over damage.
+            cache_bytes: decoded chunks that are kept.
+
+        Raises:
+            UsageError: it cannot be opened.
+            LogDamagedError: not an MCAP file, or its structure is damaged.
+        """
+        self.path = location(path)
+        self.salvage = salvage
+        self.problems: list[Problem] = []
+        self._failed: set[int] = set()
+        self._cache: OrderedDict[int, MessageTable] = OrderedDict()
+        self._cached = 0
+        self._cache_bytes = CACHE_BYTES if cache_bytes is None else cache_bytes
+        self._defined = 0
+        self._searched = False
+        self._file = RandomFile(self.path)
+        try:
+            by_index = isinstance(self.path, Url)
+            self._structure = Structure(self._file, self._refuse, by_index=by_index)
+            self._time_tail()
+            self._check_data_crc()
+        except MalformedRecord as error:
+            self.close()
+            raise LogDamagedError(f"{self.path}: {error}") from None
+        except BaseException:
+            self.close()
+            raise
+
+    # What the file holds
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._file.size
+
+    @property
+    def by_index(self) -> bool:
+        """Whether only the summary was read, and no chunk before it is asked for."""
+        return self._structure.by_index
+
+    @property
+    def profile(self) -> str:
+        """The writer's profile, as "ros2"."""
+        return self._structure.profile
+
+    @property
+    def library(self) -> str:
+        """What wrote the file."""
+        return self._structure.library
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file has its end."""
+        return self._structure.complete
+
+    @property
+    def missing(self) -> str:
+        """What a file that was cut lacks, in words; "" for a whole one."""
+        structure = self._structure
+        if structure.tail is not None and not self.salvage and structure.tail.crc:
+            return f"{structure.missing}; recover can save part of the last chunk, unverified"
+        return structure.missing
+
+    @property
+    def data_complete(self) -> bool:
+        """Whether every message is there, if not the summary behind them."""
+        return self._structure.data_crc is not None
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """What the summary says the file holds."""
+        return self._structure.statistics
+
+    @property
+    def segments(self) -> list[Segment]:
+        """Chunks and runs of messages outside chunks, in file order."""
+        tail = self._structure.tail
+        if tail is None or (tail.crc and not self.salvage):
+            return self._structure.segments
+        return [*self._structure.segments, tail]
+
+    @property
+    def metadata(self) -> list[Metadata]:
+        """The metadata records."""
+        return self._structure.metadata
+
+    @property
+    def attachments(self) -> list[Attachment]:
+        """The attachments; their CRCs were checked."""
+        try:
+            self._structure.load_attachments()
+        except MalformedRecord as error:
+            self._refuse("attachments", str(error))
+        return self._structure.attachments
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Every channel of the file; reads the chunks where nothing else names them."""
+        self._define()
+        return self._structure.definitions.channels
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Every schema of the file; reads the chunks where nothing else names them."""
+        self._define()
+        return self._structure.definitions.schemas
+
+    def attachment_data(self, attachment: Attachment) -> bytes:
+        """Read an attachment's bytes.
+
+        Raises:
+            LogDamagedError: it is larger than is read at once.
+        """
+        if attachment.size > MAX_CHUNK:
+            raise LogDamagedError(
+                f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
+                f"above the limit of {MAX_CHUNK}"
+            )
+        return self._file.read(attachment.offset, attachment.size)
+
+    def digest(self) -> str:
+        """SHA-256 of the file; where only the summary was read, from its data's end on."""
+        whole = hashlib.sha256()
+        for block in self._file.blocks(self._structure.data_end if self.by_index else 0, self.size):
+            whole.update(block)
+        return whole.hexdigest()
+
+    def crc_absent(self) -> int:
+        """Count the chunks and runs of messages that no CRC protects."""
+        if self._structure.data_crc:
+            return 0
+        return sum(1 for s in self.segments if s.crc == 0 and s.size)
+
+    # Messages
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        start: int | None = None,
+        stop: int | None = None,
+        ordered: bool = True,
+    ) -> Iterator[Message]:
+        """Give the messages by log time, ties in file order.
+
+        Args:
+            topics: only these; None for all.
+            start: from this log time on, in nanoseconds.
+            stop: up to before this log time.
+            ordered: by log time; otherwise in file order.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        tables = self.tables(start=start, stop=stop, ordered=ordered, topics=topics)
+        for segment, table in tables:
+            numbers = np.unique(table.channel)
+            known = {int(c): self._channel(int(c), segment) for c in numbers}
+            wanted = {
+                c: k
+                for c, k in known.items()
+                if k is not None and (topics is None or k.topic in topics)
+            }
+            data = memoryview(table.data.data)
+            for number, sequence, log_time, publish_time, at, size in zip(
+                table.channel.tolist(),
+                table.headers["sequence"].tolist(),
+                table.log_time.tolist(),
+                table.headers["publish_time"].tolist(),
+                table.at.tolist(),
+                table.size.tolist(),
+                strict=True,
+            ):
+                if number in wanted:
+                    yield Message(
+                        wanted[number],
+                        sequence,
+                        log_time,
+                        publish_time,
+                        bytes(data[at : at + size]),
+                    )
+
+    def tables(
+        self,
+        *,
+        start: int | None = None,
+        stop: int | None = None,
+        ordered: bool = True,
+        topics: Collection[str] | None = None,
+    ) -> Iterator[tuple[Segment, MessageTable]]:
+        """Give the messages chunk by chunk as columns, in the order of `messages`.
+
+        Chunks whose times overlap come in pieces. Of a URL, chunks without any of `topics`
+        are left out.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        low, high = start or 0, 2**64 if stop is None else stop
+        segments = list(enumerate(self.segments))
+        chosen = [(i, s) for i, s in segments if s.end >= low and s.start < high]
+        if self.by_index:
+            numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
+            chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
+        self.expect([s for _, s in chosen])
+        groups = overlapping(chosen) if ordered else [[pair] for pair in chosen]
+        for group in groups:
+            if len(group) > 1:
+                yield from self._merged(group, low, high)
+                continue
+            table = self.table(group[0][1])
+            if table is None:
+                continue
+            if ordered and (table.log_time[1:] < table.log_time[:-1]).any():
+                table = table.select(np.argsort(table.log_time, kind="stable"))
+            yield group[0][1], within(table, low, high)
+
+    def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
+        """Say which chunks will be read, one after the other, so that they come in time.
+
+        Args:
+            segments: the chunks.
+            indexes: only their message indexes.
+        """
+        spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
+        self._file.expect(list(spans))
+
+    def table(self, segment: Segment) -> MessageTable | None:
+        """Decode a chunk and check it; the last few are kept.
+
+        Returns:
+            Its messages in file order, or None where it is damaged and `salvage` is on.
+
+        Raises:
+            LogDamagedError: it is damaged, without `salvage`.
+        """
+        key = segment.offset
+        if key in self._cache:
+            self._cache.move_to_end(key)
+            return self._cache[key]
+        if key in self._failed:
+            return None
+        if segment.size <= MAX_CHUNK:
+            self._make_room(segment.size)
+        try:
+            table = self._decode(segment)
+        except MalformedRecord as error:
+            self._failed.add(key)
+            self._refuse(segment.name, str(error))
+            return None
+        self._cache[key] = table
+        self._cached += len(table.data)
+        return table
+
+    def index(self, segment: Segment) -> list[tuple[int, NDArray[np.uint64]]]:
+        """Read a chunk's message indexes: channel, and (n, 2) of log time and offset.
+
+        Raises:
+            MalformedRecord: they are larger than any chunk.
+        """
+        if not segment.indexes:
+            return []
+        first, last = segment.indexes[0].offset, segment.indexes[-1]
+        size = last.offset + 16 * last.count - first
+        if size > MAX_CHUNK:
+            raise MalformedRecord("its message index is larger than any chunk")
+        raw = self._file.read(first, size)
+        return [
+            (
+                part.channel,
+                np.frombuffer(raw, "<u8", 2 * part.count, part.offset - first).reshape(-1, 2),
+            )
+            for part in segment.indexes
+        ]
+
+    def stored(self, segment: Segment) -> tuple[memoryview, memoryview]:
+        """Read a chunk's records as they stand in the file, and its message index records.
+
+        Raises:
+            MalformedRecord: together they are larger than any chunk.
+        """
+        if segment.stated:
+            confirm(self._file, segment)
+        first, stop = segment.indexes[0].offset - INDEX_HEADER, segment.stop
+        if stop - segment.data_offset > 2 * MAX_CHUNK:
+            raise MalformedRecord("its message index is larger than any chunk")
+        raw = memoryview(self._file.read(segment.data_offset, stop - segment.data_offset))
+        return raw[: segment.stored], raw[first - segment.data_offset :]
+
+    def check(self) -> None:
+        """Decode every chunk, so that every checksum and length is checked."""
+        for segment in self.segments:
+            self.table(segment)
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return self._file.is_at(path)
+
+    def refresh(self) -> bool:
+        """Look for what a recorder wrote since; whether the file grew.
+
+        What was read before is not read again, but for one pass over a file that got its end,
+        whose checksum says whether all of it is as it was.
+
+        Raises:
+            LogDamagedError: what was written is damaged.
+        """
+        if self.complete or not self._file.grow():
+            return False
+        try:
+            kept = self._structure.go_on()
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self.path}: {error}") from None
+        self._forget({segment.offset for segment in self._structure.segments[:kept]})
+        self._defined = min(self._defined, kept)
+        self._time_tail()
+        self._check_data_crc()
+        return True
+
+    def close(self) -> None:
+        """Let go of the file; harmless when called twice."""
+        self._file.close()
+        self._forget()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # Inside
+
+    def _forget(self, but: Collection[int] = ()) -> None:
+        """Let go of the chunks that were decoded, but those at some places of the file."""
+        for key in self._cache.keys() - set(but):
+            self._cached -= len(self._cache.pop(key).data)
+        self._failed &= set(but)
+        self._defined = self._defined if but else 0
+        self._searched = False
+
+    def _refuse(self, where: str, what: str) -> None:
+        if not self.salvage:
+            raise LogDamagedError(
+                f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
+                "recording, cdmisfa learn --salvage learns without it)"
+            )
+        problem = Problem(where, what)
+        if problem not in self.problems:
+            self.problems.append(problem)
+
+    def _time_tail(self) -> None:
+        """Find the times of a chunk that was still open, whose header states none."""
+        tail = self._structure.tail
+        if tail is not None and tail in self.segments:
+            table = self.table(tail)
+            if table is not None and len(table):
+                tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
+
+    def _check_data_crc(self) -> None:
+        structure = self._structure
+        if not structure.data_crc or structure.by_index:
+            return
+        if self._file.crc(0, structure.data_end) == structure.data_crc:
+            return
+        if not self.salvage:
+            self.check()
+        self._refuse("data section", "its CRC does not match: damaged")
+
+    def _make_room(self, size: int) -> None:
+        while self._cache and self._cached + size > self._cache_bytes:
+            _, old = self._cache.popitem(last=False)
+            self._cached -= len(old.data)
+
+    def _decode(self, segment: Segment) -> MessageTable:
+        if segment.stated:
+            confirm(self._file, segment)
+        stored = self._file.read(segment.data_offset, segment.stored)
+        if segment.cut:
+            raw = decompress_prefix(stored, segment.compression, min(segment.size, MAX_CHUNK))
+            table, definitions = walked_table(raw, cut=True)
+        else:
+            raw = decompress(stored, segment.compression, segment.size)
+            if segment.crc and crc32(raw) != segment.crc:
+                raise MalformedRecord("its CRC does not match: damaged")
+            table, definitions = self._table_of(segment, raw)
+            self._check_times(segment, table)
+        del stored
+        for opcode, start, stop in definitions:
+            self._structure.definitions.add(opcode, raw[start:stop], segment.name)
+        return table
+
+    def _table_of(
+        self, segment: Segment, raw: bytes
+    ) -> tuple[MessageTable, list[tuple[int, int, int]]]:
+        if segment.indexes:
+            try:
+                return indexed_table(raw, self.index(segment))
+            except MalformedRecord as error:
+                found = walked_table(raw)
+                problem = Problem(segment.name, f"{error} (the index is not used)")
+                if problem not in self.problems:
+                    self.problems.append(problem)
+                return found
+        return walked_table(raw)
+
+    def _check_times(self, segment: Segment, table: MessageTable) -> None:
+        if len(table) and not (
+            segment.start <= int(table.log_time.min()) and int(table.log_time.max()) <= segment.end
+        ):
+            raise MalformedRecord("it holds messages outside the time range it states")
+
+    def _channel(self, number: int, segment: Segment) -> Channel | None:
+        definitions = self._structure.definitions
+        for look in (None, self._define, self._search):
+            if look is not None:
+                look()
+            channel = definitions.channels.get(number)
+            if channel and (not channel.schema_id or channel.schema_id in definitions.schemas):
+                return channel
+        if channel is None:
+            self._refuse(segment.name, f"it holds messages of channel {number}, never defined")
+        else:
+            self._refuse(
+                segment.name, f"schema {channel.schema_id} of {channel.topic!r} is never defined"
+            )
+        return channel
+
+    def _define(self) -> None:
+        """Decode chunks until every channel that has messages is known."""
+        known = self._structure.definitions.channels
+        segments = self.segments
+        if self._defined == len(segments):
+            return
+        counted: set[int] = set()
+        while self._defined < len(segments):
+            segment = segments[self._defined]
+            counts = segment.channel_counts()
+            if counts is None or not counts.keys() <= known.keys():
+                self.table(segment)
+            counted.update(counts or ())
+            self._defined += 1
+        schemas = {0, *self._structure.definitions.schemas}
+        if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
+            self._search()
+
+    def _search(self) -> None:
+        """Decode every chunk: a definition may stand in one that holds no message of it."""
+        if not self._searched:
+            self._searched = True
+            for segment in self.segments:
+                self.table(segment)
+
+    def _merged(
+        self, group: list[tuple[int, Segment]], low: int, high: int
+    ) -> Iterator[tuple[Segment, MessageTable]]:
+        times: list[NDArray[np.uint64]] = []
+        members: list[NDArray[np.int64]] = []
+        rows: list[NDArray[np.int64]] = []
+        for member, (_, segment) in enumerate(group):
+            table = self.table(segment)
+            if table is not None:
+                times.append(table.log_time)
+                members.append(np.full(len(table), member))
+                rows.append(np.arange(len(table)))
+        if not times:
+            return
+        order = np.argsort(np.concatenate(times), kind="stable")
+        member_of, row_of = np.concatenate(members)[order], np.concatenate(rows)[order]
+        changes = np.flatnonzero(np.diff(member_of)) + 1
+        for piece_members, piece_rows in zip(
+            np.split(member_of, changes), np.split(row_of, changes), strict=True
+        ):
+            if not len(piece_members):
+                continue
+            segment = group[int(piece_members[0])][1]
+            table = self.table(segment)
+            if table is not None:
+                yield segment, within(table.select(piece_rows), low, high)

@@ -1,0 +1,303 @@
+"""MCAP's records as bytes: what a log may contain, with every length checked.
+
+Nothing here trusts a length, count or text of the file. Whoever reads a file turns
+`MalformedRecord` into an error that names it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+import lz4.frame
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+RECORD_HEADER: Final = struct.Struct("<BQ")
+MAX_CHUNK: Final = 192 * 1024 * 1024
+"""Largest decompressed chunk, in bytes, that is read; asked for before decompressing."""
+MAX_DEFINITION: Final = 64 * 1024 * 1024
+"""Largest schema, channel or metadata record, in bytes, that is read."""
+
+MESSAGE_HEADER: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+INDEX_HEADER: Final = RECORD_HEADER.size + 6
+"""Bytes before the pairs of a message index."""
+MESSAGE_FIELDS: Final = MESSAGE_HEADER.itemsize - RECORD_HEADER.size
+
+Bytes = NDArray[np.uint8]
+
+
+class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where
+    """Bytes that are not what MCAP says they are; the reader adds file and place."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """How messages of a channel are to be decoded."""
+
+    id: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A stream of messages on a topic; `schema_id` 0 has no schema."""
+
+    id: int
+    schema_id: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str] = field(hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHeader:
+    """What stands before the messages of a chunk; `size` is decompressed, `stored` is not."""
+
+    start: int
+    end: int
+    size: int
+    crc: int
+    compression: str
+    stored: int
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """What the writer says the file holds."""
+
+    messages: int
+    schemas: int
+    channels: int
+    attachments: int
+    metadata: int
+    chunks: int
+    start: int
+    end: int
+    per_channel: dict[int, int] = field(hash=False)
+
+
+class Fields:
+    """The fields of one record, taken one after the other within its bounds."""
+
+    def __init__(self, data: bytes | memoryview, what: str) -> None:
+        self.data = memoryview(data)
+        self.what = what
+        self.at = 0
+
+    def take(self, count: int) -> memoryview:
+        """Take the next `count` bytes."""
+        if count > len(self.data) - self.at:
+            raise MalformedRecord(
+                f"{self.what} is cut short or lies about a length ({count} bytes wanted, "
+                f"{len(self.data) - self.at} there)"
+            )
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def integer(self, width: int) -> int:
+        """Take an unsigned little-endian number of `width` bytes."""
+        return int.from_bytes(self.take(width), "little")
+
+    def text(self) -> str:
+        """Take a text with its length in front."""
+        raw = self.take(self.integer(4))
+        try:
+            return str(raw, "utf-8")
+        except UnicodeDecodeError:
+            raise MalformedRecord(f"{self.what} holds a text that is not UTF-8") from None
+
+    def texts(self) -> dict[str, str]:
+        """Take a map of texts.
+
+        Raises:
+            MalformedRecord: a key stands twice, so that readers would disagree.
+        """
+        inner = Fields(self.take(self.integer(4)), self.what)
+        result: dict[str, str] = {}
+        while inner.at < len(inner.data):
+            key = inner.text()
+            if key in result:
+                raise MalformedRecord(f"{self.what} holds the key {key[:80]!r} twice")
+            result[key] = inner.text()
+        return result
+
+
+def schema(content: bytes | memoryview) -> Schema:
+    """Parse a Schema record."""
+    fields = Fields(content, "a schema")
+    number = fields.integer(2)
+    if number == 0:
+        raise MalformedRecord("a schema has the id 0, which stands for none")
+    return Schema(number, fields.text(), fields.text(), bytes(fields.take(fields.integer(4))))
+
+
+def channel(content: bytes | memoryview) -> Channel:
+    """Parse a Channel record."""
+    fields = Fields(content, "a channel")
+    return Channel(
+        fields.integer(2), fields.integer(2), fields.text(), fields.text(), fields.texts()
+    )
+
+
+def chunk_header(content: bytes | memoryview) -> ChunkHeader:
+    """Parse what stands before a chunk's data; `length` is the size of that part."""
+    fields = Fields(content, "a chunk")
+    start, end, size = fields.integer(8), fields.integer(8), fields.integer(8)
+    crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
+    return ChunkHeader(start, end, size, crc, compression, stored, fields.at)
+
+
+def statistics(content: bytes | memoryview) -> Statistics:
+    """Parse a Statistics record."""
+    fields = Fields(content, "the statistics")
+    messages, schemas, channels = fields.integer(8), fields.integer(2), fields.integer(4)
+    attachments, metadata, chunks = fields.integer(4), fields.integer(4), fields.integer(4)
+    start, end = fields.integer(8), fields.integer(8)
+    raw = fields.take(fields.integer(4))
+    if len(raw) % 10:
+        raise MalformedRecord("the statistics hold a broken count per channel")
+    counts = np.frombuffer(raw, np.dtype([("channel", "<u2"), ("messages", "<u8")]))
+    per_channel = {int(row["channel"]): int(row["messages"]) for row in counts}
+    return Statistics(
+        messages, schemas, channels, attachments, metadata, chunks, start, end, per_channel
+    )
+
+
+def message_index(content: bytes | memoryview) -> tuple[int, NDArray[np.uint64]]:
+    """Parse a MessageIndex record.
+
+    Returns:
+        The channel, and (n, 2) of log time and place in the decompressed chunk.
+    """
+    fields = Fields(content, "a message index")
+    number = fields.integer(2)
+    raw = fields.take(fields.integer(4))
+    if len(raw) % 16:
+        raise MalformedRecord("a message index is not made of pairs")
+    return number, np.frombuffer(raw, "<u8").reshape(-1, 2)
+
+
+def decompress(stored: bytes, compression: str, size: int) -> bytes:
+    """Give the records of a chunk.
+
+    Raises:
+        MalformedRecord: an unknown compression, more than `MAX_CHUNK` bytes, broken data,
+            or another number of bytes than the `size` the chunk states.
+    """
+    check_size(compression, size)
+    if compression == "":
+        data = stored
+    elif compression == "zstd":
+        data = _decompress_zstd(stored, size)
+    else:
+        data = _decompress_lz4(stored, size)
+    if len(data) != size:
+        raise MalformedRecord(f"it states {size} bytes decompressed and holds {len(data)}")
+    return data
+
+
+def check_size(compression: str, size: int) -> None:
+    """Refuse a chunk that cannot or must not be decompressed."""
+    if compression not in ("", "zstd", "lz4"):
+        raise MalformedRecord(f"its compression {compression[:40]!r} is unknown")
+    if size > MAX_CHUNK:
+        raise MalformedRecord(
+            f"it states {size} bytes decompressed, above the limit of {MAX_CHUNK} bytes"
+        )
+
+
+def decompress_prefix(stored: bytes, compression: str, size: int) -> bytes:
+    """Give what can be decompressed of a chunk that was cut short."""
+    check_size(compression, size)
+    if compression == "":
+        return stored[:size]
+    try:
+        if compression == "lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size))
+        parts: list[bytes] = []
+        held = 0
+        reader = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2).stream_reader(stored)
+        try:
+            while held < size and (part := reader.read(min(size - held, 1 << 17))):
+                parts.append(part)
+                held += len(part)
+        except zstandard.ZstdError:
+            if not parts:
+                raise
+        return b"".join(parts)
+    except (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError) as error:
+        raise MalformedRecord(f"its {compression} data is broken ({error})") from None
+
+
+def _decompress_zstd(stored: bytes, size: int) -> bytes:
+    try:
+        stated = zstandard.frame_content_size(stored)
+        if stated in (-1, size):
+            data: bytes = zstandard.ZstdDecompressor().decompress(
+                stored, max_output_size=max(size, 1), allow_extra_data=True
+            )
+            if len(data) == size:
+                return data
+        elif stated > size:
+            raise MalformedRecord(f"it states {size} bytes decompressed, its data {stated}")
+        reader = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2).stream_reader(
+            stored, read_across_frames=True
+        )
+        return reader.read(size + 1)
+    except (zstandard.ZstdError, ValueError, MemoryError) as error:
+        raise MalformedRecord(f"its zstd data is broken ({error})") from None
+
+
+def _decompress_lz4(stored: bytes, size: int) -> bytes:
+    try:
+        stated = lz4.frame.get_frame_info(stored)["content_size"]
+        if stated not in (0, size):
+            raise MalformedRecord(f"it states {size} bytes decompressed, its data {stated}")
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = bytes(decompressor.decompress(stored, max_length=size + 1))
+    except (RuntimeError, ValueError, MemoryError, EOFError) as error:
+        raise MalformedRecord(f"its lz4 data is broken ({error})") from None
+    if not decompressor.eof and len(data) <= size:
+        raise MalformedRecord("its lz4 data is cut short")
+    return data
+
+
+def walk(data: bytes, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, int, int]]:
+    """Each record within a chunk as (opcode, place of its first byte, place after its last).
+
+    Raises:
+        MalformedRecord: a record runs over the end, or the opcode 0.
+    """
+    stop = len(data) if stop is None else stop
+    unpack = RECORD_HEADER.unpack_from
+    at = start
+    while at < stop:
+        if stop - at < RECORD_HEADER.size:
+            raise MalformedRecord(f"{stop - at} bytes at its end are no record")
+        opcode, length = unpack(data, at)
+        end = at + RECORD_HEADER.size + length
+        if end > stop:
+            raise MalformedRecord(f"a record at {at} runs {end - stop} bytes over its end")
+        if opcode == 0:
+            raise MalformedRecord(f"no record at {at} (opcode 0)")
+        yield opcode, at, end
+        at = end

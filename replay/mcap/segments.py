@@ -1,0 +1,133 @@
+"""What a log is made of: its chunks, definitions, metadata and attachments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from mcap.opcode import Opcode
+
+from replay.mcap.records import MAX_DEFINITION, Channel, MalformedRecord, Schema, channel, schema
+
+Refuse = Callable[[str, str], None]
+"""Takes (where, what) of a damage: raises, or notes it where the caller wants to go on."""
+
+
+@dataclass(frozen=True, slots=True)
+class IndexPart:
+    """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
+
+    channel: int
+    offset: int
+    count: int
+
+
+@dataclass(slots=True)
+class Segment:
+    """A chunk, or a run of messages outside chunks.
+
+    Attributes:
+        offset: place in the file of its first record.
+        data_offset: place in the file of its (compressed) records.
+        stored: bytes there.
+        size: bytes once decompressed.
+        crc: CRC-32 of the decompressed bytes, 0 where the writer gave none.
+        start: log time of its earliest message.
+        end: log time of its latest message.
+        indexes: the chunk's message indexes.
+        counts: messages of each channel where a walk counted them.
+        cut: the file ends within it.
+        stated: only the summary speaks of it, its own header was not read.
+    """
+
+    offset: int
+    data_offset: int
+    stored: int
+    size: int
+    compression: str
+    crc: int
+    start: int
+    end: int
+    chunked: bool
+    indexes: list[IndexPart] = field(default_factory=list)
+    counts: dict[int, int] | None = None
+    cut: bool = False
+    stated: bool = False
+
+    @property
+    def stop(self) -> int:
+        """Place in the file after its message indexes."""
+        ends = (part.offset + 16 * part.count for part in self.indexes)
+        return max(ends, default=self.data_offset + self.stored)
+
+    @property
+    def name(self) -> str:
+        """How an error names it."""
+        kind = "chunk" if self.chunked else "messages"
+        return f"{kind} at byte {self.offset} (log time {self.start} to {self.end} ns)"
+
+    def channel_counts(self) -> dict[int, int] | None:
+        """Messages of each channel, or None where only decoding can tell."""
+        if self.counts is not None:
+            return self.counts
+        if not self.indexes:
+            return {} if self.size == 0 else None
+        counts: dict[int, int] = {}
+        for part in self.indexes:
+            counts[part.channel] = counts.get(part.channel, 0) + part.count
+        return counts
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """A named map of texts."""
+
+    name: str
+    values: dict[str, str] = field(hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file within the log; `offset` and `size` are those of its bytes."""
+
+    name: str
+    media_type: str
+    log_time: int
+    create_time: int
+    offset: int
+    size: int
+    crc: int
+
+
+class Definitions:
+    """The schemas and channels of a log; an id has one meaning."""
+
+    def __init__(self, refuse: Refuse) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._refuse = refuse
+        self._seen: set[tuple[int, bytes]] = set()
+        self._bytes = 0
+
+    def add(self, opcode: int, content: bytes, where: str) -> None:
+        """Take a Schema or Channel record in.
+
+        Raises:
+            MalformedRecord: it is broken.
+            LogDamagedError: its id already means something else.
+        """
+        key = (opcode, content)
+        if key in self._seen:
+            return
+        self._bytes += len(content)
+        if self._bytes > MAX_DEFINITION:
+            raise MalformedRecord(f"schemas and channels take more than {MAX_DEFINITION} bytes")
+        if opcode == Opcode.SCHEMA:
+            new = schema(content)
+            if self.schemas.setdefault(new.id, new) != new:
+                self._refuse(where, f"schema {new.id} is defined twice with different content")
+        else:
+            other = channel(content)
+            if self.channels.setdefault(other.id, other) != other:
+                self._refuse(where, f"channel {other.id} is defined twice with different content")
+        self._seen.add(key)

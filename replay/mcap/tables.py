@@ -1,0 +1,171 @@
+"""The messages of a chunk as columns: found by its message index or a walk, checked either way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from replay.mcap.records import (
+    MESSAGE_FIELDS,
+    MESSAGE_HEADER,
+    RECORD_HEADER,
+    Bytes,
+    MalformedRecord,
+    walk,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTable:
+    """The messages of one chunk in file order, one row each.
+
+    Attributes:
+        data: (B,) uint8, the chunk's decompressed records.
+        headers: (n,) of `MESSAGE_HEADER`: channel, sequence and times in nanoseconds.
+        at: (n,) int64, place of the payload in `data`.
+        size: (n,) int64, bytes of the payload.
+    """
+
+    data: Bytes
+    headers: NDArray[np.void]
+    at: NDArray[np.int64]
+    size: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.at)
+
+    @property
+    def channel(self) -> NDArray[np.uint16]:
+        """Channel of each message, (n,)."""
+        return self.headers["channel"]
+
+    @property
+    def log_time(self) -> NDArray[np.uint64]:
+        """Log time of each message in nanoseconds, (n,)."""
+        return self.headers["log_time"]
+
+    def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
+        """Give the table of some rows."""
+        return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
+
+    def payload(self, row: int) -> bytes:
+        """Copy the payload of one message."""
+        at = int(self.at[row])
+        return self.data[at : at + int(self.size[row])].tobytes()
+
+    def gather(self, at: NDArray[np.int64], size: int) -> Bytes:
+        """Copy `size` bytes from each of n places in `data`, (n, size).
+
+        Raises:
+            MalformedRecord: one lies outside the data.
+        """
+        if len(at) == 0 or size == 0:
+            return np.empty((len(at), size), np.uint8)
+        if at.min() < 0 or at.max() + size > len(self.data):
+            raise MalformedRecord("a message is shorter than its fields")
+        return windows(self.data, size)[at]
+
+
+def windows(data: Bytes, size: int) -> Bytes:
+    """View every `size` consecutive bytes of B bytes, (B - size + 1, size)."""
+    return np.ndarray((max(len(data) - size + 1, 0), size), np.uint8, data, 0, (1, 1))
+
+
+def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
+    """Build the table of the message records that begin at n places of a chunk.
+
+    Raises:
+        MalformedRecord: what stands there is no message, or runs over the chunk's end.
+    """
+    if len(offsets) == 0:
+        return MessageTable(data, np.empty(0, MESSAGE_HEADER), offsets, offsets)
+    width = MESSAGE_HEADER.itemsize
+    if offsets.min() < 0 or offsets.max() + width > len(data):
+        raise MalformedRecord("a message lies outside its chunk")
+    headers = windows(data, width)[offsets].view(MESSAGE_HEADER)[:, 0]
+    if (headers["opcode"] != Opcode.MESSAGE).any():
+        raise MalformedRecord("a message index points to something else than a message")
+    length = headers["length"]
+    if length.min() < MESSAGE_FIELDS:
+        raise MalformedRecord("a message is shorter than its own header")
+    size = length.astype(np.int64) - MESSAGE_FIELDS
+    at = offsets + width
+    if length.max() > len(data) or (at + size).max() > len(data):
+        raise MalformedRecord("a message runs over the end of its chunk")
+    return MessageTable(data, headers, at, size)
+
+
+def walked_table(
+    raw: bytes, *, cut: bool = False
+) -> tuple[MessageTable, list[tuple[int, int, int]]]:
+    """Build the table of a chunk by walking over its records.
+
+    Args:
+        raw: the chunk's records.
+        cut: the chunk ends early; what is broken at its end is left out.
+
+    Returns:
+        The table, and (opcode, start, stop) of the content of every definition.
+
+    Raises:
+        MalformedRecord: the chunk holds something that is no record, or that has no place there.
+    """
+    offsets: list[int] = []
+    definitions: list[tuple[int, int, int]] = []
+    try:
+        for opcode, at, end in walk(raw):
+            if opcode == Opcode.MESSAGE:
+                if end - at < MESSAGE_HEADER.itemsize:
+                    raise MalformedRecord("a message is shorter than its own header")
+                offsets.append(at)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                definitions.append((opcode, at + RECORD_HEADER.size, end))
+            elif opcode <= max(Opcode):
+                raise MalformedRecord(f"it holds a {Opcode(opcode).name} record")
+    except MalformedRecord:
+        if not cut:
+            raise
+    return table_at(np.frombuffer(raw, np.uint8), np.array(offsets, np.int64)), definitions
+
+
+def indexed_table(
+    raw: bytes, indexes: list[tuple[int, NDArray[np.uint64]]]
+) -> tuple[MessageTable, list[tuple[int, int, int]]]:
+    """Build the table of a chunk from its message indexes, without touching each message.
+
+    The index is believed only where it accounts for every byte of the chunk: what lies
+    between the messages it names is walked over.
+
+    Raises:
+        MalformedRecord: index and chunk contradict each other.
+    """
+    data = np.frombuffer(raw, np.uint8)
+    pairs = np.concatenate([pairs for _, pairs in indexes])
+    channels = np.repeat(
+        np.array([c for c, _ in indexes], np.uint16), [len(pairs) for _, pairs in indexes]
+    )
+    if len(pairs) and pairs[:, 1].max() >= len(data):
+        raise MalformedRecord("a message index points outside its chunk")
+    offsets = pairs[:, 1].astype(np.int64)
+    if (offsets[1:] <= offsets[:-1]).any():
+        order = np.argsort(offsets, kind="stable")
+        offsets, pairs, channels = offsets[order], pairs[order], channels[order]
+    table = table_at(data, offsets)
+    if (table.channel != channels).any() or (table.log_time != pairs[:, 0]).any():
+        raise MalformedRecord("its message index names other messages than it holds")
+    edges = np.empty((len(offsets) + 1, 2), np.int64)
+    edges[1:, 0], edges[0, 0] = table.at + table.size, 0
+    edges[:-1, 1], edges[-1, 1] = offsets, len(data)
+    definitions: list[tuple[int, int, int]] = []
+    for low, high in edges[edges[:, 0] != edges[:, 1]].tolist():
+        if low > high:
+            raise MalformedRecord("its message index names overlapping messages")
+        for opcode, at, end in walk(raw, low, high):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                definitions.append((opcode, at + RECORD_HEADER.size, end))
+            elif opcode <= max(Opcode):
+                raise MalformedRecord("its message index leaves messages out")
+    return table, definitions

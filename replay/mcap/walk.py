@@ -1,0 +1,437 @@
+"""Where everything stands in a log: one walk over its outer records, trusting none of them.
+
+The walk needs no index: it finds chunks, loose messages, metadata and attachments in
+whole files, in files without a summary, and in files that were cut anywhere. What the
+summary claims is compared with what was found.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right
+from typing import Final
+
+from mcap.opcode import Opcode
+
+from cdmisfa.core.errors import LogDamagedError
+from replay.mcap.records import (
+    MAGIC,
+    MAX_CHUNK,
+    MAX_DEFINITION,
+    RECORD_HEADER,
+    Fields,
+    MalformedRecord,
+    Statistics,
+    check_size,
+    chunk_header,
+    statistics,
+)
+from replay.mcap.segments import Attachment, Definitions, IndexPart, Metadata, Refuse, Segment
+from replay.mcap.summary import indexed_segments
+from replay.storage.store import RandomFile
+
+RUN_BYTES: Final = 1024 * 1024
+"""Messages outside chunks are read in runs of about this many bytes."""
+_CHUNK_HEADER: Final = 256
+_LOOSE: Final = struct.Struct("<HIQ")
+_INDEX: Final = struct.Struct("<HI")
+_FOOTER_BYTES: Final = RECORD_HEADER.size + 20
+_DATA_END_BYTES: Final = RECORD_HEADER.size + 4
+_OPEN_LENGTH: Final = 2**64 - 1
+_BEFORE_DATA: Final = 1024 * 1024
+
+
+class Structure:
+    """What the walk found, or what the summary names.
+
+    Args:
+        file: the log.
+        refuse: told of every damage.
+        by_index: believe a summary that accounts for every message, and read no chunk.
+
+    Attributes:
+        by_index: the summary was believed.
+        segments: chunks and runs of loose messages, in file order.
+        tail: the segment within which the file ends, or None.
+        complete: the file has its end, and nothing is missing.
+        missing: what a file that was cut lacks, in words; "" for a whole one.
+        data_crc: CRC of the data section, 0 for none, None where the file ends before it.
+        data_end: place where the data section ends.
+    """
+
+    def __init__(self, file: RandomFile, refuse: Refuse, *, by_index: bool = False) -> None:
+        self._file = file
+        self.by_index = False
+        self._refuse = refuse
+        self.definitions = Definitions(refuse)
+        self.segments: list[Segment] = []
+        self.tail: Segment | None = None
+        self.metadata: list[Metadata] = []
+        self.attachments: list[Attachment] = []
+        self.profile = ""
+        self.library = ""
+        self.statistics: Statistics | None = None
+        self.complete = False
+        self.missing = ""
+        self.data_crc: int | None = None
+        self.data_end = 0
+        self._chunk_offsets: list[int] = []
+        self._limit: int | None = None
+        self._has_indexes = False
+        self._has_summary = False
+        self._attachment_spans: list[tuple[int, int]] = []
+        self._metadata_bytes = 0
+        self._run: Segment | None = None
+        self._last_chunk: Segment | None = None
+        self._at = len(MAGIC)
+        start = file.read(0, len(MAGIC))
+        if not start:
+            raise LogDamagedError(f"{file.path}: empty, nothing was written")
+        if start != MAGIC:
+            raise LogDamagedError(f"{file.path}: not an MCAP file (its first bytes are not MCAP's)")
+        self._read_end()
+        if not by_index or not self._take_index():
+            self._walk_data()
+
+    def go_on(self) -> int:
+        """Walk over what was appended to a file that had no end yet.
+
+        Returns:
+            How many of the segments before are as they were.
+
+        Raises:
+            LogDamagedError: what was appended is damaged.
+        """
+        if self._last_chunk is not None:
+            # Its message indexes need not all have been there.
+            self._at = self.segments.pop().offset
+            self._last_chunk = None
+        if self.data_crc is not None:
+            self._at, self.data_crc = self.data_end, None
+        kept = len(self.segments)
+        self.tail, self.missing, self._limit = None, "", None
+        self.statistics, self._chunk_offsets, self._has_indexes = None, [], False
+        self._read_end()
+        self._walk_data()
+        return kept
+
+    def load_attachments(self) -> None:
+        """Read the attachments that the summary names, and check them."""
+        spans, self._attachment_spans = self._attachment_spans, []
+        for start, stop in spans:
+            self._record_at(start, stop, Opcode.ATTACHMENT)
+
+    def _take_index(self) -> bool:
+        """Take the chunks from the summary; whether it accounts for every message."""
+        if self._limit is None or not self._has_summary:
+            return False
+        known = set(self.definitions.channels)
+        stop = self._file.size - len(MAGIC) - _FOOTER_BYTES
+        try:
+            found = indexed_segments(self._file, self._limit, stop, self.statistics, known)
+            if found is None:
+                return False
+            segments, spans = found
+            self._record_at(len(MAGIC), None, Opcode.HEADER)
+            self._record_at(self._limit - _DATA_END_BYTES, self._limit, Opcode.DATA_END)
+            for start, end in spans.metadata:
+                self._record_at(start, end, Opcode.METADATA)
+        except MalformedRecord as error:
+            self._refuse("summary", str(error))
+            self._at, self.data_crc, self.metadata = len(MAGIC), None, []
+            return False
+        self.segments, self._attachment_spans = segments, spans.attachments
+        self.by_index = self.complete = True
+        return True
+
+    def _record_at(self, start: int, stop: int | None, opcode: Opcode) -> None:
+        """Take in a record that the summary names."""
+        found, length = RECORD_HEADER.unpack(
+            self._file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+        )
+        if found != opcode or stop not in (None, start + RECORD_HEADER.size + length):
+            raise MalformedRecord(f"at byte {start} is no {opcode.name} record")
+        self._at = start
+        self._take(found, start + RECORD_HEADER.size, length)
+
+    def _walk_data(self) -> None:
+        while self.data_crc is None:
+            limit = self._file.size if self._limit is None else self._limit
+            where = f"byte {self._at}"
+            try:
+                if not self._step(limit):
+                    break
+            except MalformedRecord as error:
+                self._refuse(where, str(error))
+                if not self._resume_after(self._at):
+                    self.missing = f"everything from byte {self._at} on is unreadable"
+                    break
+        self._close_run()
+        if self.data_crc is not None and self._limit is None and not self.missing:
+            self.missing = "the summary at its end is cut, every message is there"
+        self.complete = self._limit is not None and self.data_crc is not None
+        if self.complete:
+            self._compare_with_summary()
+
+    # The outer records
+
+    def _step(self, limit: int) -> bool:
+        head = self._file.peek(self._at, RECORD_HEADER.size) if self._at < limit else b""
+        if len(head) < RECORD_HEADER.size or self._at + RECORD_HEADER.size > limit:
+            return self._cut("the end of the file and its index are missing", limit)
+        opcode, length = RECORD_HEADER.unpack(head)
+        content = self._at + RECORD_HEADER.size
+        end = content + length
+        if opcode == 0:
+            if self._limit is None and self._only_zeros(self._at):
+                return self._cut(f"from byte {self._at} on there are only zeros", limit)
+            raise MalformedRecord("no record (opcode 0)")
+        if end > limit:
+            if opcode == Opcode.CHUNK and self._limit is None:
+                self._cut_chunk(content, length, limit)
+            return self._cut(
+                f"the file ends within a record at byte {self._at}, {limit - self._at} bytes of it "
+                "are there",
+                limit,
+            )
+        if self._at == len(MAGIC) and opcode != Opcode.HEADER:
+            raise MalformedRecord("the file does not begin with a header record")
+        self._take(opcode, content, length)
+        self._at = end
+        return True
+
+    def _take(self, opcode: int, content: int, length: int) -> None:
+        if opcode == Opcode.MESSAGE:
+            self._loose_message(content, length)
+            return
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(content, length)
+            return
+        self._last_chunk = None
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self.definitions.add(opcode, self._definition(content, length), f"byte {self._at}")
+            return
+        self._close_run()
+        if opcode == Opcode.CHUNK:
+            self._last_chunk = self._chunk(content, length)
+            self.segments.append(self._last_chunk)
+        elif opcode == Opcode.METADATA:
+            self._take_metadata(self._definition(content, length))
+        elif opcode == Opcode.ATTACHMENT:
+            self._attachment(content, length)
+        elif opcode == Opcode.HEADER:
+            if self._at != len(MAGIC):
+                raise MalformedRecord("a second header, as of two files in one")
+            fields = Fields(self._definition(content, length), "the header")
+            self.profile, self.library = fields.text(), fields.text()
+        elif opcode == Opcode.DATA_END:
+            self.data_end = self._at
+            crc = Fields(self._file.peek(content, min(length, 4)), "the data end").integer(4)
+            if self._limit is not None and content + length != self._limit:
+                raise MalformedRecord("the data section does not end where the summary starts")
+            self.data_crc = crc
+        elif opcode <= max(Opcode):
+            raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
+
+    def _definition(self, content: int, length: int) -> bytes:
+        if length > MAX_DEFINITION:
+            raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
+        return self._file.read(content, length)
+
+    def _chunk(self, content: int, length: int) -> Segment:
+        header = chunk_header(self._file.peek(content, min(length, _CHUNK_HEADER)))
+        if header.length + header.stored > length:
+            raise MalformedRecord("a chunk's length is not that of its data")
+        return Segment(
+            self._at,
+            content + header.length,
+            header.stored,
+            header.size,
+            header.compression,
+            header.crc,
+            header.start,
+            header.end,
+            chunked=True,
+        )
+
+    def _cut_chunk(self, content: int, length: int, limit: int) -> None:
+        try:
+            header = chunk_header(self._file.peek(content, min(_CHUNK_HEADER, limit - content)))
+            check_size(header.compression, 0)
+        except MalformedRecord:
+            return
+        if length != _OPEN_LENGTH and header.length + header.stored > length:
+            raise MalformedRecord("a chunk's length is not that of its data")
+        data = content + header.length
+        size = header.size if length != _OPEN_LENGTH else MAX_CHUNK
+        self.tail = Segment(
+            self._at,
+            data,
+            limit - data,
+            size,
+            header.compression,
+            header.crc if length != _OPEN_LENGTH else 0,
+            header.start,
+            header.end,
+            chunked=True,
+            cut=True,
+        )
+
+    def _message_index(self, content: int, length: int) -> None:
+        chunk = self._last_chunk
+        if chunk is None:
+            raise MalformedRecord("a message index without its chunk")
+        head = self._file.peek(content, min(length, _INDEX.size))
+        if len(head) < _INDEX.size:
+            raise MalformedRecord("a message index is cut short")
+        number, size = _INDEX.unpack(head)
+        if size + _INDEX.size > length or size % 16:
+            raise MalformedRecord("a message index lies about its length")
+        chunk.indexes.append(IndexPart(number, content + _INDEX.size, size // 16))
+
+    def _loose_message(self, content: int, length: int) -> None:
+        if length < _LOOSE.size + 8:
+            raise MalformedRecord("a message is shorter than its own header")
+        if length > MAX_CHUNK:
+            raise MalformedRecord(f"a message of {length} bytes, above the limit of {MAX_CHUNK}")
+        number, _, time = _LOOSE.unpack(self._file.peek(content, _LOOSE.size))
+        end = content + length
+        run = self._run
+        if run is not None and end - run.offset > RUN_BYTES:
+            self._close_run()
+            run = None
+        if run is None:
+            run = self._run = Segment(
+                self._at, self._at, 0, 0, "", 0, time, time, chunked=False, counts={}
+            )
+            self._last_chunk = None
+        run.stored = run.size = end - run.offset
+        run.start, run.end = min(run.start, time), max(run.end, time)
+        assert run.counts is not None
+        run.counts[number] = run.counts.get(number, 0) + 1
+
+    def _close_run(self) -> None:
+        if self._run is not None:
+            self.segments.append(self._run)
+            self._run = None
+
+    def _take_metadata(self, content: bytes) -> None:
+        self._metadata_bytes += len(content)
+        if self._metadata_bytes > MAX_DEFINITION:
+            raise MalformedRecord(f"metadata takes more than {MAX_DEFINITION} bytes")
+        fields = Fields(content, "metadata")
+        self.metadata.append(Metadata(fields.text(), fields.texts()))
+
+    def _attachment(self, content: int, length: int) -> None:
+        fields = Fields(self._file.read(content, min(length, _BEFORE_DATA)), "an attachment")
+        log_time, create_time = fields.integer(8), fields.integer(8)
+        name, media_type, size = fields.text(), fields.text(), fields.integer(8)
+        if fields.at + size + 4 > length:
+            raise MalformedRecord("an attachment lies about its length")
+        data = content + fields.at
+        crc = int.from_bytes(self._file.read(data + size, 4), "little")
+        found = Attachment(name, media_type, log_time, create_time, data, size, crc)
+        if crc and self._file.crc(content, data + size) != crc:
+            self._refuse(f"attachment {name[:80]!r}", "its CRC does not match: damaged")
+            return
+        self.attachments.append(found)
+
+    # The end of the file
+
+    def _cut(self, what: str, limit: int) -> bool:
+        if self._limit is not None:
+            raise MalformedRecord(
+                "a record runs into the summary"
+                if self._at < limit
+                else "the data section has no end record"
+            )
+        self.missing = what
+        return False
+
+    def _only_zeros(self, at: int) -> bool:
+        return not any(any(block) for block in self._file.blocks(at, self._file.size))
+
+    def _resume_after(self, at: int) -> bool:
+        """Go on at the next chunk the summary knows of."""
+        self._close_run()
+        self._last_chunk = None
+        place = bisect_right(self._chunk_offsets, at)
+        if place == len(self._chunk_offsets):
+            return False
+        self._at = self._chunk_offsets[place]
+        return True
+
+    def _read_end(self) -> None:
+        """Read footer and summary, where the file has them."""
+        file = self._file
+        footer_at = file.size - len(MAGIC) - _FOOTER_BYTES
+        if footer_at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
+            return
+        footer = file.read(footer_at, _FOOTER_BYTES)
+        opcode, length = RECORD_HEADER.unpack_from(footer)
+        if opcode != Opcode.FOOTER or length != 20:
+            self._refuse("footer", "it is no footer record")
+            return
+        start, offsets, crc = struct.unpack_from("<QQI", footer, RECORD_HEADER.size)
+        begin = start or offsets or footer_at
+        if not len(MAGIC) <= begin <= footer_at or (offsets and not begin <= offsets <= footer_at):
+            self._refuse("footer", "it points outside the file")
+            return
+        if crc:
+            value = file.crc(begin, footer_at + _FOOTER_BYTES - 4)
+            if value != crc:
+                self._refuse("summary", "its CRC does not match: damaged")
+                self._limit = begin
+                return
+        self._limit = begin
+        try:
+            self._walk_summary(begin, footer_at)
+            self._has_summary = start == begin
+        except MalformedRecord as error:
+            self._refuse("summary", str(error))
+
+    def _walk_summary(self, at: int, stop: int) -> None:
+        while at < stop:
+            opcode, length = RECORD_HEADER.unpack(
+                self._file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+            )
+            content, end = at + RECORD_HEADER.size, at + RECORD_HEADER.size + length
+            if opcode == 0 or end > stop:
+                raise MalformedRecord(f"no record at byte {at}")
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self.definitions.add(opcode, self._definition(content, length), "summary")
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = statistics(self._definition(content, length))
+            elif opcode == Opcode.CHUNK_INDEX:
+                self._has_indexes = True
+                fields = Fields(self._file.peek(content, min(length, 24)), "a chunk index")
+                fields.take(16)
+                self._chunk_offsets.append(fields.integer(8))
+            elif opcode <= Opcode.DATA_END and opcode not in (
+                Opcode.ATTACHMENT_INDEX,
+                Opcode.METADATA_INDEX,
+                Opcode.SUMMARY_OFFSET,
+            ):
+                raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
+            at = end
+        self._chunk_offsets.sort()
+
+    def _compare_with_summary(self) -> None:
+        chunks = [s for s in self.segments if s.chunked]
+        if self._has_indexes and [c.offset for c in chunks] != self._chunk_offsets:
+            self._refuse("summary", "its chunk index does not name the chunks that are there")
+        stated = self.statistics
+        if stated is None:
+            return
+        found = {
+            "chunks": (stated.chunks, len(chunks)),
+            "attachments": (stated.attachments, len(self.attachments)),
+            "metadata records": (stated.metadata, len(self.metadata)),
+        }
+        counts = [s.channel_counts() for s in self.segments]
+        if all(c is not None for c in counts):
+            total = sum(sum(c.values()) for c in counts if c is not None)
+            found["messages"] = (stated.messages, total)
+        for what, (said, there) in found.items():
+            if said != there:
+                self._refuse("summary", f"it states {said} {what}, there are {there}")

@@ -1,0 +1,191 @@
+"""A recording that is still being written, as a source that waits for its frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from cdmisfa.core.blocks import Block, SourceSpec, check_request
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
+from recorder.log.logfile import PARTIAL
+from replay.recordings.source import RecordedSource
+from replay.storage.listing import log_files
+
+POLL: Final = 0.1
+"""Seconds between two looks at the files."""
+
+
+class FollowedSource:
+    """The views of a recording, of which more frames come while it is read.
+
+    A recorder hands over whole seconds of frames; a block that is not there yet is waited
+    for, until the recorder finishes its files.
+
+    Args:
+        path: the recording's folder, which may not be there yet.
+        timeout: seconds without a new frame after which the recorder is taken for gone.
+        stop: asked while waiting; true ends the wait as if the recording had ended.
+
+    Attributes:
+        stop: as given; it may be replaced.
+        warnings: none, for what is missing may still come.
+    """
+
+    warnings: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        timeout: float = 60.0,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """Wait for the first frames of every view.
+
+        Raises:
+            UsageError: no recording came.
+            LogDamagedError: what is there is damaged.
+        """
+        if Path(path).is_file():
+            raise UsageError(f"{path}: a recording is followed by its folder, this is a file")
+        self.stop = stop
+        self._path = Path(path)
+        self._timeout = timeout
+        self._t = 0
+        self._taken = False
+        self._seen: object = None
+        self._source: RecordedSource | None = None
+        self._wait(lambda: self._source is not None, "frame 0")
+        self._t = self._now.t
+        self._spec = replace(self._now.spec, length=None)
+
+    @property
+    def spec(self) -> SourceSpec:
+        """What the recording delivers; how long it will be is not known."""
+        return self._spec
+
+    @property
+    def t(self) -> int:
+        """Number of the next frame."""
+        return self._t
+
+    @property
+    def finished(self) -> bool:
+        """Whether the recorder has finished every file."""
+        return any(self._path.glob("*.mcap")) and not any(self._path.glob(f"*{PARTIAL}*"))
+
+    def take(self, stream: int, n: int) -> Block:
+        """The n frames that a view shows at t .. t+n-1, waited for; moves t by n.
+
+        Raises:
+            LogExhaustedError: the recording ended, or its recorder is gone; t stays.
+            LogDamagedError: a chunk is damaged; t stays.
+            ValueError: no such stream, or n < 1.
+        """
+        check_request(self._spec, stream, n)
+        self._wait(lambda: self._end >= self._t + n, f"frame {self._t + n - 1}")
+        self._now.seek(self._t)
+        block = self._now.take(stream, n)
+        self._t += n
+        self._taken = True
+        return block
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t, waiting until it is there.
+
+        Raises:
+            LogExhaustedError: the recording ended before it, or its recorder is gone.
+            ValueError: t lies before the recording's first frame.
+        """
+        self._wait(lambda: self._end >= t, f"frame {t}")
+        self._now.seek(t)
+        self._t = t
+
+    def describe(self) -> Mapping[str, Any]:
+        """What was recorded, and once frames were taken, the files that they were taken from.
+
+        A file that still grows is named by its first `bytes`, and their SHA-256.
+        """
+        views: list[dict[str, Any]] = [{"name": name} for name in self._spec.streams]
+        if self._taken:
+            views = self._now.describe_files()
+        return {"kind": "recording", **self._now.scene(), "followed": True, "views": views}
+
+    def close(self) -> None:
+        """Let go of the files; harmless when called twice."""
+        if self._source is not None:
+            self._source.close()
+
+    @property
+    def _now(self) -> RecordedSource:
+        if self._source is None:
+            raise LogExhaustedError(f"{self._path}: it was given up before its first frame")
+        return self._source
+
+    @property
+    def _end(self) -> int:
+        return self._now.first_frame + self._now.frames
+
+    def _wait(self, ready: Callable[[], bool], what: str) -> None:
+        """Look at the files until something is there, they are finished or nothing comes.
+
+        Raises:
+            LogExhaustedError: nothing came in time, or waiting was to stop.
+            UsageError: there is no recording.
+            LogDamagedError: a file is damaged.
+        """
+        if self._source is not None and ready():
+            return
+        deadline = time.monotonic() + self._timeout
+        while not self.stop():
+            finished = self.finished
+            before = self._frames()
+            error = self._look()
+            if self._source is not None and ready():
+                return
+            if finished:
+                if error is not None:
+                    raise error
+                return
+            if self._frames() > before:
+                deadline = time.monotonic() + self._timeout
+            if time.monotonic() >= deadline:
+                if self._source is None and error is not None:
+                    raise error
+                raise LogExhaustedError(
+                    f"{self._path}: {what} did not come within {self._timeout:g} s of the last; "
+                    "if its recorder still works wait longer with --follow-timeout"
+                )
+            time.sleep(POLL)
+        raise LogExhaustedError(f"{self._path}: stopped while waiting for {what}")
+
+    def _frames(self) -> int:
+        return self._source.frames if self._source is not None else 0
+
+    def _look(self) -> CdmisfaError | None:
+        """Take in what was added to the files.
+
+        Returns:
+            Why it cannot be (yet).
+        """
+        try:
+            seen = [
+                (path, path.stat().st_size)
+                for path in log_files(self._path)
+                if isinstance(path, Path)
+            ]
+            if seen == self._seen and self._source is not None:
+                return None
+            if self._source is None:
+                self._source = RecordedSource(self._path)
+            else:
+                self._source.refresh()
+        except (UsageError, LogDamagedError) as error:
+            return error
+        except OSError:  # renamed between two looks
+            return None
+        self._seen = seen
+        return None

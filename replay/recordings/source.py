@@ -1,0 +1,343 @@
+"""A recording as a source of frames: the learner cannot tell it from the live scene."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from cdmisfa.core.blocks import Block, SourceSpec, check_request, freeze
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
+from recorder.log.logfile import PARTIAL
+from recorder.log.viewfacts import ViewFacts
+from replay.mcap.identity import identity
+from replay.mcap.reader import LogReader
+from replay.recordings.view_file import ViewFile, intersection
+from replay.storage.listing import log_files
+from replay.storage.location import Location, Url
+
+CACHE_BYTES: Final = 1024 * 1024
+"""Decoded chunks that are kept of each view; one always is.
+
+Few, because playing moves forward, and memory that is used again is still in the CPU's cache.
+"""
+_FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
+_SMALLEST: Final = 64
+"""Bytes that no log of a recording has less of once its header is written."""
+_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns")
+_SAME_VALUES: Final = ("scene", "seed", "config_sha256")
+
+
+class RecordedSource:
+    """The views of a recording on their common clock.
+
+    Args:
+        paths: a recording's folder, or the files of its views, finished or `.partial`; or an
+            S3 prefix, or URLs.
+        loop: begin again at the end instead of stopping there.
+        salvage: leave out, in every view, what is damaged in one of them.
+
+    Attributes:
+        warnings: what the user should know: files that were cut, frames left out.
+    """
+
+    def __init__(
+        self,
+        paths: str | Location | Iterable[str | Location],
+        *,
+        loop: bool = False,
+        salvage: bool = False,
+    ) -> None:
+        """Open every view and check that they belong together.
+
+        Raises:
+            UsageError: no such recording.
+            LogDamagedError: a file is damaged, or the files contradict each other.
+        """
+        self.warnings: tuple[str, ...] = ()
+        self._loop = loop
+        self._paths = paths
+        self._files = [path for path in log_files(paths) if not _only_begun(path)]
+        self._hashes: list[dict[str, Any]] | None = None
+        self._views: list[list[ViewFile]] = []
+        opened: list[ViewFile] = []
+        try:
+            for path in self._files:
+                opened.append(ViewFile(path, salvage=salvage, cache_bytes=CACHE_BYTES))
+            self._views = _arrange(opened, salvage=salvage)
+            self._set_clock()
+        except BaseException:
+            for view in opened:
+                view.close()
+            raise
+        self._t = self._first
+
+    def refresh(self) -> None:
+        """Take in what a recorder wrote since: more frames, and further parts of a view.
+
+        What is there already is not read again, unless a file was replaced.
+
+        Raises:
+            UsageError: no such recording any more.
+            LogDamagedError: what was written is damaged.
+        """
+        before = {view.path.name.removesuffix(PARTIAL): view for v in self._views for view in v}
+        opened: list[ViewFile] = []
+        added: list[ViewFile] = []
+        try:
+            for path in log_files(self._paths):
+                view = before.get(path.name.removesuffix(PARTIAL))
+                if view is not None and isinstance(path, Path) and view.is_at(path):
+                    view.refresh(path)
+                    opened.append(view)
+                elif not _only_begun(path):
+                    added.append(ViewFile(path, cache_bytes=CACHE_BYTES))
+            views = _arrange(opened + added, salvage=False)
+        except BaseException:
+            for view in added:
+                view.close()
+            raise
+        for view in before.values():
+            if view not in opened:
+                view.close()
+        self._files, self._hashes, self._views = [v.path for v in opened + added], None, views
+        self._set_clock()
+
+    @property
+    def spec(self) -> SourceSpec:
+        """What the recording delivers; without a length where it loops."""
+        return self._spec
+
+    @property
+    def t(self) -> int:
+        """Number of the next frame."""
+        return self._t
+
+    @property
+    def frames(self) -> int:
+        """Frames that every view has."""
+        return self._count
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the first frame that every view has."""
+        return self._first
+
+    def coverage(self) -> dict[str, list[tuple[int, int]]]:
+        """Give for each view the frames that are there, from and up to before."""
+        return {
+            parts[0].facts.view: [r for view in parts for r in view.ranges] for parts in self._views
+        }
+
+    def take(self, stream: int, n: int) -> Block:
+        """The n frames that a view shows at t .. t+n-1; moves t by n.
+
+        Raises:
+            LogExhaustedError: fewer than n frames are left; t stays.
+            LogDamagedError: a chunk is damaged; t stays.
+            ValueError: no such stream, or n < 1.
+        """
+        check_request(self._spec, stream, n)
+        played = self._t - self._first
+        if not self._loop and played + n > self._count:
+            raise LogExhaustedError(
+                f"{self._name()}: {self._count - played} frames are left at frame {self._t}, "
+                f"{n} are needed; record more frames, or begin again at its end with --loop"
+            )
+        frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
+        truth = np.empty((n, len(self._spec.truth)))
+        at = 0
+        while at < n:
+            view, frame, count = self._place(stream, (played + at) % self._count, n - at)
+            view.take(frame, frames[at : at + count], truth[at : at + count])
+            at += count
+        block = Block(stream, self._t, freeze(frames), freeze(truth))
+        self._t += n
+        return block
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t.
+
+        Raises:
+            LogExhaustedError: the recording ends before it.
+            ValueError: t lies before the recording's first frame.
+        """
+        if t < self._first:
+            raise ValueError(f"frame {t} lies before the recording's first, {self._first}")
+        if not self._loop and t > self._first + self._count:
+            raise LogExhaustedError(
+                f"{self._name()}: it ends at frame {self._first + self._count}, before frame {t}; "
+                "begin again at its end with --loop"
+            )
+        self._t = t
+
+    def describe(self) -> Mapping[str, Any]:
+        """The recording's views with the SHA-256 of their files, and what was recorded."""
+        if self._hashes is None:
+            self._hashes = [
+                {
+                    "name": view.facts.view,
+                    "frames": view.count,
+                    **identity(view.path, view.reader),
+                }
+                for parts in self._views
+                for view in parts
+            ]
+        return {
+            "kind": "recording",
+            **self.scene(),
+            "frames": self._count,
+            "first_frame": self._first,
+            "loop": self._loop,
+            "views": self._hashes,
+        }
+
+    def describe_files(self) -> list[dict[str, Any]]:
+        """The views' files as far as they are known, with the SHA-256 of these bytes."""
+        return [
+            {
+                "name": view.facts.view,
+                "frames": view.count,
+                "file": view.path.name,
+                "bytes": view.reader.size,
+                "sha256": view.reader.digest(),
+            }
+            for parts in self._views
+            for view in parts
+        ]
+
+    def scene(self) -> Mapping[str, str]:
+        """What was recorded: the scene, its seed and the checksum of its configuration."""
+        values = self._views[0][0].facts.values
+        return {k: values[k] for k in _SAME_VALUES if k in values}
+
+    def close(self) -> None:
+        """Let go of the files; harmless when called twice."""
+        for parts in self._views:
+            for view in parts:
+                view.close()
+
+    def _name(self) -> str:
+        parents = {path.parent for path in self._files}
+        return str(self._files[0]) if len(self._files) == 1 else min(map(str, parents))
+
+    def _set_clock(self) -> None:
+        """Find the frames that every view has, whole."""
+        facts = [parts[0].facts for parts in self._views]
+        covered = list(self.coverage().values())
+        common = covered[0]
+        for ranges in covered[1:]:
+            common = intersection(common, ranges)
+        if not common:
+            raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
+        self._ranges = _joined(common)
+        self._range_starts = list(
+            itertools.accumulate((stop - start for start, stop in self._ranges), initial=0)
+        )
+        self._first = self._ranges[0][0]
+        self._count = self._range_starts[-1]
+        warnings: list[str] = []
+        for view in itertools.chain.from_iterable(self._views):
+            if view.reader.missing:
+                warnings.append(f"{view.path}: {view.reader.missing}")
+            warnings += [f"{view.path}: {p.where}: {p.what}" for p in view.reader.problems]
+        if len({ranges[-1][1] for ranges in covered}) > 1:
+            warnings.append(
+                f"{self._name()}: its views end at different frames; it ends with the shortest, "
+                f"before frame {self._ranges[-1][1]}"
+            )
+        left_out = self._ranges[-1][1] - self._first - self._count
+        if left_out:
+            warnings.append(
+                f"{self._name()}: {left_out} frames are missing in a view and left out in all"
+            )
+        self.warnings = tuple(warnings)
+        self._spec = SourceSpec(
+            tuple(f.view for f in facts),
+            facts[0].frame_shape,
+            facts[0].dtype,
+            facts[0].truth,
+            facts[0].fps,
+            facts[0].start_ns,
+            None if self._loop else self._count,
+        )
+
+    def _place(self, stream: int, played: int, wanted: int) -> tuple[ViewFile, int, int]:
+        """Find the frame that is `played` frames from the start: file, frame, how many follow."""
+        number = bisect.bisect_right(self._range_starts, played) - 1
+        low, high = self._ranges[number]
+        frame = low + played - self._range_starts[number]
+        for view in self._views[stream]:
+            for start, stop in view.ranges:
+                if start <= frame < stop:
+                    return view, frame, min(wanted, min(high, stop) - frame)
+        raise AssertionError(f"frame {frame} is in no file")
+
+
+def _only_begun(path: Location) -> bool:
+    """Whether a file is a further part that its recorder had begun, but not a frame of it."""
+    if isinstance(path, Url) or not _FURTHER_PART.fullmatch(path.name):
+        return False
+    try:
+        with LogReader(path) as reader:
+            return not reader.segments
+    except LogDamagedError:
+        return path.stat().st_size < _SMALLEST
+
+
+def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
+    """Views by stream index, each as its parts by first frame."""
+    by_view: dict[tuple[int, str], list[ViewFile]] = {}
+    for view in opened:
+        by_view.setdefault((view.facts.stream_index, view.facts.view), []).append(view)
+    indexes = [index for index, _ in by_view]
+    names = [name for _, name in by_view]
+    if len(set(indexes)) < len(indexes) or len(set(names)) < len(names):
+        raise LogDamagedError(
+            f"{opened[0].path}: its files are not of one recording: two claim the same stream"
+        )
+    first = opened[0]
+    for view in opened[1:]:
+        key = _difference(first.facts, view.facts)
+        if key:
+            raise LogDamagedError(
+                f"{view.path}: not of the same recording as {first.path.name}: {key} differs"
+            )
+    arranged = []
+    for stream in sorted(by_view):
+        parts = sorted(by_view[stream], key=lambda v: v.facts.first_frame)
+        for one, two in itertools.pairwise(parts):
+            end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
+            if end > two.facts.first_frame or (end < two.facts.first_frame and not salvage):
+                raise LogDamagedError(
+                    f"{two.path}: begins at frame {two.facts.first_frame}, {one.path.name} ends "
+                    f"before {end}: a part is missing or doubled"
+                )
+        arranged.append(parts)
+    return arranged
+
+
+def _difference(one: ViewFacts, two: ViewFacts) -> str:
+    for key in _SAME:
+        if getattr(one, key) != getattr(two, key):
+            return key
+    for key in _SAME_VALUES:
+        if one.values.get(key) != two.values.get(key):
+            return key
+    return ""
+
+
+def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Sorted ranges with those that touch made one."""
+    found: list[tuple[int, int]] = []
+    for start, stop in ranges:
+        if found and found[-1][1] == start:
+            found[-1] = (found[-1][0], stop)
+        else:
+            found.append((start, stop))
+    return found

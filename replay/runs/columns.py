@@ -1,0 +1,121 @@
+"""Records of consecutive iterations as arrays, without a Python object a record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.signals import SIGNALS, BlockSignals
+from replay.mcap.records import MalformedRecord
+from replay.runs.signals_message import file_descriptor
+from replay.runs.wire import Span, alike, column, spans
+
+Decode = Callable[[bytes], BlockSignals]
+
+_NUMBERS = {field.name: field.number for field in file_descriptor().message_type[0].field}
+
+
+@dataclass(frozen=True, slots=True)
+class SignalColumns:
+    """Consecutive records whose values have the same shapes.
+
+    Attributes:
+        values: of each signal by its name, (n, *dims).
+    """
+
+    values: Mapping[str, NDArray[Any]]
+
+    def __len__(self) -> int:
+        return len(self.values["iteration"])
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.values[name]
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """(n,) first frame of each block."""
+        return self.values["t"]
+
+    @property
+    def iterations(self) -> NDArray[np.int64]:
+        """(n,) iterations."""
+        return self.values["iteration"]
+
+    @property
+    def tau(self) -> int:
+        """Frames of a block."""
+        return int(self.values["y"].shape[1])
+
+    def times(self, per_frame: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Frames and iterations of the rows: one a record, or one a frame of it."""
+        if not per_frame:
+            return self.frames, self.iterations
+        every = (self.frames[:, None] + np.arange(self.tau)).reshape(-1)
+        return every, np.repeat(self.iterations, self.tau)
+
+
+def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumns]:
+    """Records as arrays, a new piece wherever a shape changes."""
+    for _, group in groupby(records, key=_shapes):
+        alike_ones = list(group)
+        yield SignalColumns(
+            {
+                s.name: np.array([getattr(r, s.name) for r in alike_ones], dtype=s.dtype)
+                for s in SIGNALS.values()
+            }
+        )
+
+
+def columns_of_messages(messages: Sequence[bytes], decode: Decode) -> Iterator[SignalColumns]:
+    """The records in messages as arrays, bit for bit what `decode` makes of each.
+
+    Raises:
+        LogDamagedError: from `decode`.
+    """
+    for _, group in groupby(messages, key=len):
+        same_size = list(group)
+        whole = _at_once(same_size, decode(same_size[0]))
+        if whole is not None:
+            yield whole
+        else:
+            yield from columns_of_records([decode(message) for message in same_size])
+
+
+def _at_once(messages: Sequence[bytes], first: BlockSignals) -> SignalColumns | None:
+    """All messages as laid out like the first one, or None where they are not."""
+    try:
+        places = spans(messages[0])
+    except MalformedRecord:
+        return None
+    fields: dict[str, Span] = {n: places[k] for n, k in _NUMBERS.items() if k in places}
+    stored = {name: fields[name] for name in SIGNALS if name in fields}
+    rows = alike(messages, list(stored.values()))
+    if rows is None:
+        return None
+    values: dict[str, NDArray[Any]] = {}
+    for signal in SIGNALS.values():
+        value = np.asarray(getattr(first, signal.name), dtype=signal.dtype)
+        shape = (len(messages), *value.shape)
+        if signal.name not in stored:  # an empty array, or one that this version has not got
+            values[signal.name] = np.broadcast_to(value, shape)
+            continue
+        width = np.dtype(signal.dtype).itemsize * value.size
+        if stored[signal.name][1] - stored[signal.name][0] != width:
+            return None
+        kind = np.dtype(signal.dtype).newbyteorder("<").str
+        found = column(rows, stored[signal.name], "u1" if signal.dtype == "bool" else kind)
+        if signal.dtype == "bool":
+            if found.max(initial=0) > 1:
+                return None
+            found = found.astype(bool)
+        values[signal.name] = found.reshape(shape)
+    return SignalColumns(values)
+
+
+def _shapes(signals: BlockSignals) -> tuple[tuple[int, ...], ...]:
+    return tuple(np.shape(getattr(signals, s.name)) for s in SIGNALS.values() if s.dims)

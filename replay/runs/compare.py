@@ -1,0 +1,131 @@
+"""Whether two runs are the same, bit for bit, and where they part if they are not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.signals import BlockSignals, canonical_bytes, values
+from replay.runs.log import RunHeader, read_header, read_signals
+
+Pair = tuple[BlockSignals | None, BlockSignals | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first place where two runs differ.
+
+    Attributes:
+        iteration: of the record, from 0; -1 where the two are of different versions of the
+            record and what both hold is the same.
+        signal: name of its first signal that differs, or "" where one run has ended.
+        place: index of the first element that differs; () for a scalar or a shape.
+        first: the value in the first run, as text.
+        second: the value in the second run, as text.
+        versions: of the two runs' records, where they are not the same one.
+    """
+
+    iteration: int
+    signal: str
+    place: tuple[int, ...]
+    first: str
+    second: str
+    versions: tuple[int, int] | None = None
+
+    def __str__(self) -> str:
+        if self.versions is None:
+            return self._place()
+        a, b = self.versions
+        shared = "all the same, bit for bit" if self.iteration < 0 else self._place()
+        return f"signals of version {a} against {b}; of those in both: {shared}"
+
+    def _place(self) -> str:
+        if not self.signal:
+            return f"iteration {self.iteration}: {self.first} against {self.second}"
+        place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
+        where = f"iteration {self.iteration}: {self.signal}{place}"
+        return f"{where} is {self.first} against {self.second}"
+
+    def as_json(self) -> dict[str, Any]:
+        """The difference as JSON values."""
+        return {
+            "iteration": self.iteration,
+            "signal": self.signal,
+            "place": list(self.place),
+            "first": self.first,
+            "second": self.second,
+            "versions": None if self.versions is None else list(self.versions),
+        }
+
+
+def compare(
+    first: Path, second: Path, headers: tuple[RunHeader, RunHeader] | None = None
+) -> Difference | None:
+    """The first difference between two runs' signals, or None where every bit is the same.
+
+    Runs of different versions of the record differ by that; the first difference is then
+    sought among the signals that both hold.
+
+    Args:
+        first: a run.
+        second: another one.
+        headers: what stands at the beginning of their logs, where that was read already.
+
+    Raises:
+        UsageError: one of them is no run.
+        LogDamagedError: one of them cannot be read.
+    """
+    a, b = headers or (read_header(first), read_header(second))
+    versions = a.schema, b.schema
+    pairs = zip_longest(read_signals(first, a), read_signals(second, b))
+    found = _first_difference(pairs, min(versions))
+    if versions[0] == versions[1]:
+        return found
+    found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
+    return replace(found, versions=versions)
+
+
+def _first_difference(pairs: Iterable[Pair], version: int) -> Difference | None:
+    """The first difference among the signals of a version of the record."""
+    for iteration, (a, b) in enumerate(pairs):
+        if a is None or b is None:
+            ended, more = f"ended after {iteration} iterations", "goes on"
+            return Difference(
+                iteration, "", (), ended if a is None else more, ended if b is None else more
+            )
+        if canonical_bytes(a, version) != canonical_bytes(b, version):
+            return _difference(iteration, a, b, version)
+    return None
+
+
+def _difference(iteration: int, a: BlockSignals, b: BlockSignals, version: int) -> Difference:
+    for (signal, x), (_, y) in zip(values(a, version), values(b, version), strict=True):
+        if x.shape != y.shape:
+            return Difference(
+                iteration, signal.name, (), f"of shape {x.shape}", f"of shape {y.shape}"
+            )
+        differs = np.flatnonzero(_differ(x, y))
+        if len(differs):
+            place = tuple(int(i) for i in np.unravel_index(differs[0], x.shape))
+            return Difference(iteration, signal.name, place, _text(x[place]), _text(y[place]))
+    raise AssertionError("records with different bytes have the same values")
+
+
+def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where two arrays differ in a bit, (size,); one NaN is as good as another."""
+    both_nan = np.ravel(np.isnan(x) & np.isnan(y))
+    width = np.dtype(f"u{x.dtype.itemsize}")
+    bits = [np.ascontiguousarray(value).view(width).reshape(-1) for value in (x, y)]
+    differ: NDArray[np.bool_] = (bits[0] != bits[1]) & ~both_nan
+    return differ
+
+
+def _text(value: Any) -> str:
+    """A number with every digit that tells it from its neighbours."""
+    return repr(value.item())

@@ -1,0 +1,204 @@
+"""What happened in a run, in short: read once before it is shown or drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.runs.columns import SignalColumns
+from replay.runs.log import RunHeader, read_header, run_log
+from replay.runs.stretches import read_columns
+
+Float = NDArray[np.float64]
+
+LINES = ("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon")
+"""Signals whose values are kept for every iteration, to choose ranges from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Saved:
+    """The iteration at whose end a module was saved."""
+
+    module: int
+    stream: int
+    iteration: int
+    t: int
+    policy: tuple[int, ...]
+    eta: tuple[float, ...]
+    eta_dot: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """The time in which one abstraction was learned.
+
+    Attributes:
+        module: its number.
+        blocks: of the phase.
+        novel: how many of them the gate let through.
+        visits: (S,) how many of them were of each stream.
+    """
+
+    module: int
+    blocks: int
+    novel: int
+    visits: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """A run in short.
+
+    Attributes:
+        header: what stands at the beginning of its log.
+        iterations: number of records.
+        frames: number of frames watched.
+        tau: frames of a block.
+        outputs: outputs of an abstraction.
+        modules: most frozen modules in any iteration.
+        visits: (S,) frames each stream was watched.
+        saved: the saves, in order.
+        last: the time since the last save.
+        policy: the last policy.
+        lines: for each name of `LINES` its values, (n,) or (n J,).
+    """
+
+    header: RunHeader
+    iterations: int
+    frames: int
+    tau: int
+    outputs: int
+    modules: int
+    visits: NDArray[np.int64]
+    saved: tuple[Saved, ...]
+    last: Phase | None
+    policy: tuple[int, ...]
+    lines: dict[str, Float]
+
+    @property
+    def delta(self) -> float | None:
+        """Threshold of eta-dot, where the configuration names it."""
+        return delta_of(self.header)
+
+    def streams(self, most: int) -> list[int]:
+        """The most watched streams, at most so many, in their own order."""
+        ranked = np.argsort(-self.visits, kind="stable")[:most]
+        return sorted(int(s) for s in ranked)
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the streams."""
+        return self.header.spec.streams
+
+    def span(self, *names: str, low: float | None = None) -> tuple[float, float] | None:
+        """A range that shows these lines without their few wildest values.
+
+        Args:
+            names: of the lines.
+            low: where the range must begin.
+        """
+        values = np.concatenate([self.lines[name] for name in names])
+        values = values[np.isfinite(values)]
+        if not len(values):
+            return None
+        lower, upper = (float(v) for v in np.percentile(values, (1.0, 98.0)))
+        lower = lower if low is None else low
+        margin = 0.1 * (upper - lower) or 0.1 * abs(upper) or 1.0
+        return (lower - margin if low is None else lower), upper + margin
+
+
+def delta_of(header: RunHeader) -> float | None:
+    """Threshold of eta-dot, where a run's configuration names it."""
+    value = header.setting("learner", "delta")
+    return float(value) if isinstance(value, int | float) else None
+
+
+class Tally:
+    """Sums a run up, as its records come.
+
+    Attributes:
+        header: what stands at the beginning of its log.
+    """
+
+    def __init__(self, header: RunHeader) -> None:
+        self.header = header
+        self._visits = np.zeros(len(header.spec.streams), dtype=np.int64)
+        self._lines: dict[str, list[Float]] = {name: [] for name in LINES}
+        self._saved: list[Saved] = []
+        self._iterations = self._modules = self._tau = self._outputs = 0
+        self._policy: tuple[int, ...] = ()
+        self._last: Phase | None = None
+
+    def add(self, columns: SignalColumns) -> None:
+        """Take the next records in."""
+        _, self._tau, self._outputs = columns["y"].shape
+        self._visits += self._tau * np.bincount(columns["stream"], minlength=len(self._visits))
+        for name, parts in self._lines.items():
+            parts.append(columns[name].reshape(-1))
+        self._modules = max(self._modules, columns["y_frozen"].shape[1])
+        self._saved += [_save_of(columns, i) for i in np.flatnonzero(columns["saved"]).tolist()]
+        self._iterations += len(columns)
+        self._policy = tuple(columns["policy"][-1].tolist())
+        self._last = self._phase(columns)
+
+    def _phase(self, columns: SignalColumns) -> Phase:
+        """The last abstraction's phase, as far as it has come."""
+        module = int(columns["module"][-1])
+        own = columns["module"] == module
+        before = self._last if self._last is not None and self._last.module == module else None
+        visits = np.bincount(columns["stream"][own], minlength=len(self._visits))
+        return Phase(
+            module,
+            int(own.sum()) + (before.blocks if before else 0),
+            int(columns["novel"][own].sum()) + (before.novel if before else 0),
+            visits + (before.visits if before else 0),
+        )
+
+    def outline(self) -> Outline:
+        """What was taken in, in short."""
+        return Outline(
+            header=self.header,
+            iterations=self._iterations,
+            frames=int(self._visits.sum()),
+            tau=self._tau,
+            outputs=self._outputs,
+            modules=self._modules,
+            visits=self._visits.copy(),
+            saved=tuple(self._saved),
+            last=self._last,
+            policy=self._policy,
+            lines={name: _joined(parts) for name, parts in self._lines.items()},
+        )
+
+
+def read_outline(path: Path) -> Outline:
+    """Read a run through once.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: it cannot be read.
+    """
+    log = run_log(path)
+    tally = Tally(read_header(log))
+    for columns in read_columns(log, tally.header):
+        tally.add(columns)
+    return tally.outline()
+
+
+def _save_of(columns: SignalColumns, place: int) -> Saved:
+    return Saved(
+        module=int(columns["module"][place]),
+        stream=int(columns["stream"][place]),
+        iteration=int(columns.iterations[place]),
+        t=int(columns.frames[place]),
+        policy=tuple(columns["policy"][place].tolist()),
+        eta=tuple(columns["eta"][place].tolist()),
+        eta_dot=tuple(columns["eta_dot"][place].tolist()),
+    )
+
+
+def _joined(parts: Sequence[Float]) -> Float:
+    return np.concatenate(parts) if parts else np.empty(0)

@@ -1,0 +1,186 @@
+"""`BlockSignals` as a protobuf message, generated from the table of signals.
+
+Every number has a fixed width, so a record that is read is, bit for bit, the record
+that was written. The sizes of all arrays stand in one more field: an empty array
+keeps its shape. A field's number never changes: those of a later version of the
+record follow all of the versions before.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
+from recorder.log.messages import varint
+
+MESSAGE = "cdmisfa.BlockSignals"
+"""Full name of the message in the log's schema."""
+
+SHAPES = "shapes"
+"""Field with the sizes of every dimension of every array, the oldest arrays first."""
+
+_FIELD = descriptor_pb2.FieldDescriptorProto
+_TYPES = {"float64": _FIELD.TYPE_DOUBLE, "int64": _FIELD.TYPE_SFIXED64, "bool": _FIELD.TYPE_BOOL}
+_CODES = {"float64": "d", "int64": "q", "bool": "?"}
+_WIRE = {"float64": 1, "int64": 1, "bool": 0}
+_LENGTH_DELIMITED = 2
+
+_BY_AGE = sorted(SIGNALS.values(), key=lambda s: s.since)
+_SCALARS = tuple(s for s in _BY_AGE if not s.dims)
+_ARRAYS = tuple(s for s in _BY_AGE if s.dims)
+_FIRST = tuple(s.name for s in _BY_AGE if s.since == 1)
+_LATER = tuple(s.name for s in _BY_AGE if s.since > 1)
+_NUMBER = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
+
+
+def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
+    """The message's definition, with each signal's symbol, unit and meaning as its comment."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name="cdmisfa/block_signals.proto", package="cdmisfa", syntax="proto3"
+    )
+    definition = file.message_type.add(name="BlockSignals")
+    for signal in _BY_AGE:
+        definition.field.add(
+            name=signal.name,
+            number=_NUMBER[signal.name],
+            type=_TYPES[signal.dtype],
+            label=_FIELD.LABEL_REPEATED if signal.dims else _FIELD.LABEL_OPTIONAL,
+        )
+        _comment(file, len(definition.field) - 1, _sentence(signal))
+    definition.field.add(
+        name=SHAPES, number=_NUMBER[SHAPES], type=_FIELD.TYPE_UINT32, label=_FIELD.LABEL_REPEATED
+    )
+    _comment(
+        file,
+        len(definition.field) - 1,
+        "Sizes of the dimensions of " + ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS),
+    )
+    return file
+
+
+def schema_data() -> bytes:
+    """The definition as a log stores it: a FileDescriptorSet."""
+    data: bytes = descriptor_pb2.FileDescriptorSet(file=[file_descriptor()]).SerializeToString(
+        deterministic=True
+    )
+    return data
+
+
+def encode(signals: BlockSignals) -> bytes:
+    """A record as the bytes of its message."""
+    scalars = list(_TAGGED)
+    scalars[1::2] = [getattr(signals, s.name) for s in _SCALARS]
+    parts = [_STRUCT.pack(*scalars)]
+    shapes = []
+    for name, dtype, tag in _ARRAY_TAGS:
+        value = np.asarray(getattr(signals, name), dtype=dtype)
+        shapes.append(value.shape)
+        if value.size:
+            parts.append(_length_prefix(tag, value.nbytes))
+            parts.append(value.tobytes())
+    key = tuple(shapes)
+    if key not in _SHAPE_BYTES:
+        sizes = b"".join(varint(size) for shape in key for size in shape)
+        _SHAPE_BYTES[key] = _length_prefix(_tag(SHAPES, _LENGTH_DELIMITED), len(sizes)) + sizes
+    parts.append(_SHAPE_BYTES[key])
+    return b"".join(parts)
+
+
+def missing(version: int) -> tuple[str, ...]:
+    """Names of the signals that a version of the record lacks."""
+    return tuple(s.name for s in SIGNALS.values() if s.since > version)
+
+
+def decode(data: bytes, where: str = "record", version: int = SCHEMA_VERSION) -> BlockSignals:
+    """The record in the bytes of a message; NaN where its version lacks a signal.
+
+    Args:
+        data: what `encode` of that version made.
+        where: what to name in an error.
+        version: of the record.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
+    """
+    try:
+        decoded = _CLASS.FromString(data)
+    except message.DecodeError as error:
+        raise LogDamagedError(f"{where}: not a {MESSAGE} message, see cdmisfa verify") from error
+    sizes = iter(getattr(decoded, SHAPES))
+    fields: dict[str, Any] = {
+        s.name: getattr(decoded, s.name) if s.since <= version else math.nan for s in _SCALARS
+    }
+    known: dict[str, int] = {}
+    for signal in _ARRAYS:
+        if signal.since <= version:
+            shape = tuple(size for _, size in zip(signal.dims, sizes, strict=False))
+            fields[signal.name] = _array(getattr(decoded, signal.name), shape, signal, where)
+            known.update(zip(signal.dims, shape, strict=True))
+        else:
+            shape = tuple(known[letter] for letter in signal.dims)
+            if math.prod(shape) > len(data):
+                raise LogDamagedError(f"{where}: sizes without values, see cdmisfa verify")
+            fields[signal.name] = np.full(shape, math.nan)
+    return BlockSignals(**fields)
+
+
+def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> NDArray[Any]:
+    if len(shape) != len(signal.dims) or math.prod(shape) != len(values):
+        raise LogDamagedError(
+            f"{where}: {signal.name} has {len(values)} values for shape {shape}, see cdmisfa verify"
+        )
+    return np.array(values, dtype=signal.dtype).reshape(shape)
+
+
+def _comment(file: descriptor_pb2.FileDescriptorProto, field: int, text: str) -> None:
+    file.source_code_info.location.add(
+        path=[4, 0, 2, field], span=[field, 0, 0], leading_comments=f" {text}\n"
+    )
+
+
+def _sentence(signal: Signal) -> str:
+    parts = [signal.about.rstrip(".")]
+    if signal.symbol:
+        parts.append(f"symbol {signal.symbol}")
+    if signal.equation:
+        parts.append(f"equation {signal.equation}")
+    if signal.dims:
+        parts.append(f"dimensions {signal.dims}")
+    return "; ".join([*parts, f"unit {signal.unit}"]) + "."
+
+
+def _tag(name: str, wire_type: int) -> bytes:
+    return varint(_NUMBER[name] << 3 | wire_type)
+
+
+def _length_prefix(tag: bytes, length: int) -> bytes:
+    return tag + (bytes((length,)) if length < 0x80 else varint(length))
+
+
+def _message_class() -> Any:
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file_descriptor())
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(MESSAGE))
+
+
+_CLASS = _message_class()
+_TAGGED: tuple[Any, ...] = tuple(
+    part for s in _SCALARS for part in (_tag(s.name, _WIRE[s.dtype]), None)
+)
+_STRUCT = struct.Struct(
+    "<"
+    + "".join(
+        f"{len(tag)}s{_CODES[s.dtype]}" for tag, s in zip(_TAGGED[::2], _SCALARS, strict=True)
+    )
+)
+_ARRAY_TAGS = tuple(
+    (s.name, np.dtype(s.dtype).newbyteorder("<"), _tag(s.name, _LENGTH_DELIMITED)) for s in _ARRAYS
+)
+_SHAPE_BYTES: dict[tuple[tuple[int, ...], ...], bytes] = {}

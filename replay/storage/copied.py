@@ -1,0 +1,43 @@
+"""A log behind a URL as a file, for what needs all of it anyway."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from cdmisfa.core.errors import CdmisfaError
+from replay.storage.listing import log_files
+from replay.storage.location import Location, Url
+from replay.storage.store import RandomFile
+
+
+@contextlib.contextmanager
+def fetched(place: Location) -> Iterator[Path]:
+    """Give a path as it is, and a URL as a copy that is gone afterwards.
+
+    Raises:
+        UsageError: there is no such object.
+        LogDamagedError: the server sends less than it says, or something else.
+        CdmisfaError: the server does not give it, or there is no room for it.
+    """
+    if not isinstance(place, Url):
+        yield place
+        return
+    with tempfile.TemporaryDirectory(prefix="cdmisfa-") as temporary:
+        folder = Path(temporary) / (place if place.folder else place.parent).name
+        folder.mkdir()
+        for log in log_files(place):
+            _copy(log, folder / log.name)
+        yield folder if place.folder else folder / place.name
+
+
+def _copy(log: Location, target: Path) -> None:
+    with contextlib.closing(RandomFile(log)) as source:
+        try:
+            with target.open("xb") as copy:
+                for block in source.blocks(0, source.size):
+                    copy.write(block)
+        except OSError as error:
+            raise CdmisfaError(f"{log}: cannot be copied to {target}: {error.strerror}") from None

@@ -1,0 +1,104 @@
+"""Where a log is: a path, or a URL."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from urllib.parse import unquote, urlsplit
+
+from cdmisfa.core.errors import UsageError
+
+SCHEMES: Final = ("s3", "http", "https")
+_URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Url:
+    """A log on a server; as a text it shows neither password nor signature.
+
+    Attributes:
+        address: the whole URL.
+    """
+
+    address: str
+
+    def __str__(self) -> str:
+        if self.scheme == "s3":
+            return self.address
+        parts = urlsplit(self.address)
+        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+
+    @property
+    def scheme(self) -> str:
+        """What stands before "://"."""
+        return self.address.split("://", 1)[0]
+
+    @property
+    def name(self) -> str:
+        """The last part of its path, fit for a file."""
+        last = str(self).rstrip("/").split("://", 1)[1].rsplit("/", 1)[-1]
+        name = re.sub(r"[/\\\0]", "_", last if self.scheme == "s3" else unquote(last))
+        return "log" if name in ("", ".", "..") else name
+
+    @property
+    def stem(self) -> str:
+        """The name without its last ending."""
+        return Path(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The last ending of the name."""
+        return Path(self.name).suffix
+
+    @property
+    def parent(self) -> Url:
+        """The folder it would be in."""
+        return Url(str(self).rstrip("/").rsplit("/", 1)[0])
+
+    @property
+    def folder(self) -> bool:
+        """Whether it names what is listed; only s3 lists."""
+        return self.scheme == "s3" and not {".mcap", ".partial"} & {self.suffix}
+
+
+Location = Path | Url
+"""Where a log is."""
+
+
+def location(value: str | Path | Url) -> Location:
+    """Tell a URL from a path.
+
+    Raises:
+        UsageError: a URL of a kind that is not read.
+    """
+    found = _URL.match(value) if isinstance(value, str) else None
+    if not isinstance(value, str) or found is None:
+        return value if isinstance(value, Url) else Path(value)
+    scheme = found[1].lower()
+    if scheme not in SCHEMES:
+        raise UsageError(f"{scheme}:// is not read: use one of {', '.join(SCHEMES)}, or a path")
+    url = Url(scheme + value[len(found[1]) :])
+    try:
+        parts = urlsplit(url.address)
+        whole = bool(parts.netloc and parts.path.strip("/"))
+    except ValueError:
+        whole = False
+    else:
+        _check_port(url)
+    if not whole and not (scheme == "s3" and url.address.removeprefix("s3://").strip("/")):
+        raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
+    return url
+
+
+def _check_port(url: Url) -> None:
+    """Refuse a port that no server can have.
+
+    Raises:
+        UsageError: it is no number up to 65535.
+    """
+    try:
+        _ = urlsplit(url.address).port if url.scheme != "s3" else None
+    except ValueError:
+        raise UsageError(f"{url} has no port: a port is a number up to 65535") from None

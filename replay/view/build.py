@@ -1,0 +1,140 @@
+"""Building the Rerun view of a run or a recording from its logs.
+
+The view can always be built again: the logs are the archive.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import rerun as rr
+from rerun.chunk import Chunk
+
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from recorder.log.logfile import partial_path
+from replay.runs.log import is_run, read_header, run_log
+from replay.runs.modules import MODULES_FILE, load_modules
+from replay.runs.outline import Tally, read_outline
+from replay.runs.stretches import read_stretches
+from replay.view.config import ViewConfig
+from replay.view.labels import label
+from replay.view.layout import RunLayout
+from replay.view.properties import APPLICATION, identity, properties_of, property_chunks
+from replay.view.recording import write_recording, write_unwatched
+from replay.view.run import RunView
+from replay.view.summary import summary_text
+
+ENDED = "ended:"
+"""How the event begins that says why a run ended."""
+
+FLUSH_SECONDS = 60.0
+
+
+def build_view(
+    path: Path,
+    out: Path,
+    *,
+    every: int = 10,
+    force: bool = True,
+    config: ViewConfig | None = None,
+    all_views: Path | None = None,
+) -> None:
+    """Write the view of a run or a recording as an .rrd file, whole or not at all.
+
+    Args:
+        path: a run's folder or its run.mcap, or a recording.
+        out: the file.
+        every: show every so many watched frames, of those that were kept.
+        force: replace an existing file.
+        config: everything else; `every` is then taken from it.
+        all_views: the recording that the run learned from, to show what was not watched too.
+
+    Raises:
+        UsageError: there is no such run or recording, `out` exists and `force` is not set, or
+            the run did not learn from the recording `all_views`.
+        LogDamagedError: it cannot be read.
+        CdmisfaError: the view cannot be written.
+    """
+    config = config or ViewConfig(every=every)
+    out, path = Path(out), Path(path)
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    if is_run(path):
+        log = run_log(path)
+        with recording_to(out, _name(log), log) as recording:
+            _write_run(recording, log, config, all_views)
+    elif all_views is not None:
+        raise UsageError(f"{path} is a recording: all of its views are shown anyway")
+    else:
+        with recording_to(out, path.resolve().stem, path) as recording:
+            write_recording(recording, path, config)
+
+
+@contextlib.contextmanager
+def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStream]:
+    """A Rerun recording that becomes the file `out` once it is complete.
+
+    Args:
+        out: the file; replaced.
+        name: what the viewer calls the recording.
+        source: what it is made from, so that others of the same name are not taken for it.
+
+    Raises:
+        UsageError: its folder is not there.
+        CdmisfaError: the file cannot be written.
+    """
+    partial = partial_path(out)
+    if not out.parent.is_dir():
+        raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
+    recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))
+    recording.set_log_time_enabled(False)
+    try:
+        recording.save(partial)
+        if not partial.exists():
+            raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
+        recording.send_recording_name(label(name))
+        yield recording
+        recording.flush(timeout_sec=FLUSH_SECONDS)
+        recording.disconnect()
+        os.replace(partial, out)
+    except (RuntimeError, OSError) as error:
+        raise CdmisfaError(f"{out} cannot be written: {error}") from error
+    finally:
+        recording.disconnect()
+        partial.unlink(missing_ok=True)
+
+
+def _write_run(
+    recording: rr.RecordingStream, log: Path, config: ViewConfig, all_views: Path | None
+) -> None:
+    header, folder = read_header(log), log.parent
+    streams: Sequence[int] = range(len(header.spec.streams))
+    if len(streams) > config.streams:  # which are watched most is known at the end only
+        streams = read_outline(log).streams(config.streams)
+    tally, view, ended = Tally(header), RunView(recording, header, streams, config), ""
+    for stretch in read_stretches(log, header, every=config.every):
+        for columns in stretch.signals:
+            tally.add(columns)
+        view.take(stretch)
+        ended = next((e.text for e in stretch.events if e.text.startswith(ENDED)), ended)
+    outline = tally.outline()
+    view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
+    # Not as `AnyValues`, which lose a value of another type than the process's first of its name.
+    recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
+    text = label(summary_text(outline, _name(log), _sentence(ended)))
+    recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)
+    layout = RunLayout(outline, all_views=all_views is not None, head=head)
+    recording.send_blueprint(layout.blueprint())
+
+
+def _sentence(ended: str) -> str:
+    reason = ended.removeprefix(ENDED).strip()
+    return f"It ended: {reason}." if reason else ""
+
+
+def _name(log: Path) -> str:
+    return log.resolve().parent.name

@@ -1,0 +1,206 @@
+"""What a run was and came to: the columns that the viewer's tables of runs show.
+
+Rows are written with the bindings below Rerun's package, which takes half a second to import.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+from rerun_bindings import ChunkInternal, ChunkStoreInternal, ComponentDescriptor
+
+from cdmisfa.core.errors import CdmisfaError
+from replay.runs.log import run_log
+from replay.view.labels import label
+
+if TYPE_CHECKING:
+    from replay.runs.outline import Outline
+
+APPLICATION = "cdmisfa"
+"""Rerun's application id: one layout is remembered for it."""
+
+Sections = dict[str, dict[str, Any]]
+"""Values by section of the configuration; those of `result` are what the run came to."""
+
+
+def identity(name: str, source: Path) -> str:
+    """The name of a recording, which no other one has: Rerun merges those of the same name.
+
+    Args:
+        name: what the viewer calls it.
+        source: the log that it is made from.
+    """
+    place = hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:12]
+    return f"{name}-{place}"
+
+
+def run_identity(run: Path) -> str:
+    """The name of the recording that shows a run.
+
+    Raises:
+        UsageError: there is no such run.
+    """
+    log = run_log(run)
+    return identity(log.resolve().parent.name, log)
+
+
+def properties_of(outline: Outline, folder: Path) -> Sections:
+    """Configuration and result of a run that was read through.
+
+    Args:
+        outline: the run in short.
+        folder: of the run, whose manifest says why it ended.
+    """
+    manifest = outline.header.manifest
+    result: dict[str, Any] = {
+        "seed": manifest.get("seed", 0),
+        "iterations": outline.iterations,
+        "frames": outline.frames,
+        "modules": len(outline.saved),
+        "learned": ", ".join(label(outline.names()[s.stream]) for s in outline.saved),
+        **_ending(_manifest(folder)),
+    }
+    return {**_configuration(manifest), "result": result}
+
+
+def read_properties(run: Path) -> Sections:
+    """The same as `properties_of`, from the manifest of a finished run alone.
+
+    The log of a run that has none, or no result in it, is read through.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: it cannot be read.
+    """
+    manifest = _manifest(run)
+    try:
+        found = manifest["result"]
+        modules = [label(str(module["stream"])) for module in found["modules"]]
+        result: dict[str, Any] = {
+            "seed": int(manifest["seed"]),
+            "iterations": int(found["iterations"]),
+            "frames": int(found["frames"]),
+            "modules": len(modules),
+            "learned": ", ".join(modules),
+            **_ending(manifest),
+        }
+    except (KeyError, TypeError, ValueError):
+        from replay.runs.outline import read_outline  # only where there is no result
+
+        return properties_of(read_outline(run), run)
+    return {**_configuration(manifest), "result": result}
+
+
+def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
+    """Write recordings that hold the properties of runs only, as the rows of a table.
+
+    A column has one type: text where the runs' values are of several, as "auto" and 0.5 are.
+
+    Args:
+        runs: folders of runs.
+        folder: of the files.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: it cannot be read.
+        CdmisfaError: a row cannot be written.
+    """
+    rows = [read_properties(run) for run in runs]
+    types: dict[tuple[str, str], set[type]] = {}
+    for row in rows:
+        for section, values in row.items():
+            for name, value in values.items():
+                types.setdefault((section, name), set()).add(type(value))
+    columns = {column: _joint(found) for column, found in types.items()}
+    cells: dict[tuple[str, str, Any], pa.Array] = {}  # runs of a sweep share most
+    files = []
+    for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
+        out = folder / f"{i:05d}.rrd"
+        try:
+            chunks = [
+                ChunkInternal.from_property(section, _components(section, values, columns, cells))
+                for section, values in row.items()
+            ]
+            stream = ChunkStoreInternal.from_chunks(chunks).stream()
+            stream.write_rrd(str(out), APPLICATION, run_identity(run))
+        except (RuntimeError, OSError, OverflowError, ValueError) as error:
+            raise CdmisfaError(f"{out} cannot be written: {error}") from error
+        files.append(out)
+    return files
+
+
+def property_chunks(sections: Sections) -> list[ChunkInternal]:
+    """The properties of one run as Rerun's chunks."""
+    return [
+        ChunkInternal.from_property(
+            section,
+            {ComponentDescriptor(name): pa.array([value]) for name, value in values.items()},
+        )
+        for section, values in sections.items()
+    ]
+
+
+def _joint(types: Iterable[type]) -> type:
+    """The type that holds values of all these."""
+    found = set(types)
+    if len(found) == 1:
+        return found.pop()
+    return float if found == {int, float} else str
+
+
+def _components(
+    section: str,
+    values: Mapping[str, Any],
+    columns: Mapping[tuple[str, str], type],
+    cells: dict[tuple[str, str, Any], pa.Array],
+) -> dict[ComponentDescriptor, pa.Array]:
+    """A section's values as Rerun stores them, in the types of their columns."""
+    components = {}
+    for name, value in values.items():
+        key = section, name, (type(value), value)
+        if key not in cells:
+            cells[key] = pa.array([columns[section, name](value)])
+        components[ComponentDescriptor(name)] = cells[key]
+    return components
+
+
+def _configuration(manifest: Mapping[str, Any]) -> Sections:
+    config = manifest.get("config")
+    tables = config.items() if isinstance(config, Mapping) else ()
+    sections = {str(name): _flat(table) for name, table in tables if isinstance(table, Mapping)}
+    return {name: values for name, values in sections.items() if values}
+
+
+def _manifest(folder: Path) -> Mapping[str, Any]:
+    """A run's manifest; empty where there is none that can be read."""
+    try:
+        document = json.loads((folder / "run.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, Mapping) else {}
+
+
+def _ending(manifest: Mapping[str, Any]) -> dict[str, str]:
+    """Why the run ended, where its manifest says it."""
+    try:
+        return {name: str(manifest["result"][name]) for name in ("ended", "signals_sha256")}
+    except (KeyError, TypeError):
+        return {}
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}".replace(".", "_")
+        if isinstance(value, Mapping):
+            values |= _flat(value, f"{name}_")
+        elif isinstance(value, bool | int | float):
+            values[name] = value
+        else:
+            values[name] = label(value if isinstance(value, str) else json.dumps(value))
+    return values

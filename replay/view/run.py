@@ -1,0 +1,324 @@
+"""A run as rows of a Rerun recording: every signal as it is, and what eyes need besides.
+
+`/signals/<name>` holds each signal's values for every iteration, read back they are
+those of run.mcap. `/world`, `/lanes`, `/decision`, `/gate`, `/abstraction` and
+`/modules` show the same for a person.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import SIGNALS, Signal
+from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, packed_all, shade
+from replay.runs.columns import SignalColumns
+from replay.runs.log import RunHeader
+from replay.runs.outline import Outline, delta_of
+from replay.runs.stretches import Stretch
+from replay.view.columns import TIMELINE_SIGNALS, Clock, Column, ImageColumn, TensorColumn
+from replay.view.config import ViewConfig
+from replay.view.labels import label, part
+from replay.view.lanes import Lanes
+
+AXES = {"S": "stream", "A": "action", "J": "output"}
+"""Names of tensors' dimensions; the second S of a tensor is the next stream."""
+
+BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
+"""Colours of signals that are drawn beside another one."""
+
+SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
+"""Signals whose name is their symbol, spelled out."""
+
+RECENT = 50
+"""Blocks over which the share of each stream is taken."""
+
+SPARSE = 10
+"""With more streams than are shown one by one, tensors are kept every so many iterations."""
+
+Frames = TypeVar("Frames", int, NDArray[np.int64])
+AnyColumn = TypeVar("AnyColumn", bound=Column)
+
+
+class RunView:
+    """Writes a run into a recording.
+
+    Args:
+        recording: the recording.
+        header: what stands at the beginning of the run's log.
+        streams: those that get lines and lanes of their own.
+        config: how the run is shown.
+
+    Attributes:
+        spec: what the learner's source delivered.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        header: RunHeader,
+        streams: Sequence[int],
+        config: ViewConfig,
+    ) -> None:
+        self._recording = recording
+        self._delta = delta_of(header)
+        self._config = config
+        self.spec = header.spec
+        self._clock = Clock(self.spec)
+        self._columns: dict[str, Column] = {}
+        self._streams = streams
+        self._tau = 1
+        self._recent = np.zeros((0, len(streams)), dtype=bool)
+        self._lanes = Lanes(recording, self._clock, self.spec.streams, self._streams)
+
+    def take(self, stretch: Stretch) -> None:
+        """Take what a log holds of some iterations."""
+        for columns in stretch.signals:
+            self.add(columns)
+        for frames, watched in stretch.watched:
+            self.watched(frames, watched)
+        for frames, truth in stretch.truth:
+            self.truth(frames, truth)
+        for t, phi in stretch.phi:
+            self.weights("abstraction/phi", t, phi)
+        for event in stretch.events:
+            self.event(event.t, event.iteration, event.text, event.level)
+
+    def finish(self, outline: Outline, modules: Sequence[Module]) -> None:
+        """Write what is known at the end, and hand over everything that waits.
+
+        Args:
+            outline: the run in short.
+            modules: the frozen modules, for their weights.
+        """
+        for module in modules:
+            t = module.iteration * self._tau
+            self.weights(f"modules/{module.index}/weights", t, module.phi)
+        if outline.iterations:
+            end = max(outline.frames - outline.tau, 1)
+            self.threshold(np.array([0, end]), np.array([0, outline.iterations - 1]))
+        self._lanes.end(outline.frames)
+        self.flush()
+
+    def add(self, columns: SignalColumns) -> None:
+        """Take the records of consecutive iterations."""
+        self._tau = max(columns.tau, 1)
+        self._signals(columns)
+        self._attention(columns)
+        self._decision(columns)
+        self._gate(columns)
+        self._saved(columns)
+        self._lanes.add(columns)
+
+    def watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
+        """Take (n, *frame_shape) of what the learner saw at n frames."""
+        shape, path = self.spec.frame_shape, "world/watched"
+        if len(shape) == 2:
+            kept = at % self._config.every == 0
+            if not kept.all():
+                at, frames = at[kept], frames[kept]
+            if len(at):
+                self._column(path, self._screen).add(at, self._iteration(at), frames)
+        else:
+            names = [f"x{i + 1}" for i in range(int(np.prod(shape)))]
+            line = self._line(path, names, 0)
+            line.add(at, self._iteration(at), frames.reshape(len(frames), -1))
+
+    def truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+        """Take (n, D) of what the world knows at n frames, and the learner does not."""
+        line = self._line("world/truth", list(self.spec.truth), 0)
+        line.add(at, self._iteration(at), values)
+
+    def weights(self, path: str, t: int, phi: NDArray[np.float64]) -> None:
+        """Show (J, I) weights at an entity."""
+        self._set_time(t, self._iteration(t))
+        self._recording.log(path, self._picture(phi))
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """Say in words what happened."""
+        self._set_time(t, iteration)
+        level = "WARN" if level == "WARNING" else level
+        self._recording.log("events", rr.TextLog(label(text), level=level))
+
+    def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
+        """Draw the line that eta-dot must fall below, through these frames."""
+        if self._delta is not None:
+            line = self._line("abstraction/delta", ["δ threshold"], 0, rgb=GREY)
+            line.add(frames, iterations, np.full((len(frames), 1), self._delta))
+
+    def flush(self) -> None:
+        """Hand over everything that waits."""
+        for column in self._columns.values():
+            column.flush()
+        self._lanes.flush()
+
+    def _signals(self, columns: SignalColumns) -> None:
+        """Every signal's values as they are."""
+        outputs = columns["y"].shape[2]
+        for signal in SIGNALS.values():
+            if signal.name in TIMELINE_SIGNALS:
+                continue
+            value, path = columns[signal.name], f"signals/{signal.name}"
+            if signal.show == "heat":
+                self._tensor(signal, path, columns, value)
+                if signal.name == "Q":  # what stream and action change is small beside the mean
+                    beside = value - value.mean(axis=(1, 2), keepdims=True)
+                    self._tensor(signal, "decision/Q_beside_mean", columns, beside)
+            elif signal.dims.startswith("M"):
+                for i in range(value.shape[1]):
+                    labels = _labels(signal, i + 1, outputs)
+                    line = self._line(f"{path}/{i + 1}", labels, i + 1)
+                    frames, iterations = columns.times("T" in signal.dims)
+                    line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
+            else:
+                labels = _labels(signal, 0, outputs)
+                number = BESIDE.get(signal.name, 0)
+                line = self._line(path, labels if signal.dims != "S" else None, number)
+                frames, iterations = columns.times(signal.dims.startswith("T"))
+                line.add(frames, iterations, value.reshape(len(frames), -1))
+
+    def _tensor(
+        self, signal: Signal, path: str, columns: SignalColumns, value: NDArray[Any]
+    ) -> None:
+        crowded = len(self.spec.streams) > self._config.streams
+        kept = columns.iterations % SPARSE == 0 if crowded else np.ones(len(value), dtype=bool)
+        if value.size and kept.any():
+            names = [AXES[d] for d in signal.dims]
+            if names.count("stream") > 1:
+                names[-1] = "next stream"
+            column = self._column(
+                path,
+                lambda: TensorColumn(self._recording, self._clock, path, self._config.rows, names),
+            )
+            column.add(columns.frames[kept], columns.iterations[kept], value[kept])
+
+    def _attention(self, columns: SignalColumns) -> None:
+        """How much of the recent blocks each shown stream was watched."""
+        watched = columns["stream"][:, None] == np.array(self._streams)
+        all_of_them = np.concatenate([self._recent, watched])
+        sums = np.cumsum(all_of_them, axis=0)
+        end = np.arange(len(self._recent), len(all_of_them))
+        before = end - RECENT
+        shares = sums[end] - np.where(before[:, None] < 0, 0, sums[np.maximum(before, 0)])
+        self._recent = all_of_them[-RECENT:]
+        names = [self.spec.streams[s] for s in self._streams]
+        line = self._line("decision/attention", names, 0, rgbs=[colour(s) for s in self._streams])
+        line.add(*columns.times(), shares / np.minimum(end + 1, RECENT)[:, None])
+
+    def _decision(self, columns: SignalColumns) -> None:
+        """Reward and value of each shown stream, as lines in the streams' colours."""
+        reward, value = columns["R"], columns["Q"]
+        for s in self._streams:
+            name = self.spec.streams[s]
+            place = part(self.spec.streams, s)
+            if reward.size:
+                line = self._line(f"decision/R_stay/{place}", [f"R stay {name}"], s)
+                line.add(*columns.times(), reward[:, s, 0, s])
+            line = self._line(f"decision/advantage/{place}", [f"Q stay - switch {name}"], s)
+            line.add(*columns.times(), value[:, s, 0] - value[:, s, 1])
+
+    def _gate(self, columns: SignalColumns) -> None:
+        """Each frozen module's band of 2 SD, whose blocks it knows."""
+        mean, width = columns["band_mean"], 2 * columns["band_sd"]
+        edges = np.concatenate([mean - width, mean + width], axis=2)
+        for i in range(edges.shape[1]):
+            labels = [f"band of module {i + 1}"] * edges.shape[2]
+            self._line(f"gate/band/{i + 1}", labels, i, width=1.0).add(
+                *columns.times(), edges[:, i]
+            )
+
+    def _saved(self, columns: SignalColumns) -> None:
+        """Where eta-dot stood when a module was saved."""
+        saved = columns["saved"]
+        if saved.any():
+            marks = self._column("abstraction/saved", self._marks)
+            eta_dot = columns["eta_dot"][saved, :1]
+            marks.add(columns.frames[saved], columns.iterations[saved], eta_dot)
+
+    def _marks(self) -> Column:
+        path = "abstraction/saved"
+        style = rr.SeriesPoints(
+            colors=[packed(VERMILLION)],
+            markers="diamond",
+            marker_sizes=[7.0],
+            names=["module saved"],
+        )
+        self._recording.log(path, style, static=True)
+        return Column(self._recording, self._clock, path, self._config.rows)
+
+    def _screen(self) -> Column:
+        path = "world/watched"
+        column = ImageColumn(self._recording, self._clock, path, self._config.rows)
+        column.declare(*self.spec.frame_shape)
+        return column
+
+    def _picture(self, phi: NDArray[np.float64]) -> Any:
+        """(J, I) weights as images below one another, as bars, or as a tensor."""
+        shape = self.spec.frame_shape
+        if len(shape) == 2 and phi.shape[1] == shape[0] * shape[1]:
+            return rr.Image(shade(phi.reshape(-1, shape[1])))
+        if phi.size <= 256:
+            return rr.BarChart(phi.reshape(-1).copy(), color=packed(SKY))
+        return rr.Tensor(phi.copy(), dim_names=("output", "input"))
+
+    def _iteration(self, t: Frames) -> Frames:
+        return t // self._tau
+
+    def _set_time(self, t: int, iteration: int) -> None:
+        self._recording.set_time("frame", sequence=t)
+        self._recording.set_time("iteration", sequence=max(iteration, 0))
+        time = np.datetime64(self.spec.time_ns(t), "ns")
+        self._recording.set_time("message_log_time", timestamp=time)
+
+    def _line(
+        self,
+        path: str,
+        labels: Sequence[str] | None,
+        number: int,
+        *,
+        rgb: Rgb | None = None,
+        rgbs: Sequence[Rgb] | None = None,
+        width: float = 1.5,
+    ) -> Column:
+        """The column of a line, its names and colours said once."""
+
+        def declare() -> Column:
+            if labels is not None:
+                shades = rgbs or [rgb or colour(number + i) for i in range(len(labels))]
+                if len(set(labels)) == 1:
+                    shades = [shades[0]] * len(labels)
+                style = rr.SeriesLines(
+                    names=[label(text) for text in labels],
+                    colors=packed_all(shades),
+                    widths=[width] * len(labels),
+                )
+                self._recording.log(path, style, static=True)
+            return Column(self._recording, self._clock, path, self._config.rows)
+
+        return self._column(path, declare)
+
+    def _column(self, path: str, make: Callable[[], AnyColumn]) -> Column:
+        if path not in self._columns:
+            self._columns[path] = make()
+        return self._columns[path]
+
+
+def _labels(signal: Signal, module: int, outputs: int) -> list[str]:
+    """Names of a signal's lines: its symbol and unit, its module, its outputs."""
+    name = signal.name.replace("_", " ")
+    if module:
+        symbol = signal.symbol.replace("_i", f"_{module}")
+        text = symbol if signal.name in SPELLED else f"{symbol} {name} module {module}".strip()
+    elif signal.name in SPELLED or signal.symbol == name:
+        text = signal.symbol
+    else:
+        text = f"{signal.symbol} {name}".strip()
+    unit = "" if signal.unit in ("", "1") else f" [{signal.unit}]"
+    if "J" not in signal.dims or outputs == 1:
+        return [f"{text}{unit}"]
+    return [f"{text} output {j + 1}{unit}" for j in range(outputs)]

@@ -1,0 +1,302 @@
+"""Many runs in one table: Rerun's own catalogue server over a folder of runs.
+
+A row is a run, its columns are the run's configuration and result; from there each run
+is opened in its own view. The rows come first, from the manifests; the views, which are
+larger and may have to be built, follow as a second layer of the same recordings. Only
+programs on this machine can connect.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rerun_bindings import CatalogClientInternal, RrdReaderInternal
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from recorder.log.logfile import PARTIAL
+from replay.runs.log import is_run, run_log
+from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
+from replay.viewer.program import free_port, has_display, running
+
+VIEW_FILE = "run.rrd"
+"""Name of the view in a run's folder."""
+
+REQUEST = "sweep.json"
+"""File of a sweep that names the trials it was asked for last."""
+
+TRIALS = "trials"
+"""Folder of a sweep that holds its runs."""
+
+ROWS = "base"
+"""Name of the layer of rows."""
+
+LAYER = "view"
+"""Name of the layer of views, beside that of the rows."""
+
+TOGETHER = 100
+"""Views that are registered at once: each time the server goes over all that it has."""
+
+REGISTER_SECONDS = 300
+"""Longest wait for the server to read what is registered at once."""
+
+START_SECONDS = 60.0
+"""Longest wait for the server to listen."""
+
+LAST_SECONDS = 5.0
+"""Longest wait, at the end, for the view that is being built."""
+
+Progress = Callable[[int, int], None]
+
+REFUSALS = (OSError, RuntimeError, ValueError)
+"""What Rerun's client raises when the server refuses, or is not there."""
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """The folders of runs in a folder or in its `trials`; none where it is itself a run.
+
+    Of a sweep's trials they are those that it was asked for last.
+
+    Args:
+        folder: of a sweep, or any other.
+
+    Raises:
+        LogDamagedError: the sweep's request cannot be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir() or is_run(folder):
+        return []
+    trials = list((folder / TRIALS).iterdir()) if (folder / TRIALS).is_dir() else []
+    if is_sweep(folder):
+        asked = _asked(folder / REQUEST)
+        trials = [trial for trial in trials if trial.name.removesuffix(PARTIAL) in asked]
+    return sorted(p for p in (*folder.iterdir(), *trials) if p.is_dir() and is_run(p))
+
+
+def is_sweep(folder: Path) -> bool:
+    """Whether a folder is that of a sweep."""
+    return (Path(folder) / REQUEST).is_file()
+
+
+def _asked(request: Path) -> set[str]:
+    try:
+        return {str(trial["id"]) for trial in json.loads(request.read_text("utf-8"))["trials"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise LogDamagedError(f"{request} is damaged: run the sweep again to write it") from error
+
+
+def ready_view(run: Path) -> Path:
+    """The view of a run; built where it is missing, older than the log, or of another run.
+
+    Raises:
+        LogDamagedError: the run cannot be read.
+        CdmisfaError: the view cannot be written.
+    """
+    from replay.view.build import build_view  # only where a view is missing
+
+    view, log = run / VIEW_FILE, run_log(run)
+    old = not view.is_file() or view.stat().st_mtime < log.stat().st_mtime
+    if old or _identity(view) != run_identity(run):  # the copy of a run brings its view along
+        build_view(run, view)
+    return view
+
+
+def serve_catalogue(
+    folder: Path, *, port: int | None = None, progress: Progress | None = None
+) -> None:
+    """Serve a folder of runs until interrupted, and open it where there is a display.
+
+    Prints the address of their table on stderr as soon as it is there; the views that the
+    rows lead to follow. A run whose view cannot be made is named on stderr.
+
+    Args:
+        folder: of a sweep that kept its logs, or any folder of runs.
+        port: to listen at; by default a free one.
+        progress: called with the views that are ready, and all.
+
+    Raises:
+        UsageError: there is no run in it.
+        LogDamagedError: a run without a manifest cannot be read.
+        CdmisfaError: the server ended with an error.
+    """
+    runs = runs_in(folder)
+    if not runs:
+        raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
+    port, ended = port or free_port(), threading.Event()
+    address = f"rerun+http://127.0.0.1:{port}"
+    with (
+        tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place,
+        running(["server", "--host", "127.0.0.1", "--port", str(port)]) as server,
+    ):
+        files = write_rows(runs, Path(place))  # while the server starts
+        dataset = _created(address, _dataset_name(folder), server)
+        if dataset is None:
+            return
+        refused = _register(dataset, files, ROWS)
+        for file, reason in refused.items():
+            print(f"{runs[files.index(file)]} has no row: {reason}", file=sys.stderr, flush=True)
+        table = f"{address}/entry/{dataset.entry_details().id}"
+        shown = f"{len(runs) - len(refused)} runs at {table}    look at them: rerun {table}"
+        print(shown, file=sys.stderr, flush=True)
+        follow = threading.Thread(
+            target=_follow, args=(runs, dataset, Path(place), table, progress, ended), daemon=True
+        )
+        follow.start()
+        try:
+            server.wait()
+        finally:
+            ended.set()
+            follow.join(LAST_SECONDS)
+
+
+def _created(address: str, name: str, server: subprocess.Popen[bytes]) -> Any:
+    """A new dataset of a server that is starting; None where the server has ended.
+
+    Raises:
+        CdmisfaError: it does not listen in time.
+    """
+    # Rerun's public client of a catalogue needs DataFusion; for this it is too much.
+    end, refusal = time.monotonic() + START_SECONDS, ""
+    while time.monotonic() < end:
+        if server.poll() is not None:
+            return None
+        try:
+            return CatalogClientInternal(address).create_dataset(name)
+        except REFUSALS as error:
+            refusal = str(error).splitlines()[0]
+        time.sleep(0.01)
+    raise CdmisfaError(f"the server did not start within {START_SECONDS:.0f} s: {refusal}")
+
+
+def _follow(
+    runs: Sequence[Path],
+    dataset: Any,
+    place: Path,
+    table: str,
+    progress: Progress | None,
+    ended: threading.Event,
+) -> None:
+    """Open the table of runs, and add the views to it."""
+    if has_display():
+        from replay.viewer.live import open_live
+
+        open_live(table)
+    try:
+        set_layout(runs, dataset, place)
+    except (CdmisfaError, *REFUSALS) as error:
+        print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
+    try:
+        add_views(runs, dataset, place, progress, ended)
+    except REFUSALS as error:
+        if not ended.wait(1.0):  # the server goes first
+            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+
+
+def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
+    """Make the layout of the run that learned most the one in which every run opens.
+
+    Args:
+        runs: folders of runs.
+        dataset: the server's.
+        place: folder of the layout's file.
+
+    Raises:
+        LogDamagedError: that run cannot be read.
+    """
+    from replay.runs.outline import read_outline
+    from replay.view.layout import RunLayout  # takes half a second: only once the table is there
+
+    results = [read_properties(run)["result"] for run in runs]
+    most = max(range(len(runs)), key=lambda i: int(results[i]["modules"]))
+    outline = read_outline(runs[most])
+    # Its own ranges would cut the others' curves off: the viewer chooses each run's.
+    outline = replace(
+        outline,
+        frames=max(int(result["frames"]) for result in results),
+        lines={name: values[:0] for name, values in outline.lines.items()},
+    )
+    file = place / "layout.rbl"
+    RunLayout(outline).blueprint().save(APPLICATION, str(file))
+    layouts = dataset.blueprint_dataset()
+    (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
+    dataset.set_default_blueprint_segment_id(segment)
+
+
+def add_views(
+    runs: Sequence[Path],
+    dataset: Any,
+    place: Path,
+    progress: Progress | None = None,
+    ended: threading.Event | None = None,
+) -> None:
+    """Add the views of runs to the rows that a server has, building what is missing or old.
+
+    A run whose view cannot be made is named on stderr and left with its row alone.
+
+    Args:
+        runs: folders of runs.
+        dataset: the server's.
+        place: folder for copies of views.
+        progress: called with the runs that are done, and all.
+        ended: set once the server has ended.
+    """
+    for start in range(0, len(runs), TOGETHER):
+        views: list[Path] = []
+        for i, run in enumerate(runs[start : start + TOGETHER], start + 1):
+            if ended is not None and ended.is_set():
+                return
+            try:
+                views.append(ready_view(run))
+            except (CdmisfaError, OSError) as error:
+                print(f"{run} has no view: {error}", file=sys.stderr, flush=True)
+            if progress is not None:
+                progress(i, len(runs))
+        # The rows hold the properties too, perhaps in other types: a table's column has one.
+        bare = {
+            _without_properties(view, place / f"view-{start + i:05d}.rrd"): view
+            for i, view in enumerate(_register(dataset, views, LAYER))
+        }
+        for copy, reason in _register(dataset, list(bare), LAYER).items():
+            print(f"{bare[copy]} is not served: {reason}", file=sys.stderr, flush=True)
+
+
+def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str]:
+    """Add recordings to a dataset; those that the server refuses, with its reasons."""
+    if not files:
+        return {}
+    names = {file.resolve().as_uri(): file for file in files}
+    handle = dataset.register(list(names), [layer] * len(names), "replace")
+    answers = handle.iter_results(REGISTER_SECONDS)
+    return {names[name]: reason.splitlines()[-1] for name, _, reason in answers if reason}
+
+
+def _without_properties(view: Path, out: Path) -> Path:
+    """A copy of a view that leaves a run's properties to its row."""
+    reader = RrdReaderInternal(str(view))
+    (store,) = (s for s in reader.store_entries() if s.kind == "recording")
+    kept = reader.stream(store).drop_matching(content=["/__properties/**"])
+    kept.write_rrd(str(out), store.application_id, store.recording_id)
+    return out
+
+
+def _dataset_name(folder: Path) -> str:
+    """A folder's name in the letters that the server takes."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", folder.resolve().name).strip("_.-")[:180] or "runs"
+
+
+def _identity(view: Path) -> str:
+    """Name of the recording in a view, "" where it cannot be read."""
+    with contextlib.suppress(*REFUSALS):
+        stores = RrdReaderInternal(str(view)).store_entries()
+        return next((str(s.recording_id) for s in stores if s.kind == "recording"), "")
+    return ""

@@ -1,0 +1,196 @@
+"""A run in the viewer while it learns.
+
+What the learner thinks is kept in memory and handed over in large pieces, so that the
+learner hardly waits for it. Only programs on this machine can connect.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
+from replay.runs.columns import columns_of_records
+from replay.runs.log import RunHeader, read_header, run_log
+from replay.runs.outline import LINES, Outline
+from replay.runs.stretches import read_stretches
+from replay.view.config import ViewConfig
+from replay.view.layout import MOST_MODULES, RunLayout
+from replay.view.properties import APPLICATION
+from replay.view.run import RunView
+from replay.viewer.program import environment, free_port, program
+
+EVERY_SECONDS = 1.5
+"""Time between two pieces."""
+
+MOST_BLOCKS = 500
+"""Most blocks that wait, however quick the learner is."""
+
+LAST_SECONDS = 5.0
+"""Longest wait for viewers to take the last piece."""
+
+MEMORY = "1GiB"
+"""Most that is kept for viewers that connect later; the oldest goes first."""
+
+
+class LiveView:
+    """Shows a run to viewers on this machine while it learns.
+
+    Args:
+        spec: what the learner's source delivers.
+        manifest: what the run was started with, as for `RunWriter`.
+        tau: frames of a block.
+        outputs: outputs of an abstraction.
+        port: to listen at; by default a free one.
+
+    Raises:
+        CdmisfaError: the port is taken, or Rerun is switched off.
+    """
+
+    def __init__(
+        self,
+        spec: SourceSpec,
+        manifest: Mapping[str, Any],
+        tau: int,
+        outputs: int,
+        *,
+        port: int | None = None,
+    ) -> None:
+        outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest, 1), tau, outputs)
+        self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
+        self._recording.set_log_time_enabled(False)
+        if not rr.is_enabled(self._recording):
+            raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
+        server = rr.GrpcServerSink(
+            bind_ip="127.0.0.1", port=port or free_port(), server_memory_limit=MEMORY
+        )
+        try:
+            self._recording.set_sinks(server)
+        except RuntimeError as error:
+            raise CdmisfaError(f"no live view at port {port}: {error}") from error
+        self.address = str(server.uri)
+        self._recording.send_recording_name("live")
+        self._recording.send_blueprint(RunLayout(outline).blueprint())
+        # No image is left out here: of each block only the first is taken.
+        config = ViewConfig(every=1)
+        self._view = RunView(
+            self._recording, outline.header, outline.streams(config.streams), config
+        )
+        self._tau = tau
+        self._images = len(spec.frame_shape) == 2
+        self._records: list[BlockSignals] = []
+        self._watched: list[NDArray[Any]] = []
+        self._truth: list[NDArray[np.float64]] = []
+        self._next = time.monotonic() + EVERY_SECONDS
+        self._phi: NDArray[np.float64] | None = None
+
+    def block(self, signals: BlockSignals, block: Block, phi: NDArray[np.float64]) -> None:
+        """Take what one iteration gave; see `RunWriter.block`."""
+        self._records.append(signals)
+        self._watched.append(block.frames[:: len(block) if self._images else 1].copy())
+        self._truth.append(block.truth.copy())
+        self._phi = phi
+        if signals.saved:
+            self._view.weights(f"modules/{signals.module}/weights", block.t, phi)
+        if len(self._records) >= MOST_BLOCKS or time.monotonic() >= self._next:
+            self.flush()
+
+    def earlier(self, run: Path) -> None:
+        """Show what the log of a run that goes on holds already, before its next block.
+
+        Raises:
+            UsageError: there is no such run.
+            LogDamagedError: its log cannot be read.
+        """
+        log = run_log(run)
+        for stretch in read_stretches(log, read_header(log), every=self._tau):
+            self._view.take(stretch)
+            weights = dict(stretch.phi)
+            for columns in stretch.signals:
+                self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
+                for i in np.flatnonzero(columns["saved"]).tolist():
+                    t, module = int(columns.frames[i]), int(columns["module"][i])
+                    if t in weights:
+                        self._view.weights(f"modules/{module}/weights", t, weights[t])
+            self._view.flush()
+
+    def event(self, t: int, iteration: int, text: str) -> None:
+        """Say in words what happened."""
+        self._view.event(t, iteration, text)
+
+    def flush(self) -> None:
+        """Hand over everything that waits."""
+        if self._records and self._phi is not None:
+            last, starts = self._records[-1], np.array([s.t for s in self._records])
+            every = (starts[:, None] + np.arange(len(last.y))).reshape(-1)
+            for columns in columns_of_records(self._records):
+                self._view.add(columns)
+            self._view.watched(starts if self._images else every, np.concatenate(self._watched))
+            if self._view.spec.truth:
+                self._view.truth(every, np.concatenate(self._truth))
+            self._view.threshold(np.array([last.t]), np.array([last.iteration]))
+            self._view.weights("abstraction/phi", last.t, self._phi)
+            self._records, self._watched, self._truth = [], [], []
+        self._view.flush()
+        self._next = time.monotonic() + EVERY_SECONDS
+
+    def close(self) -> None:
+        """Hand over the rest and stop serving; a viewer keeps what it has."""
+        self.flush()
+        with contextlib.suppress(RuntimeError):
+            self._recording.flush(timeout_sec=LAST_SECONDS)
+        self._recording.disconnect()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def open_live(address: str, memory_limit: str = "2GB") -> None:
+    """Open a viewer on a live view; it stays open when the run has ended."""
+    command = [str(program()), "--connect", address, "--memory-limit", memory_limit]
+    subprocess.Popen(
+        command,
+        env=environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
+    """A run that has not begun: there may come as many modules as there are streams."""
+    streams = len(header.spec.streams)
+    return Outline(
+        header=header,
+        iterations=0,
+        frames=0,
+        tau=tau,
+        outputs=outputs,
+        modules=min(streams, MOST_MODULES),
+        visits=np.zeros(streams, dtype=np.int64),
+        saved=(),
+        last=None,
+        policy=(),
+        lines={name: np.empty(0) for name in LINES},
+    )
