@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-from cdmisfa.core.blocks import START_NS
+from cdmisfa.core.clock import START_NS
 from cdmisfa.core.config import as_table, positive, within
 from cdmisfa.core.errors import UsageError
 

@@ -12,8 +12,8 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.log import logfile
-from recorder.log.logfile import LogFile, partial_path
+from recorder.log.logfile import LogFile
+from recorder.log.whole import PARTIAL, partial_path
 
 SECOND = 1_000_000_000
 
@@ -204,4 +204,4 @@ def test_one_schema_is_registered_once(tmp_path):
     with LogFile(tmp_path / "a.mcap") as log:
         assert log.add_schema("X", "protobuf", b"1") == log.add_schema("X", "protobuf", b"1")
         assert log.add_schema("X", "protobuf", b"2") != log.add_schema("X", "protobuf", b"1")
-    assert logfile.PARTIAL == ".partial"
+    assert PARTIAL == ".partial"

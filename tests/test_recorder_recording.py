@@ -20,9 +20,9 @@ from recorder import recording
 from recorder.config import RecordConfig, SceneConfig
 from recorder.log import viewlog
 from recorder.log.folder import ASKED, held
-from recorder.log.logfile import partial_path
 from recorder.log.parts import Split
 from recorder.log.viewlog import METADATA, frames_held, sha256
+from recorder.log.whole import partial_path
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource
 from recorder.world.rendering import BLOCK, requests

@@ -17,10 +17,11 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 
-from cdmisfa.agents.learner import CuriousLearner, LearnerState
+from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.learning import LearnerState
 from cdmisfa.experiments.checkpoint import (
     SET_ASIDE,
     checkpoints,

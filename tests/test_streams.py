@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from source_contract import SourceContract
 
-from cdmisfa.core.blocks import START_NS, FrameSource
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError
 from recorder.world.oscillatory import PERIOD, OscillatorySource
 

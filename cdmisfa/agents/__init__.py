@@ -5,6 +5,6 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "cdmisfa.agents.learner": "CuriousLearner LearnerState",
+        "cdmisfa.agents.learner": "CuriousLearner",
     },
 )

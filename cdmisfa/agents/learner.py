@@ -6,8 +6,6 @@ blocks give the same signals, bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,6 +26,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expanded_size, quadratic
+from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.features.incsfa import IncSFA, project
@@ -36,21 +35,6 @@ Float = NDArray[np.float64]
 
 POLICY_KEY, WEIGHTS_KEY = 1, 2
 """Spawn keys of the learner's two random generators, beneath the run's seed."""
-
-
-@dataclass(frozen=True, slots=True)
-class LearnerState:
-    """Everything that changes in a learner, so that it can be put away and taken up again.
-
-    Attributes:
-        arrays: the agent's memory and the adaptive abstraction, by name.
-        modules: what was learned so far.
-        policy_rng: state of the policy's random generator, as its `bit_generator.state`.
-    """
-
-    arrays: Mapping[str, NDArray[Any]]
-    modules: tuple[Module, ...]
-    policy_rng: Mapping[str, Any]
 
 
 MAX_INPUTS = 2_000_000

@@ -5,10 +5,12 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "cdmisfa.core.blocks": "Block FrameSource SourceSpec",
-        "cdmisfa.core.signals": "SIGNALS BlockSignals",
-        "cdmisfa.core.modules": "Module",
+        "cdmisfa.core.blocks": "Block FrameSource HeadPose SeekableSource SourceSpec",
         "cdmisfa.core.config": "LearnerConfig",
-        "cdmisfa.core.errors": "CdmisfaError LogDamagedError UsageError",
+        "cdmisfa.core.errors": "CdmisfaError LogDamagedError LogExhaustedError UsageError",
+        "cdmisfa.core.learning": "Learner LearnerState Sink",
+        "cdmisfa.core.modules": "Module",
+        "cdmisfa.core.registry": "Registry",
+        "cdmisfa.core.signals": "SIGNALS BlockSignals",
     },
 )

@@ -13,15 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, frames_of, time_of, times_of
 from cdmisfa.core.errors import UsageError
-
-NANOSECONDS = 1_000_000_000
-
-START_NS = 1_451_606_400_000_000_000
-"""Log time of frame 0 where nothing else is set: 2016-01-01, the year of the paper."""
-
-SLOWEST = 1e-6
-"""Frames a second of the slowest clock; the fastest has one a nanosecond, the unit of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +71,29 @@ class SourceSpec:
                 f"[{SLOWEST:g}, {NANOSECONDS:g}]"
             )
 
+    @property
+    def images(self) -> bool:
+        """Whether frames are gray images, and not values."""
+        return self.dtype == "uint8" and len(self.frame_shape) == 2
+
     def time_ns(self, t: int) -> int:
-        """Log time of frame t in nanoseconds: the start plus t frames, never the wall clock."""
-        return self.start_ns + round(t * NANOSECONDS / self.fps)
+        """Log time of frame t, in nanoseconds."""
+        return time_of(t, self.fps, self.start_ns)
+
+    def times(self, start: int, stop: int) -> Times:
+        """Log times of the frames [start, stop), in nanoseconds."""
+        return times_of(np.arange(start, stop), self.fps, self.start_ns)
+
+    def frames_at(self, times: NDArray[Any]) -> Times:
+        """The frames nearest to log times in nanoseconds."""
+        return frames_of(times, self.fps, self.start_ns)
 
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """Streams of frames on one clock: simulated, synthetic or recorded, all the same.
+    """Streams of frames on one clock: simulated, synthetic, live or recorded, all the same.
+
+    It only goes forward; what can also go back is a `SeekableSource`.
 
     Blocks do not depend on how they are cut: `take(s, 40)` gives the frames of
     `take(s, 15)` followed by `take(s, 25)`. Which stream is watched never changes
@@ -108,11 +116,12 @@ class FrameSource(Protocol):
             ValueError: no such stream, or n < 1.
         """
 
-    def seek(self, t: int) -> None:
-        """Move the clock to frame t, so that the next block starts there.
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """What every stream shows in the next n frames, in their order; moves t by n.
 
         Raises:
-            ValueError: there is no frame before 0.
+            LogExhaustedError: fewer than n frames are left; t stays.
+            ValueError: n < 1.
         """
 
     def describe(self) -> Mapping[str, Any]:
@@ -120,6 +129,27 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Let go of files and simulators; harmless when called twice."""
+
+
+@runtime_checkable
+class SeekableSource(FrameSource, Protocol):
+    """A source that can show any frame again. A class that derives from it has `take_all`."""
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t, so that the next block starts there.
+
+        Raises:
+            ValueError: there is no frame before 0.
+        """
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """What every stream shows in the next n frames; see `FrameSource`."""
+        start = self.t
+        blocks = []
+        for stream in range(len(self.spec.streams)):
+            self.seek(start)
+            blocks.append(self.take(stream, n))
+        return tuple(blocks)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.learner import CuriousLearner, LearnerState
+from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION
 
@@ -171,7 +172,7 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path 
     Raises:
         UsageError: there is no run, or it was made with another configuration or source.
     """
-    from recorder.log.logfile import partial_path
+    from recorder.log.whole import partial_path
     from replay.runs.log import RUN_FILE
 
     whole, aside = run / RUN_FILE, run / SET_ASIDE
@@ -189,7 +190,7 @@ def log_to_go_on_with(run: Path) -> Path:
     Raises:
         UsageError: there is no run.
     """
-    from recorder.log.logfile import partial_path
+    from recorder.log.whole import partial_path
     from replay.runs.log import RUN_FILE
 
     whole = run / RUN_FILE

@@ -20,7 +20,7 @@ from typing import Any
 
 from cdmisfa.agents.agent import think
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.compiled import needs_compiling
 from cdmisfa.core.config import LearnerConfig, as_table
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
@@ -349,6 +349,8 @@ def _go_on(log: Any, learner: CuriousLearner, source: FrameSource, digest: Signa
         restore(learner, checkpoint)
         for signals in log.take_over(before, checkpoint.iteration):
             digest.add(signals)
+        if not isinstance(source, SeekableSource):
+            raise UsageError("this source cannot go back: resume from its recording")
         source.seek(checkpoint.t)
         last = max(checkpoint.iteration - 1, 0)
         log.event(source.t, last, f"resumed at iteration {checkpoint.iteration}")

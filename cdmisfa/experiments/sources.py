@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.core.blocks import FrameSource, SourceSpec
+from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
 from recorder.config import SCENE_KEYS, RecordConfig, SceneConfig, scene_table
@@ -156,7 +156,7 @@ def open_source(
     salvage: bool = False,
     cameras: CameraOptions | None = None,
     follow: float | None = None,
-) -> tuple[FrameSource, Configuration]:
+) -> tuple[SeekableSource, Configuration]:
     """Open a live scene by its name, a recording, or other people's camera logs.
 
     Args:
@@ -201,7 +201,7 @@ def open_source(
                 f"{path}: no such file or folder, and no scene either: "
                 f"the scenes are {', '.join(SCENES)}"
             )
-    source: FrameSource
+    source: SeekableSource
     if follow is not None:
         from replay.recordings.followed import FollowedSource
 
@@ -224,7 +224,7 @@ def open_log(
     loop: bool = False,
     salvage: bool = False,
     cameras: CameraOptions | None = None,
-) -> FrameSource:
+) -> SeekableSource:
     """Open a recording of ours, or what else holds images.
 
     Args:

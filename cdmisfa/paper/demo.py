@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.run import Progress, RunResult, learn
@@ -149,7 +149,7 @@ def _learn(
 
 
 @contextlib.contextmanager
-def _opened(words: list[str | Path], seed: int) -> Iterator[FrameSource]:
+def _opened(words: list[str | Path], seed: int) -> Iterator[SeekableSource]:
     source, _ = open_source(words, seed=seed, loop=True)
     with contextlib.closing(source):
         yield source
@@ -170,7 +170,7 @@ def _check(
     bar.say(f"live and recorded signals of {iterations} iterations are the same, bit for bit")
 
 
-def _score(module: Module, source: FrameSource) -> Learned:
+def _score(module: Module, source: SeekableSource) -> Learned:
     """Find the true quantity that a module's first output follows best."""
     y, truth = _outputs(module, source)
     r = correlations(y[:, 0], truth)
@@ -186,7 +186,7 @@ def _score(module: Module, source: FrameSource) -> Learned:
 
 
 def _outputs(
-    module: Module, source: FrameSource
+    module: Module, source: SeekableSource
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Outputs (n, J) of a module on its own view, and what was true then (n, D)."""
     from cdmisfa.features.incsfa import project

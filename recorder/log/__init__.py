@@ -5,7 +5,7 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "recorder.log.logfile": "LogFile partial_path",
+        "recorder.log.logfile": "LogFile",
         "recorder.log.parts": "Split ViewParts",
         "recorder.log.viewfacts": "ViewFacts",
         "recorder.log.viewlog": "Identity ViewLog",

@@ -17,9 +17,7 @@ from typing import BinaryIO, Literal, Self
 from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-
-PARTIAL = ".partial"
-"""Ending of a file that is being written, or whose writing was cut short."""
+from recorder.log.whole import partial_path
 
 FLUSH_NS = 1_000_000_000
 """Log time after which the chunk in progress is handed to the operating system."""
@@ -31,11 +29,6 @@ _COMPRESSION = {
     "lz4": CompressionType.LZ4,
     "none": CompressionType.NONE,
 }
-
-
-def partial_path(path: Path) -> Path:
-    """Where a log is written until it is finished."""
-    return path.with_name(path.name + PARTIAL)
 
 
 class LogFile:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import NANOSECONDS
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import SCHEMA_VERSION
 

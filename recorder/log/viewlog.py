@@ -19,7 +19,7 @@ from mcap.records import Channel, Message
 from cdmisfa.core.blocks import Block, HeadPose, SourceSpec
 from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
-from recorder.log.logfile import LogFile, partial_path
+from recorder.log.logfile import LogFile
 from recorder.log.messages import (
     METADATA,
     POSE_TOPIC,
@@ -31,6 +31,7 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
+from recorder.log.whole import partial_path
 
 CONFIG_NAME = "config.json"
 ROOT_FRAME = "root"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, HeadPose, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, HeadPose, SeekableSource, SourceSpec, check_request, freeze
 from recorder.config import RecordConfig, SceneConfig, scene_table
 from recorder.world.eyes import Eyes
 from recorder.world.motions import Motions
@@ -17,7 +17,7 @@ TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 """Columns of ground truth: the objects' positions in the paper's coordinates, metres."""
 
 
-class LiveSource:
+class LiveSource(SeekableSource):
     """What the robot's eyes see, rendered when it is asked for.
 
     Args:

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import START_NS, Block, SourceSpec, check_frame, check_request, freeze
+from cdmisfa.core.blocks import (
+    Block,
+    SeekableSource,
+    SourceSpec,
+    check_frame,
+    check_request,
+    freeze,
+)
+from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 
 PERIOD = 500
@@ -66,7 +74,7 @@ def one_period(name: str) -> Float:
     return freeze(np.ascontiguousarray(STREAMS[name](theta)))
 
 
-class OscillatorySource:
+class OscillatorySource(SeekableSource):
     """Deterministic two-dimensional streams on the common clock.
 
     Args:

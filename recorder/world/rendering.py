@@ -13,7 +13,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 
-from cdmisfa.core.blocks import Block, FrameSource
+from cdmisfa.core.blocks import Block, SeekableSource
 from cdmisfa.core.errors import CdmisfaError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.scenes import open_scene
@@ -27,7 +27,7 @@ BLOCK = 64
 _AHEAD = 3
 """Blocks a process may be ahead of the writer."""
 
-_source: FrameSource | None = None
+_source: SeekableSource | None = None
 
 
 def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
@@ -45,7 +45,7 @@ def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
                 yield stream, first, high - first
 
 
-def render_here(source: FrameSource, wanted: Iterable[Request]) -> Generator[Block, None, None]:
+def render_here(source: SeekableSource, wanted: Iterable[Request]) -> Generator[Block, None, None]:
     """The blocks, one after the other, from one source."""
     for request in wanted:
         yield _take(source, request)
@@ -118,7 +118,7 @@ def _render(request: Request) -> Block:
     return _take(_source, request)
 
 
-def _take(source: FrameSource, request: Request) -> Block:
+def _take(source: SeekableSource, request: Request) -> Block:
     stream, first, n = request
     source.seek(first)
     return source.take(stream, n)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.oscillatory import OscillatorySource
@@ -15,7 +15,7 @@ SCENES = ("icub", "oscillatory")
 
 def open_scene(
     kind: str, scene: SceneConfig | None = None, record: RecordConfig | None = None
-) -> FrameSource:
+) -> SeekableSource:
     """A live source of a scene's streams.
 
     Args:

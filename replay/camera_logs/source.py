@@ -12,7 +12,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import NANOSECONDS, Block, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from replay.camera_logs.joined import join_parts
 from replay.camera_logs.pixels import step_of
@@ -45,7 +46,7 @@ class Aligned:
     dropped: int
 
 
-class ForeignSource:
+class ForeignSource(SeekableSource):
     """Cameras in MCAP logs, ROS bags, videos and folders of pictures, gray and small, on one clock.
 
     Args:

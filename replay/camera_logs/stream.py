@@ -11,7 +11,7 @@ from typing import Any, Final, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import NANOSECONDS
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.pixels import (
     RECIPE,

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import NANOSECONDS
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.pixels import MAX_PIXELS, RECIPE, RawPixels, gray, shrink
 from replay.mcap.records import Bytes, MalformedRecord

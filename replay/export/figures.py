@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.logfile import partial_path
+from recorder.log.whole import partial_path
 from replay.export.history import History, read_history
 from replay.palette import GREY, VERMILLION, Rgb, colour
 from replay.runs.log import run_log

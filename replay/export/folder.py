@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.logfile import partial_path
+from recorder.log.whole import partial_path
 
 WRITTEN = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
 """Endings of the files that exports write; a folder with others is somebody else's."""

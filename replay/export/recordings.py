@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.signals import SIGNALS, BlockSignals, Signal
-from recorder.log.logfile import partial_path
+from recorder.log.whole import partial_path
 from replay.export.folder import whole_folder
 from replay.export.images import check_images, write_images
 from replay.export.lerobot import write_lerobot

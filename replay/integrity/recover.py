@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.log.logfile import PARTIAL, LogFile
+from recorder.log.logfile import LogFile
+from recorder.log.whole import PARTIAL
 from replay.integrity.info import ChannelSurvey
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel, Schema

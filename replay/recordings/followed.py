@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.blocks import Block, SourceSpec, check_request
+from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
-from recorder.log.logfile import PARTIAL
+from recorder.log.whole import PARTIAL
 from replay.recordings.source import RecordedSource
 from replay.storage.listing import log_files
 
@@ -18,7 +18,7 @@ POLL: Final = 0.1
 """Seconds between two looks at the files."""
 
 
-class FollowedSource:
+class FollowedSource(SeekableSource):
     """The views of a recording, of which more frames come while it is read.
 
     A recorder hands over whole seconds of frames; a block that is not there yet is waited

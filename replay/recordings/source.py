@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
-from recorder.log.logfile import PARTIAL
 from recorder.log.viewfacts import ViewFacts
+from recorder.log.whole import PARTIAL
 from replay.mcap.identity import identity
 from replay.mcap.reader import LogReader
 from replay.recordings.view_file import ViewFile, intersection
@@ -33,7 +33,7 @@ _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns")
 _SAME_VALUES: Final = ("scene", "seed", "config_sha256")
 
 
-class RecordedSource:
+class RecordedSource(SeekableSource):
     """The views of a recording on their common clock.
 
     Args:

@@ -22,11 +22,13 @@ from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
 from google.protobuf import message
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import NANOSECONDS, Block, SourceSpec
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
-from recorder.log.logfile import PARTIAL, LogFile, partial_path
+from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
+from recorder.log.whole import PARTIAL, partial_path
 from replay.mcap.reader import LogReader
 from replay.runs import matrix_message, signals_message
 

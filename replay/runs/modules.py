@@ -14,7 +14,7 @@ import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.modules import Module
-from recorder.log.logfile import partial_path
+from recorder.log.whole import partial_path
 
 MODULES_FILE = "modules.npz"
 """Name of the file in a run's folder."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.log.logfile import PARTIAL
+from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
 from replay.runs import matrix_message, signals_message

@@ -14,7 +14,7 @@ import rerun as rr
 from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.logfile import partial_path
+from recorder.log.whole import partial_path
 from replay.runs.log import is_run, read_header, run_log
 from replay.runs.modules import MODULES_FILE, load_modules
 from replay.runs.outline import Tally, read_outline

@@ -14,7 +14,8 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import NANOSECONDS, SourceSpec
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.clock import NANOSECONDS
 
 FRAME = "frame"
 """Timeline of the global frame counter t."""

@@ -24,7 +24,7 @@ from typing import Any
 from rerun_bindings import CatalogClientInternal, RrdReaderInternal
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from recorder.log.logfile import PARTIAL
+from recorder.log.whole import PARTIAL
 from replay.runs.log import is_run, run_log
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
 from replay.viewer.program import free_port, has_display, running

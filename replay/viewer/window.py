@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.logfile import partial_path
+from recorder.log.whole import partial_path
 from replay.recordings.source import RecordedSource
 from replay.runs.log import is_run, read_signals
 from replay.view.build import build_view

@@ -1,0 +1,106 @@
+"""What learns, and what is told about it: `Learner` and `Sink`.
+
+`cdmisfa.experiments.run.learn` brings a source, a learner and sinks together, and knows no more
+of them than is said here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import BlockSignals
+
+
+@dataclass(frozen=True, slots=True)
+class LearnerState:
+    """Everything that changes in a learner, from which it can be restored.
+
+    Attributes:
+        arrays: the learner's memory, by name.
+        modules: what was learned so far.
+        policy_rng: state of the policy's random generator, as its `bit_generator.state`.
+    """
+
+    arrays: Mapping[str, NDArray[Any]]
+    modules: tuple[Module, ...]
+    policy_rng: Mapping[str, Any]
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """Blocks in, signals out. The same blocks give the same signals, bit for bit."""
+
+    @property
+    def stream(self) -> int:
+        """The stream it wants to watch next."""
+
+    @property
+    def tau(self) -> int:
+        """Frames it wants in each block."""
+
+    @property
+    def iteration(self) -> int:
+        """Iterations so far."""
+
+    @property
+    def modules(self) -> Sequence[Module]:
+        """What it learned so far."""
+
+    @property
+    def over(self) -> bool:
+        """Whether it has nothing left to learn."""
+
+    def step(self, block: Block) -> BlockSignals:
+        """One iteration: look at tau frames, learn, and decide what to watch next.
+
+        Raises:
+            ValueError: it is not the block that was asked for.
+            CdmisfaError: it holds a value that is no finite number.
+        """
+
+    @property
+    def state(self) -> LearnerState:
+        """Everything that changes in it, a copy."""
+
+    def restore(self, state: LearnerState) -> None:
+        """Go to a state of a learner with the same configuration, spec and seed.
+
+        Raises:
+            ValueError: the state is not one of such a learner.
+        """
+
+    def summary(self) -> Mapping[str, Any]:
+        """Its part of a run's result, as JSON values."""
+
+
+@runtime_checkable
+class Sink(Protocol):
+    """Takes what happens in a run, in order: a log, a view, a hash, a progress bar."""
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """An iteration is over.
+
+        Args:
+            block: what was watched.
+            signals: what came of it.
+            learner: as it is now; not to be changed.
+        """
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """Something happened that a person wants to read.
+
+        Args:
+            t: frame at which.
+            iteration: the last one before it.
+            text: one line.
+            level: "INFO" or "WARNING".
+        """
+
+    def finish(self) -> None:
+        """The run is over, for whatever reason, and was not broken off by an error."""

@@ -1,0 +1,67 @@
+"""`Registry`: things of one kind by their names, to which anybody may add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Generic, TypeVar
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import did_you_mean
+
+Entry = TypeVar("Entry")
+
+
+class Registry(Mapping[str, Entry], Generic[Entry]):
+    """Entries by name, in the order in which they were added.
+
+    Args:
+        kind: what an entry is, for messages: "expansion".
+        entries: those there are from the beginning.
+
+    Example:
+        >>> sizes = Registry("size", {"small": 1})
+        >>> sizes.add("large", 100)
+        >>> list(sizes), sizes["large"]
+        (['small', 'large'], 100)
+    """
+
+    def __init__(self, kind: str, entries: Mapping[str, Entry] | None = None) -> None:
+        self._kind = kind
+        self._entries = dict(entries or {})
+
+    def add(self, name: str, entry: Entry) -> None:
+        """Add an entry.
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        if name in self._entries:
+            raise ValueError(f"there is a {self._kind} {name!r} already")
+        self._entries[name] = entry
+
+    def remove(self, name: str) -> None:
+        """Take an entry out again."""
+        del self._entries[name]
+
+    def __getitem__(self, name: str) -> Entry:
+        """The entry of a name.
+
+        Raises:
+            UsageError: there is none; it names the nearest.
+        """
+        if name not in self._entries:
+            raise UsageError(f"no {self._kind} {name!r}: {did_you_mean(name, self._entries)}")
+        return self._entries[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def get(self, name: str, default: Entry | None = None) -> Entry | None:  # type: ignore[override]
+        """The entry of a name, or the default."""
+        return self._entries.get(name, default)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
