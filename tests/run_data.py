@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,11 @@ def run_of(
         yield signals, block_of(spec, signals.stream, signals.t, tau, rng)
 
 
+def having(phi: NDArray[Any]) -> Any:
+    """What stands for a learner whose weights, frozen or not, are these."""
+    return SimpleNamespace(phi=phi, modules=[SimpleNamespace(phi=phi)])
+
+
 def write_run(
     path: Path,
     spec: SourceSpec,
@@ -123,7 +129,7 @@ def write_run(
     records = []
     for signals, block in run_of(spec, iterations, tau=tau, seed=seed, saves=saves):
         phi = np.full((1, phi_size), float(signals.iteration))
-        writer.block(signals, block, phi)
+        writer.block(block, signals, having(phi))
         records.append(signals)
     writer.event(iterations * tau, iterations - 1, "stopped: the test is over")
     writer.finish()

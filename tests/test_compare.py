@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from run_data import VECTOR, run_of, write_run
+from run_data import VECTOR, having, run_of, write_run
 
 from replay.runs.compare import compare
 from replay.runs.log import RunWriter
@@ -18,7 +18,7 @@ def write_changed(path, iteration, name, change):
             if signals.iteration == iteration:
                 value = change(np.array(getattr(signals, name)))
                 signals = dataclasses.replace(signals, **{name: value})
-            writer.block(signals, block, np.zeros((1, 2)))
+            writer.block(block, signals, having(np.zeros((1, 2))))
 
 
 def test_equal_runs_have_no_difference(tmp_path):
@@ -65,6 +65,6 @@ def test_a_run_that_ended_early_is_said_so(tmp_path):
     write_run(tmp_path / "a", VECTOR, 8, seed=3)
     with RunWriter(tmp_path / "b", VECTOR, {}) as writer:
         for signals, block in list(run_of(VECTOR, 8, seed=3))[:6]:
-            writer.block(signals, block, np.zeros((1, 2)))
+            writer.block(block, signals, having(np.zeros((1, 2))))
     difference = compare(tmp_path / "a", tmp_path / "b")
     assert str(difference) == "iteration 6: goes on against ended after 6 iterations"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from PIL import Image
-from run_data import IMAGE, VECTOR, run_of
+from run_data import IMAGE, VECTOR, having, run_of
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
@@ -33,7 +33,7 @@ def _strict(monkeypatch):
 
 def feed(view, spec, iterations=30, tau=40):
     for signals, block in run_of(spec, iterations, saves=True):
-        view.block(signals, block, np.ones((1, int(np.prod(spec.frame_shape)))))
+        view.block(block, signals, having(np.ones((1, int(np.prod(spec.frame_shape))))))
     view.event(iterations * tau, iterations - 1, "the end")
 
 

@@ -159,14 +159,14 @@ def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
         sys.path.insert(0, sys.argv[2])
         from pathlib import Path
         import numpy as np
-        from run_data import VECTOR, run_of
+        from run_data import VECTOR, having, run_of
         from replay.runs import log as runlog
         runlog.FLUSH_SECONDS = 0.2
         writer = runlog.RunWriter(Path(sys.argv[1]), VECTOR, {})
         for signals, block in run_of(VECTOR, 22):
             if signals.iteration == 20:
                 time.sleep(0.25)
-            writer.block(signals, block, np.zeros((1, 2)))
+            writer.block(block, signals, having(np.zeros((1, 2))))
         os.kill(os.getpid(), signal.SIGKILL)
     """
     path = tmp_path / "run.mcap"

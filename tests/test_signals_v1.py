@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from run_data import VECTOR, write_run
+from run_data import VECTOR, having, write_run
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -82,7 +82,7 @@ def written(folder: Path, records: list[BlockSignals]) -> Path:
     folder.mkdir()
     with RunWriter(folder / "run.mcap", header.spec, header.manifest) as writer:
         for signals, x, world in zip(records, watched, truth, strict=True):
-            writer.block(signals, Block(signals.stream, signals.t, x, world), phi)
+            writer.block(Block(signals.stream, signals.t, x, world), signals, having(phi))
     return folder
 
 

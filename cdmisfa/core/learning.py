@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block
@@ -53,6 +54,10 @@ class Learner(Protocol):
         """What it learned so far."""
 
     @property
+    def phi(self) -> NDArray[np.float64]:
+        """Weights of what it is learning now, (J, I), a copy."""
+
+    @property
     def over(self) -> bool:
         """Whether it has nothing left to learn."""
 
@@ -81,7 +86,10 @@ class Learner(Protocol):
 
 @runtime_checkable
 class Sink(Protocol):
-    """Takes what happens in a run, in order: a log, a view, a hash, a progress bar."""
+    """Takes what happens in a run, in order: a log, a view, a hash, a progress bar.
+
+    A class that derives from it needs only what it has a use for.
+    """
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """An iteration is over.
@@ -104,3 +112,8 @@ class Sink(Protocol):
 
     def finish(self) -> None:
         """The run is over, for whatever reason, and was not broken off by an error."""
+
+
+def weights_after(signals: BlockSignals, learner: Learner) -> NDArray[np.float64]:
+    """The weights (J, I) that a learner's last iteration ended with, frozen where it saved them."""
+    return learner.modules[-1].phi if signals.saved else learner.phi

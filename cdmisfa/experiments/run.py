@@ -191,9 +191,7 @@ def learn(
             for sink in (log, shown):
                 if sink is None:
                     continue
-                sink.block(
-                    signals, block, learner.modules[-1].phi if signals.saved else learner.phi
-                )
+                sink.block(block, signals, learner)
                 if len(learner.modules) > learned:
                     sink.event(block.t, signals.iteration, _saved_text(learner, source))
             if log is not None and checkpoint_every and learner.iteration % checkpoint_every == 0:

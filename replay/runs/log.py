@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
@@ -98,7 +99,7 @@ class Event:
     level: str
 
 
-class RunWriter:
+class RunWriter(Sink):
     """Writes run.mcap; a context manager that finishes on success.
 
     Args:
@@ -173,14 +174,8 @@ class RunWriter:
         """The file's name once it is finished."""
         return self._log.path
 
-    def block(self, signals: BlockSignals, block: Block, phi: NDArray[np.float64]) -> None:
-        """Write what one iteration gave.
-
-        Args:
-            signals: the iteration's record.
-            block: the frames it is about.
-            phi: (J, I) weights of the abstraction after the block.
-        """
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """Write what one iteration gave; see `Sink`."""
         at, k = signals.log_time, signals.iteration
         sequence = k & 0xFFFFFFFF
         self._log.write(self._signals, at, signals_message.encode(signals), sequence)
@@ -195,18 +190,13 @@ class RunWriter:
             frames = block.frames.reshape(len(block), -1)
             self._log.write(self._watched, at, matrix_message.encode(block.t, frames), sequence)
         if k % self._phi_every == 0 or signals.saved:
+            phi = weights_after(signals, learner)
             self._log.write(self._phi, at, matrix_message.encode(block.t, phi), sequence)
         if time.monotonic() >= self._next_flush:
             self.flush()
 
-    def event(
-        self,
-        t: int,
-        iteration: int,
-        text: str,
-        level: Literal["INFO", "WARNING", "ERROR"] = "INFO",
-    ) -> None:
-        """Write in words what happened at frame t."""
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """Write in words what happened at frame t; see `Sink`."""
         entry = Log_pb2.Log(
             level=Log_pb2.Log.Level.Value(level), message=text, name=f"iteration {iteration}"
         )

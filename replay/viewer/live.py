@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from replay.runs.columns import columns_of_records
 from replay.runs.log import RunHeader, read_header, run_log
@@ -45,7 +46,7 @@ MEMORY = "1GiB"
 """Most that is kept for viewers that connect later; the oldest goes first."""
 
 
-class LiveView:
+class LiveView(Sink):
     """Shows a run to viewers on this machine while it learns.
 
     Args:
@@ -96,8 +97,9 @@ class LiveView:
         self._next = time.monotonic() + EVERY_SECONDS
         self._phi: NDArray[np.float64] | None = None
 
-    def block(self, signals: BlockSignals, block: Block, phi: NDArray[np.float64]) -> None:
-        """Take what one iteration gave; see `RunWriter.block`."""
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """Take what one iteration gave; see `Sink`."""
+        phi = weights_after(signals, learner)
         self._records.append(signals)
         self._watched.append(block.frames[:: len(block) if self._images else 1].copy())
         self._truth.append(block.truth.copy())
@@ -126,9 +128,13 @@ class LiveView:
                         self._view.weights(f"modules/{module}/weights", t, weights[t])
             self._view.flush()
 
-    def event(self, t: int, iteration: int, text: str) -> None:
-        """Say in words what happened."""
-        self._view.event(t, iteration, text)
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """Say in words what happened; see `Sink`."""
+        self._view.event(t, iteration, text, level)
+
+    def finish(self) -> None:
+        """Hand over the rest; viewers are served until `close`."""
+        self.flush()
 
     def flush(self) -> None:
         """Hand over everything that waits."""
