@@ -128,7 +128,7 @@ def test_a_converted_log_is_a_recording_with_the_same_signals(cdmisfa: Cdmisfa, 
 
 
 def test_topics_become_names_of_files() -> None:
-    from cdmisfa.experiments.convert import view_names
+    from replay.camera_logs.names import view_names
 
     topics = ("/a/image", "/a,image", "../../etc", "/")
     assert view_names(topics) == ("a_image", "a_image-2", "etc", "stream")

@@ -21,7 +21,8 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.pixels import ENCODINGS, RawPixels, gray, image_decoder, shrink
+from replay.camera_logs.messages import image_decoder
+from replay.camera_logs.pixels import ENCODINGS, RawPixels, gray, shrink
 from replay.camera_logs.source import ForeignSource
 from replay.mcap.records import MalformedRecord
 

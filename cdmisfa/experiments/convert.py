@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +20,7 @@ from recorder.recording import (
     remove_views,
     written,
 )
+from replay.camera_logs.names import view_names
 from replay.camera_logs.source import ForeignSource
 
 KIND: Final = "foreign"
@@ -89,18 +88,3 @@ def convert(
         for log in logs:
             log.finish()
     return [written(log.view, path, n) for log in logs for path, n in log.parts]
-
-
-def view_names(topics: Sequence[str]) -> tuple[str, ...]:
-    """Topics as names of views, which are names of files, too: "/cam/left" is cam_left.
-
-    Letters lose their accents, those of other scripts stay.
-    """
-    names: list[str] = []
-    for topic in topics:
-        letters = unicodedata.normalize("NFKD", topic)
-        bare = "".join(c for c in letters if not unicodedata.combining(c))
-        plain = re.sub(r"[^\w.-]+", "_", bare).strip("._") or "stream"
-        taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
-        names.append(f"{plain}-{taken + 1}" if taken else plain)
-    return tuple(names)

@@ -237,7 +237,7 @@ def open_log(
         UsageError: no such log, or streams that need to be aligned.
         LogDamagedError: it is damaged.
     """
-    from replay.camera_logs.stream import only_foreign
+    from replay.camera_logs.opening import only_foreign
     from replay.recordings.source import RecordedSource
     from replay.recordings.view_file import NoRecordingError
 
@@ -255,7 +255,7 @@ def open_log(
 
 def _refuse_what_is_no_log(path: Location) -> None:
     """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
-    from replay.camera_logs.stream import only_foreign
+    from replay.camera_logs.opening import only_foreign
     from replay.mcap.identity import starts_as_log
     from replay.runs.log import RUN_FILE, is_run
     from replay.storage.location import Url

@@ -6,6 +6,7 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "replay.camera_logs.source": "ForeignSource",
-        "replay.camera_logs.stream": "ImageStream open_images",
+        "replay.camera_logs.opening": "open_images",
+        "replay.camera_logs.stream": "ImageStream",
     },
 )

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.pixels import RECIPE, Decoder, image_decoder, shrink
-from replay.camera_logs.stream import choose_topic
+from replay.camera_logs.messages import Decoder
+from replay.camera_logs.pixels import RECIPE, shrink
+from replay.camera_logs.stream import choose_images, explained, sorted_times
 from replay.mcap.records import Bytes, MalformedRecord
 
-_ROS1_TYPES = {
-    "sensor_msgs/msg/Image": "sensor_msgs/Image",
-    "sensor_msgs/msg/CompressedImage": "sensor_msgs/CompressedImage",
-}
+BAGS: Final = (".bag", ".db3")
 
 
 class BagImages:
@@ -44,20 +41,19 @@ class BagImages:
         self._next = -1
         ros1 = path.suffix == ".bag" and path.is_file()
         reader = _reader_of(path, ros1=ros1)
-        with _explained(path):
+        with explained(path, "rosbags"):
             reader.open()
         self._reader = reader
         try:
             self._connections, self._decode = self._find(topic, ros1=ros1)
-            with _explained(path):
+            with explained(path, "rosbags"):
                 stamps = [stamp for stamp, _ in self._from(None)]
+            if not stamps:
+                raise UsageError(f"{path}: there is no message on {self.topic}")
+            self.times = sorted_times(f"{path}: {self.topic}", stamps)
         except BaseException:
             self.close()
             raise
-        if not stamps:
-            self.close()
-            raise UsageError(f"{path}: there is no message on {self.topic}")
-        self.times = np.array(stamps, np.uint64)
         self.count = len(stamps)
 
     @property
@@ -76,7 +72,7 @@ class BagImages:
         Raises:
             LogDamagedError: the message is no image that is read, or the bag is damaged.
         """
-        with _explained(self.path):
+        with explained(self.path, "rosbags"):
             if row != self._next:
                 self._messages = self._from(int(self.times[row]))
                 self._next = int(np.searchsorted(self.times, self.times[row]))
@@ -106,20 +102,18 @@ class BagImages:
             yield stamp, data
 
     def _find(self, topic: str | None, *, ros1: bool) -> tuple[list[Any], Decoder]:
-        decoders: dict[str, Decoder] = {}
-        others: dict[str, str] = {}
-        for connection in self._reader.connections:
-            kind = str(connection.msgtype)
-            schema = _ROS1_TYPES.get(kind, kind) if ros1 else kind
-            decoder = image_decoder(schema, "ros1" if ros1 else "cdr")
-            if decoder is None:
-                others[connection.topic] = kind
-            else:
-                decoders[connection.topic] = decoder
-        chosen = choose_topic(self.path, topic, [(name, name) for name in decoders], others)
         # Several publishers on one topic are several connections of a ROS 1 bag.
-        connections = [c for c in self._reader.connections if c.topic == chosen]
-        return connections, decoders[chosen]
+        kinds = {str(c.topic): str(c.msgtype) for c in self._reader.connections}
+        encoding = "ros1" if ros1 else "cdr"
+        chosen, decode = choose_images(
+            self.path,
+            topic,
+            [
+                (name, kind.replace("/msg/", "/") if ros1 else kind, encoding, name)
+                for name, kind in kinds.items()
+            ],
+        )
+        return [c for c in self._reader.connections if c.topic == chosen], decode
 
 
 def _reader_of(path: Path, *, ros1: bool) -> Any:
@@ -130,17 +124,5 @@ def _reader_of(path: Path, *, ros1: bool) -> Any:
         raise CdmisfaError(
             f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
-    with _explained(path):
+    with explained(path, "rosbags"):
         return Rosbag1(path) if ros1 else Rosbag2(path)
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Say in one line what rosbags, which lets any exception through, cannot read."""
-    try:
-        yield
-    except (CdmisfaError, MemoryError):
-        raise
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}"[:200]
-        raise LogDamagedError(f"{path}: rosbags cannot read it ({reason})") from None

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from cdmisfa.core.errors import UsageError
-from replay.camera_logs.stream import ImageStream, McapImages
+from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 from replay.storage.location import Location
 
@@ -59,40 +57,6 @@ class JoinedImages:
         """Let go of the files; harmless when called twice."""
         for part in self.parts:
             part.close()
-
-
-def open_joined(
-    path: Path,
-    files: Sequence[Path],
-    topic: str | None,
-    size: tuple[int, int],
-    *,
-    salvage: bool = False,
-) -> ImageStream:
-    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
-
-    Raises:
-        UsageError: no part has images on the topic, or they have several topics.
-        LogDamagedError: a part is damaged.
-    """
-    parts: list[ImageStream] = []
-    refusal: UsageError | None = None
-    try:
-        for file in files:
-            try:
-                parts.append(McapImages(file, topic, size, salvage=salvage))
-            except UsageError as error:
-                refusal = refusal or error
-        if refusal is not None and (topic is None or not parts):
-            raise refusal
-        topics = {part.topic for part in parts}
-        if len(topics) > 1:
-            raise UsageError(f"{path}: name one --topic; it has images on: {sorted(topics)}")
-    except BaseException:
-        for part in parts:
-            part.close()
-        raise
-    return JoinedImages(path, parts)
 
 
 def join_parts(streams: Sequence[ImageStream]) -> list[ImageStream]:

@@ -2,48 +2,33 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
-from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from replay.camera_logs.joined import join_parts
-from replay.camera_logs.pixels import step_of
-from replay.camera_logs.stream import (
-    ImageStream,
+from replay.camera_logs.alignment import (
+    Aligned,
+    by_index,
+    by_time,
     even_times,
-    fingerprint,
-    image_logs,
-    open_images,
+    of_other_rate,
+    overlap,
+    step_of,
+    unlike,
 )
+from replay.camera_logs.joined import join_parts
+from replay.camera_logs.names import stream_names
+from replay.camera_logs.opening import fingerprint, image_logs, open_images
+from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 from replay.storage.location import Location, Url
 
 Align = Literal["index", "time"]
-MAX_FRAMES: Final = 2**31
-
-
-@dataclass(frozen=True, slots=True)
-class Aligned:
-    """A stream on the common clock.
-
-    Attributes:
-        rows: (n,) int64, which message each frame shows.
-        repeated: frames that show the message of the frame before again.
-        dropped: messages that no frame shows.
-    """
-
-    rows: NDArray[np.int64]
-    repeated: int
-    dropped: int
 
 
 class ForeignSource(SeekableSource):
@@ -110,7 +95,7 @@ class ForeignSource(SeekableSource):
             self._times = [
                 s.times if len(s.times) else even_times(s.count, self._fps) for s in self._streams
             ]
-            self._aligned = self._put_on_clock(align)
+            start_ns, self._aligned = self._put_on_clock(align)
             for stream, aligned in enumerate(self._aligned):  # refused before anything is written
                 self._frame(stream, int(aligned.rows[0]))
         except BaseException:
@@ -118,23 +103,21 @@ class ForeignSource(SeekableSource):
             raise
         self._count = len(self._aligned[0].rows)
         self._spec = SourceSpec(
-            _names(self._streams),
+            stream_names(self._streams),
             size,
             "uint8",
             (),
             self._fps,
-            self._start,
+            start_ns,
             None if loop else self._count,
         )
         self.alignment = {
             name: {
-                "messages": stream.count,
+                "messages": aligned.messages,
                 "repeated": aligned.repeated,
                 "dropped": aligned.dropped,
             }
-            for name, stream, aligned in zip(
-                self._spec.streams, self._streams, self._aligned, strict=True
-            )
+            for name, aligned in zip(self._spec.streams, self._aligned, strict=True)
         }
         self.warnings = tuple(dict.fromkeys(w for s in self._streams for w in s.warnings))
 
@@ -220,79 +203,51 @@ class ForeignSource(SeekableSource):
         self._shown[stream] = (row, frame)
         return frame
 
-    def _put_on_clock(self, align: Align | None) -> list[Aligned]:
+    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Aligned]]:
+        """When frame 0 is, and which image of each stream every frame shows.
+
+        Raises:
+            UsageError: `align` is needed, or puts nothing on the clock.
+        """
         if align == "time":
-            return self._by_time()
+            start, stop = overlap(self._times)
+            if stop < start:
+                raise UsageError(
+                    f"{self._files[0]}: its streams have no time in common; use --align index"
+                )
+            return start, by_time(self._times, start, stop, self._fps)
         if align is None:
             self._refuse_unequal()
-            self._refuse_rate()
-        self._start = int(self._times[0][0])
-        count = min(len(times) for times in self._times)
-        return [Aligned(np.arange(count), 0, len(times) - count) for times in self._times]
-
-    def _refuse_rate(self) -> None:
-        """Refuse to take images at another rate than theirs without being told how.
-
-        Raises:
-            UsageError: their rate differs by more than a hundredth from the one asked for.
-        """
-        for stream in self._streams:
-            step = step_of(stream.times)
-            if step > 0 and abs(step * self._fps - 1) > 0.01:
-                raise UsageError(
-                    f"{stream.topic} has {1 / step:g} images a second, not {self._fps:g}: choose "
-                    f"images by their times, as with: {self._command()}"
-                )
-
-    def _overlap(self) -> tuple[int, int]:
-        """From when to when every stream has images, in nanoseconds."""
-        starts, stops = zip(*((int(t[0]), int(t[-1])) for t in self._times), strict=True)
-        return max(starts), min(stops)
-
-    def _by_time(self) -> list[Aligned]:
-        self._start, stop = self._overlap()
-        if stop < self._start:
-            raise UsageError(
-                f"{self._files[0]}: its streams have no time in common; use --align index"
-            )
-        ticks = (stop - self._start) * self._fps / NANOSECONDS + 1
-        if ticks > MAX_FRAMES:
-            raise UsageError(f"--rate {self._fps:g} makes {ticks:.0f} frames: choose a lower one")
-        offsets = np.rint(np.arange(int(ticks)) * NANOSECONDS / self._fps).astype(np.uint64)
-        clock = np.uint64(self._start) + offsets
-        aligned = []
-        for times in self._times:
-            rows = np.searchsorted(times, clock, side="right").astype(np.int64) - 1
-            shown = len(np.unique(rows))
-            aligned.append(Aligned(rows, len(rows) - shown, len(times) - shown))
-        return aligned
+        return int(self._times[0][0]), by_index(self._times)
 
     def _refuse_unequal(self) -> None:
-        """Refuse streams whose i-th images were not taken together, with what would work.
+        """Refuse streams that are not on one clock, or not on the one asked for.
 
         Raises:
-            UsageError: they differ in number, or by more than half a step.
+            UsageError: they differ in number, by more than half a step, or in their rate; it
+                says what would work.
         """
         first = self._times[0]
-        half = NANOSECONDS * step_of(first) / 2
         for stream, times in zip(self._streams[1:], self._times[1:], strict=True):
-            if len(times) != len(first):
-                reason = f"{len(first)} and {len(times)} images"
-            elif np.abs(times.astype(np.int64) - first.astype(np.int64)).max() > half:
-                reason = "images at different times"
-            else:
-                continue
-            raise UsageError(
-                f"{self._streams[0].topic} and {stream.topic} have {reason}: put them on one "
-                f"clock, as with: {self._command()}"
-            )
+            reason = unlike(first, times)
+            if reason:
+                raise UsageError(
+                    f"{self._streams[0].topic} and {stream.topic} have {reason}: put them on one "
+                    f"clock, as with: {self._command()}"
+                )
+        for stream, times in zip(self._streams, self._times, strict=True):
+            if of_other_rate(times, self._fps):
+                raise UsageError(
+                    f"{stream.topic} has {1 / step_of(times):g} images a second, not "
+                    f"{self._fps:g}: choose images by their times, as with: {self._command()}"
+                )
 
     def _command(self) -> str:
         """Give a command that takes these streams."""
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        start, stop = self._overlap()
+        start, stop = overlap(self._times)
         words += ["--size", f"{self._size[1]}x{self._size[0]}"]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
@@ -322,34 +277,3 @@ def _rate(streams: Sequence[ImageStream]) -> float:
     if not step > 0:
         raise UsageError(f"{timed.path}: {timed.topic} tells no rate; set one with --rate")
     return float(f"{1 / step:.6g}")
-
-
-def _names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
-    """Topics as names of streams, with the file's and folders' where topics are shared."""
-    topics = [s.topic for s in streams]
-    if len(set(topics)) == len(topics):
-        return tuple(topics)
-    places = [_place(stream) for stream in streams]
-    for i, place in enumerate(places):
-        if place in places[:i]:
-            raise UsageError(f"{topics[i]} of {streams[i].path} is named twice: leave one out")
-    for folders in range(max(len(Path(path).parts) for path, _ in places)):
-        names = [_in_folders(stream, folders) for stream in streams]
-        if len(set(names)) == len(names):
-            return tuple(names)
-    return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
-
-
-def _place(stream: ImageStream) -> tuple[str, str]:
-    """Where the images of a stream lie, and their topic there."""
-    path = stream.path
-    return (path.address if isinstance(path, Url) else str(path.resolve())), stream.topic
-
-
-def _in_folders(stream: ImageStream, folders: int) -> str:
-    """A stream's name with those of its file, and of some of the folders this is in."""
-    path, topic = stream.path, stream.topic
-    of_file = topic == path.stem or (isinstance(path, Path) and topic == path.resolve().name)
-    own = topic if of_file else path.stem + topic
-    above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
-    return "/".join([*above[max(len(above) - folders, 0) :], own]).removeprefix("//")

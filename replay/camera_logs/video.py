@@ -7,7 +7,6 @@ on the processor, comes between; only videos without luma are taken by their col
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
@@ -18,8 +17,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.pixels import MAX_PIXELS, RECIPE, RawPixels, gray, shrink
+from replay.camera_logs.stream import explained, sorted_times
 from replay.mcap.records import Bytes, MalformedRecord
 
+VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 _NOWHERE: Final = 2**62
 _FORWARD: Final = 256
 """Frames that are decoded and passed over rather than sought."""
@@ -56,7 +57,7 @@ class VideoImages:
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a video has no topics, leave {topic} out")
         try:
-            with _explained(path):
+            with explained(path, "FFmpeg"):
                 self._container = self._av.open(str(path))
                 self._open()
         except BaseException:
@@ -85,7 +86,7 @@ class VideoImages:
         """
         stamp = int(self._stamps[row])
         where = f"{self.path}: at {float(stamp * self._tick):g} s"
-        with _explained(self.path):
+        with explained(self.path, "FFmpeg"):
             if not self._next <= row < self._next + _FORWARD:
                 self._container.seek(stamp, stream=self._stream, backward=True)
                 self._frames = self._container.decode(self._stream)
@@ -145,12 +146,10 @@ class VideoImages:
 
     def _nanoseconds(self) -> NDArray[np.uint64]:
         """Times of the frames, from the video's beginning, or its first frame if that is before."""
-        scale = self._tick * NANOSECONDS
+        tick = self._tick * NANOSECONDS
         first = min(int(self._stamps[0]), 0)
-        exact = [round((int(stamp) - first) * scale) for stamp in self._stamps]
-        if exact[-1] >= 2**62:
-            raise LogDamagedError(f"{self.path}: it has times beyond any clock")
-        return np.array(exact, np.uint64)
+        exact = [round((int(stamp) - first) * tick) for stamp in self._stamps]
+        return sorted_times(f"{self.path}: it", exact)
 
     def _gray(self, frame: Any) -> Bytes:
         """The luma of a frame, or the grey of its colours, (height, width) uint8."""
@@ -185,15 +184,3 @@ def _pyav(path: Path) -> Any:
         ) from None
     av.logging.set_level(None)
     return av
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Say in one line what FFmpeg cannot read."""
-    try:
-        yield
-    except (CdmisfaError, MemoryError):
-        raise
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise LogDamagedError(f"{path}: FFmpeg cannot read it ({reason})") from None

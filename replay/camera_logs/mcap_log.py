@@ -1,0 +1,141 @@
+"""The images on one topic of an MCAP log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.camera_logs.messages import Decoder
+from replay.camera_logs.pixels import RECIPE, shrink
+from replay.camera_logs.stream import choose_images, sorted_times
+from replay.mcap.reader import LogReader
+from replay.mcap.records import Bytes, Channel, MalformedRecord
+from replay.mcap.segments import Segment
+from replay.storage.location import Location
+
+CACHE_BYTES: Final = 1024 * 1024
+"""Decoded chunks that are kept; one always is."""
+
+
+class McapImages:
+    """The images on one topic of one log, in the order of log time.
+
+    Args:
+        path: the log.
+        topic: the topic; may be left out where the log has one topic of images.
+        size: (height, width) of a frame.
+        salvage: leave out what is damaged.
+
+    Raises:
+        UsageError: no such topic, or no images on it.
+        LogDamagedError: the log is damaged.
+    """
+
+    recipe = RECIPE
+
+    def __init__(
+        self, path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
+    ) -> None:
+        self.path = path
+        self.size = size
+        self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
+        self.count = 0
+        try:
+            self.channel, self._decode = self._find(topic)
+            self._index()
+        except BaseException:
+            self.reader.close()
+            raise
+
+    @property
+    def topic(self) -> str:
+        """The topic."""
+        return self.channel.topic
+
+    @property
+    def warnings(self) -> Sequence[str]:
+        """What was cut off or left out."""
+        problems = [f"{p.where}: {p.what}" for p in self.reader.problems]
+        return [f"{self.path}: {text}" for text in (self.reader.missing, *problems) if text]
+
+    def frame(self, row: int) -> Bytes:
+        """Decode a message into a frame, (height, width) uint8.
+
+        Raises:
+            LogDamagedError: the message is no image that is read.
+        """
+        try:
+            return shrink(self._decode(self._payload(row)), *self.size)
+        except MalformedRecord as error:
+            raise LogDamagedError(
+                f"{self.path}: {self.topic} at {self.times[row]} ns: {error}"
+            ) from None
+
+    def close(self) -> None:
+        """Let go of the file; harmless when called twice."""
+        self.reader.close()
+
+    def _payload(self, row: int) -> bytes:
+        table = self.reader.table(self._segments[int(self._segment_of[row])])
+        if table is None:
+            raise MalformedRecord("it is damaged")
+        place = int(self._row_in[row])
+        if self.reader.by_index:
+            own = np.flatnonzero(table.channel == self.channel.id)
+            if place >= len(own) or table.log_time[own[place]] != self.times[row]:
+                raise MalformedRecord("its chunk holds other messages than the summary names")
+            place = int(own[place])
+        return table.payload(place)
+
+    def _find(self, topic: str | None) -> tuple[Channel, Decoder]:
+        kinds = {number: schema.name for number, schema in self.reader.schemas.items()}
+        channels = self.reader.channels.values()
+        return choose_images(
+            self.path,
+            topic,
+            [(c.topic, kinds.get(c.schema_id, "no schema"), c.encoding, c) for c in channels],
+        )
+
+    def _index(self) -> None:
+        """Find every message of the topic.
+
+        One pass over a log checks all of it; of a URL only its message indexes are read, and
+        each chunk is checked when its images are.
+        """
+        self._segments: list[Segment] = []
+        times, members, rows = [], [], []
+        found = self._by_index() if self.reader.by_index else self._by_pass()
+        for segment, log_times, places in found:
+            times.append(log_times)
+            members.append(np.full(len(places), len(self._segments), np.int32))
+            rows.append(places.astype(np.int32))
+            self._segments.append(segment)
+        if not times:
+            raise UsageError(f"{self.path}: there is no message on {self.channel.topic}")
+        order = np.argsort(np.concatenate(times), kind="stable")
+        self.times = sorted_times(f"{self.path}: {self.topic}", np.concatenate(times)[order])
+        self._segment_of = np.concatenate(members)[order]
+        self._row_in = np.concatenate(rows)[order]
+        self.count = len(order)
+        self.reader.expect(self._segments)
+
+    def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
+        """Log times of the topic's messages in each chunk, and their rows in its table."""
+        for segment, table in self.reader.tables(ordered=False):
+            own = np.flatnonzero(table.channel == self.channel.id)
+            if len(own):
+                yield segment, table.log_time[own], own
+
+    def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
+        """As `_by_pass`, with their rows among the topic's own messages of the chunk."""
+        number = self.channel.id
+        segments = [s for s in self.reader.segments if (s.channel_counts() or {}).get(number)]
+        self.reader.expect(segments, indexes=True)
+        for segment in segments:
+            pairs = np.concatenate([p for c, p in self.reader.index(segment) if c == number])
+            pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+            yield segment, pairs[:, 0], np.arange(len(pairs))

@@ -1,0 +1,149 @@
+"""Messages of other people that hold images: which they are, and their fields."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+
+from replay.camera_logs.pixels import RawPixels, compressed_gray, gray
+from replay.mcap.records import Bytes, MalformedRecord
+
+Decoder = Callable[[bytes], Bytes]
+"""Turns a message into a gray image, (height, width) uint8; raises MalformedRecord."""
+
+
+def image_decoder(schema: str, encoding: str) -> Decoder | None:
+    """Find the decoder for messages of a schema in an encoding, or None."""
+    return _DECODERS.get((schema, encoding))
+
+
+def _foxglove_raw(data: bytes) -> Bytes:
+    message = _parse(RawImage, data)
+    return gray(
+        RawPixels(
+            message.height, message.width, message.encoding, False, message.step, message.data
+        )
+    )
+
+
+def _foxglove_compressed(data: bytes) -> Bytes:
+    return compressed_gray(_parse(CompressedImage, data).data)
+
+
+def _parse(kind: Any, data: bytes) -> Any:
+    try:
+        return kind.FromString(data)
+    except DecodeError:
+        raise MalformedRecord(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
+
+
+def _json_raw(data: bytes) -> Bytes:
+    fields = _json(data)
+    numbers = [fields.get(k) for k in ("height", "width", "step")]
+    if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
+        raise MalformedRecord("a JSON image needs whole height, width and step")
+    height, width, step = (int(n) for n in numbers if n is not None)
+    return gray(RawPixels(height, width, str(fields.get("encoding")), False, step, _base64(fields)))
+
+
+def _json_compressed(data: bytes) -> Bytes:
+    return compressed_gray(_base64(_json(data)))
+
+
+def _json(data: bytes) -> Mapping[str, Any]:
+    try:
+        fields = json.loads(data)
+    except (ValueError, RecursionError):
+        raise MalformedRecord("a message is no JSON") from None
+    if not isinstance(fields, dict):
+        raise MalformedRecord("a message is no JSON object")
+    return fields
+
+
+def _base64(fields: Mapping[str, Any]) -> bytes:
+    try:
+        return base64.b64decode(fields.get("data", ""), validate=True)
+    except (binascii.Error, ValueError, TypeError):
+        raise MalformedRecord("a JSON image's data is no base64") from None
+
+
+class _RosFields:
+    """Fields of a ROS message, aligned (ROS 2) or packed (ROS 1)."""
+
+    def __init__(self, data: bytes, *, ros1: bool) -> None:
+        self._data = memoryview(data)
+        self._at = self._base = 0
+        self._aligned = not ros1
+        self._order = "<"
+        self.terminated = not ros1
+        if not ros1:
+            head = bytes(self._take(4))
+            if head[0] != 0 or head[1] not in (0, 1, 6, 7, 8, 9, 10, 11):
+                raise MalformedRecord("a message is no CDR")
+            self._order = "<" if head[1] & 1 else ">"
+            self._base = 4
+
+    def _take(self, count: int) -> memoryview:
+        if count > len(self._data) - self._at:
+            raise MalformedRecord("a ROS message is cut short or lies about a length")
+        self._at += count
+        return self._data[self._at - count : self._at]
+
+    def u32(self) -> int:
+        if self._aligned:
+            self._take(-(self._at - self._base) % 4)
+        return int(struct.unpack(self._order + "I", self._take(4))[0])
+
+    def u8(self) -> int:
+        return self._take(1)[0]
+
+    def text(self) -> str:
+        raw = bytes(self._take(self.u32()))
+        return str(raw.removesuffix(b"\0") if self.terminated else raw, "utf-8", "replace")
+
+    def data(self) -> memoryview:
+        return self._take(self.u32())
+
+
+def _ros_header(data: bytes, ros1: bool) -> _RosFields:
+    fields = _RosFields(data, ros1=ros1)
+    for _ in range(3 if ros1 else 2):
+        fields.u32()
+    fields.text()
+    return fields
+
+
+def _ros_raw(data: bytes, *, ros1: bool) -> Bytes:
+    fields = _ros_header(data, ros1)
+    height, width, encoding = fields.u32(), fields.u32(), fields.text()
+    big_endian, step = bool(fields.u8()), fields.u32()
+    return gray(RawPixels(height, width, encoding, big_endian, step, fields.data()))
+
+
+def _ros_compressed(data: bytes, *, ros1: bool) -> Bytes:
+    fields = _ros_header(data, ros1)
+    fields.text()
+    return compressed_gray(bytes(fields.data()))
+
+
+_DECODERS: Final[Mapping[tuple[str, str], Decoder]] = {
+    ("foxglove.RawImage", "protobuf"): _foxglove_raw,
+    ("foxglove.CompressedImage", "protobuf"): _foxglove_compressed,
+    ("foxglove.RawImage", "json"): _json_raw,
+    ("foxglove.CompressedImage", "json"): _json_compressed,
+    ("sensor_msgs/msg/Image", "cdr"): lambda data: _ros_raw(data, ros1=False),
+    ("sensor_msgs/msg/CompressedImage", "cdr"): lambda data: _ros_compressed(data, ros1=False),
+    ("sensor_msgs/Image", "ros1"): lambda data: _ros_raw(data, ros1=True),
+    ("sensor_msgs/CompressedImage", "ros1"): lambda data: _ros_compressed(data, ros1=True),
+}
+
+SCHEMAS: Final = tuple(sorted({schema for schema, _ in _DECODERS}))
+"""Message types that are read."""

@@ -1,0 +1,59 @@
+"""What streams are called: after their topics, as views and their files are."""
+
+from __future__ import annotations
+
+import os
+import re
+import unicodedata
+from collections.abc import Sequence
+from pathlib import Path
+
+from cdmisfa.core.errors import UsageError
+from replay.camera_logs.stream import ImageStream
+from replay.storage.location import Url
+
+
+def stream_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
+    """Topics as names of streams, with the file's and folders' where topics are shared."""
+    topics = [s.topic for s in streams]
+    if len(set(topics)) == len(topics):
+        return tuple(topics)
+    places = [_place(stream) for stream in streams]
+    for i, place in enumerate(places):
+        if place in places[:i]:
+            raise UsageError(f"{topics[i]} of {streams[i].path} is named twice: leave one out")
+    for folders in range(max(len(Path(path).parts) for path, _ in places)):
+        names = [_in_folders(stream, folders) for stream in streams]
+        if len(set(names)) == len(names):
+            return tuple(names)
+    return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
+
+
+def view_names(topics: Sequence[str]) -> tuple[str, ...]:
+    """Topics as names of views, which are names of files, too: "/cam/left" is cam_left.
+
+    Letters lose their accents, those of other scripts stay.
+    """
+    names: list[str] = []
+    for topic in topics:
+        letters = unicodedata.normalize("NFKD", topic)
+        bare = "".join(c for c in letters if not unicodedata.combining(c))
+        plain = re.sub(r"[^\w.-]+", "_", bare).strip("._") or "stream"
+        taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
+        names.append(f"{plain}-{taken + 1}" if taken else plain)
+    return tuple(names)
+
+
+def _place(stream: ImageStream) -> tuple[str, str]:
+    """Where the images of a stream lie, and their topic there."""
+    path = stream.path
+    return (path.address if isinstance(path, Url) else str(path.resolve())), stream.topic
+
+
+def _in_folders(stream: ImageStream, folders: int) -> str:
+    """A stream's name with those of its file, and of some of the folders this is in."""
+    path, topic = stream.path, stream.topic
+    of_file = topic == path.stem or (isinstance(path, Path) and topic == path.resolve().name)
+    own = topic if of_file else path.stem + topic
+    above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
+    return "/".join([*above[max(len(above) - folders, 0) :], own]).removeprefix("//")

@@ -1,0 +1,148 @@
+"""Opening camera logs of any kind: which logs paths mean, of what kind they are, what they are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import UsageError
+from replay.camera_logs.bag import BAGS, BagImages
+from replay.camera_logs.joined import JoinedImages
+from replay.camera_logs.mcap_log import McapImages
+from replay.camera_logs.picture_folder import PICTURES, FolderImages, by_number
+from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.video import VIDEOS, VideoImages
+from replay.mcap.identity import identity
+from replay.storage.checksum import sha256
+from replay.storage.listing import log_files
+from replay.storage.location import Location, Url, location
+
+
+def open_images(
+    path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
+) -> ImageStream:
+    """Open the images on a topic of a log, or in a folder.
+
+    Args:
+        path: an MCAP log or its URL, a ROS bag, a video or a folder of pictures.
+        topic: the topic; may be left out where there is one topic of images.
+        size: (height, width) of a frame.
+        salvage: leave out what is damaged.
+
+    Raises:
+        UsageError: no such topic, or no images on it.
+        LogDamagedError: the log is damaged.
+    """
+    if isinstance(path, Path):
+        if _is_bag(path):
+            return BagImages(path, topic, size)
+        if _is_split(path):
+            return open_joined(path, _parts_of(path), topic, size, salvage=salvage)
+        if path.is_dir():
+            return FolderImages(path, topic, size)
+        if path.suffix.lower() in VIDEOS:
+            return VideoImages(path, topic, size)
+    return McapImages(path, topic, size, salvage=salvage)
+
+
+def open_joined(
+    path: Path,
+    files: Sequence[Path],
+    topic: str | None,
+    size: tuple[int, int],
+    *,
+    salvage: bool = False,
+) -> ImageStream:
+    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
+
+    Raises:
+        UsageError: no part has images on the topic, or they have several topics.
+        LogDamagedError: a part is damaged.
+    """
+    parts: list[ImageStream] = []
+    refusal: UsageError | None = None
+    try:
+        for file in files:
+            try:
+                parts.append(McapImages(file, topic, size, salvage=salvage))
+            except UsageError as error:
+                refusal = refusal or error
+        if refusal is not None and (topic is None or not parts):
+            raise refusal
+        topics = {part.topic for part in parts}
+        if len(topics) > 1:
+            raise UsageError(f"{path}: name one --topic; it has images on: {sorted(topics)}")
+    except BaseException:
+        for part in parts:
+            part.close()
+        raise
+    return JoinedImages(path, parts)
+
+
+def image_logs(paths: Sequence[str | Location]) -> list[Location]:
+    """List the logs that paths mean: a folder of MCAP files is each of them, a rosbag2 one log.
+
+    Raises:
+        UsageError: there is none.
+    """
+    found: list[Location] = []
+    for path in map(location, paths):
+        if only_foreign(path) or (isinstance(path, Path) and _is_split(path)):
+            found.append(path)
+        else:
+            found += log_files(path)
+    return found
+
+
+def only_foreign(path: Location) -> bool:
+    """Whether a path can be no recording of ours, by its kind."""
+    if isinstance(path, Url):
+        return False
+    video = path.suffix.lower() in VIDEOS and path.is_file()
+    return video or _is_bag(path) or _is_picture_folder(path)
+
+
+def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any]:
+    """What tells a log from others: see `identity`; of a folder, names and contents count.
+
+    Args:
+        path: the log.
+        streams: of which one reads it, where it is behind a URL.
+
+    Raises:
+        CdmisfaError: a file cannot be read.
+    """
+    if isinstance(path, Url) or not path.is_dir():
+        reads = (s.reader for s in streams if isinstance(s, McapImages) and s.path == path)
+        return identity(path, next(reads, None))
+    whole = hashlib.sha256()
+    for file in sorted(p for p in path.iterdir() if p.is_file()):
+        whole.update(f"{file.name}\0{sha256(file)}\n".encode("utf-8", "surrogateescape"))
+    return {"file": path.name, "sha256": whole.hexdigest()}
+
+
+def _is_bag(path: Path) -> bool:
+    """A ROS bag that is not in MCAP files."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() and not any(path.glob("*.mcap"))
+    return path.suffix in BAGS
+
+
+def _is_picture_folder(path: Path) -> bool:
+    return (
+        path.is_dir()
+        and not any(path.glob("*.mcap*"))
+        and any(p.suffix.lower() in PICTURES for p in path.iterdir())
+    )
+
+
+def _is_split(path: Path) -> bool:
+    """Whether a folder is a rosbag2 of MCAP files, which are parts of one log."""
+    return (path / "metadata.yaml").is_file() and any(path.glob("*.mcap"))
+
+
+def _parts_of(folder: Path) -> list[Path]:
+    """The parts of a rosbag2, in order."""
+    return sorted(folder.glob("*.mcap"), key=by_number)
