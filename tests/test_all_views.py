@@ -14,10 +14,10 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.run import learn
 from recorder.config import SceneConfig
 from recorder.recording import record
+from replay.recordings.poses import head_poses, yaw_of
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_signals
 from replay.view.build import build_view
-from replay.view.recording import head_poses, yaw_of
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = face(
     {
         "replay.recordings.source": "RecordedSource",
         "replay.recordings.followed": "FollowedSource",
+        "replay.recordings.poses": "head_poses yaw_of",
         "replay.recordings.view_file": "NoRecordingError ViewFile",
     },
 )
