@@ -15,7 +15,8 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.run import ENDINGS, RunResult, learn, write_json
+from cdmisfa.experiments.endings import ENDINGS
+from cdmisfa.experiments.run import RunResult, learn, write_json
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.log import read_events, read_signals
 from replay.runs.modules import load_modules

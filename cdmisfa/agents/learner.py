@@ -115,7 +115,7 @@ class CuriousLearner:
         return self.abstraction.phi.copy()
 
     @property
-    def exhausted(self) -> bool:
+    def over(self) -> bool:
         """Whether exploration has ended long ago and still nothing converged."""
         return bool(self.agent.memory["idle"][0] > self.config.patience)
 
@@ -193,6 +193,10 @@ class CuriousLearner:
         if self.out["saved"][0]:
             self.save_abstraction()
         return signals
+
+    def summary(self) -> dict[str, Any]:
+        """Its part of a run's result, as JSON values."""
+        return {"final_policy": self.agent.policy.tolist(), "epsilon": self.epsilon}
 
     def _count_inputs(self) -> int:
         """Number of inputs after expansion.

@@ -36,17 +36,9 @@ from cdmisfa.experiments.checkpoint import (
     save_checkpoint,
     set_aside,
 )
+from cdmisfa.experiments.endings import ENDINGS, ending
 from cdmisfa.features.incsfa import strict
 from recorder.log.folder import held
-
-ENDINGS: Mapping[str, str] = {
-    "max_modules": "as many modules as asked for were learned",
-    "max_iterations": "the asked number of iterations is over",
-    "nothing_left": "exploration ended long ago and no further abstraction converged",
-    "log_exhausted": "the recording ended",
-    "interrupted": "it was interrupted",
-}
-"""Why a run ended."""
 
 PACKAGES = ("cdmisfa", "numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
 
@@ -174,7 +166,7 @@ def learn(
                 shown.earlier(log.path.parent)
         _say_if_compiling()
         while True:
-            ended = _ending(learner, limit, max_iterations, stop)
+            ended = ending(learner, limit, max_iterations) or ("interrupted" if stop() else "")
             if ended:
                 break
             try:
@@ -235,18 +227,6 @@ def learn(
         over.result = result
         raise over from exhausted
     return result
-
-
-def _ending(
-    learner: CuriousLearner, limit: int, max_iterations: int | None, stop: Callable[[], bool]
-) -> str:
-    if len(learner.modules) >= limit:
-        return "max_modules"
-    if max_iterations is not None and learner.iteration >= max_iterations:
-        return "max_iterations"
-    if learner.exhausted:
-        return "nothing_left"
-    return "interrupted" if stop() else ""
 
 
 def _saved_text(learner: CuriousLearner, source: FrameSource) -> str:

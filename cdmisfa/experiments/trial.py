@@ -21,6 +21,7 @@ from cdmisfa.core.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.core.modules import Module
+from cdmisfa.experiments.endings import ending
 from cdmisfa.features.incsfa import Params, State, project
 from cdmisfa.features.incsfa.strict import update
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
@@ -210,7 +211,7 @@ def run_trial(
     parts: list[dict[str, NDArray[Any]]] = []
     uniforms = np.empty((0, 3))
     swapped = -1
-    while not (ended := _ending(learner, limit, max_iterations)):
+    while not (ended := ending(learner, limit, max_iterations)):
         if not len(uniforms):
             uniforms = learner.policy_rng.random((CHUNK, 3))
         left = CHUNK if max_iterations is None else max_iterations - learner.iteration
@@ -252,14 +253,6 @@ def run_trial(
         swapped=swapped,
         curves=Curves(parts) if curves else None,
     )
-
-
-def _ending(learner: CuriousLearner, limit: int, max_iterations: int | None) -> str:
-    if len(learner.modules) >= limit:
-        return "max_modules"
-    if max_iterations is not None and learner.iteration >= max_iterations:
-        return "max_iterations"
-    return "nothing_left" if learner.exhausted else ""
 
 
 def _expand(config: LearnerConfig, tables: Sequence[Float]) -> tuple[Float, Float]:
