@@ -141,6 +141,21 @@ def test_all_stand_on_the_clock_of_the_log(shown):
     assert np.datetime64(times[-1], "ns").astype(int) == spec.time_ns(ITERATIONS * TAU - 1)
 
 
+def test_every_frame_has_the_log_time_of_the_log_at_any_rate(tmp_path):
+    """At 29.97 frames a second, rounding the frame's length first moves 9 of 200,000 frames."""
+    spec = dataclasses.replace(VECTOR, fps=29.97)
+    write_run(tmp_path / "run.mcap", spec, 9, tau=14_985)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    times = {}
+    for chunk in RrdReader(str(tmp_path / "run.rrd")).stream():
+        if chunk.entity_path == "/signals/y" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            log_times = batch.column("message_log_time").cast("int64").to_pylist()
+            times |= dict(zip(batch.column("frame").to_pylist(), log_times, strict=True))
+    frames = range(9 * 14_985)
+    assert [t for t in frames if times[t] != spec.time_ns(t)] == []
+
+
 def test_what_was_watched_is_there(shown):
     spec, _, rows, _ = shown
     frames = np.concatenate([block.frames for _, block in run_of(spec, ITERATIONS)])

@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.clock import times_of
 
 FRAME = "frame"
 """Timeline of the global frame counter t."""
@@ -41,14 +41,13 @@ class Clock:
     """
 
     def __init__(self, spec: SourceSpec) -> None:
-        self._start = spec.start_ns
-        self._frame_ns = NANOSECONDS / spec.fps
+        self._spec = spec
 
     def columns(
         self, frames: NDArray[np.int64], iterations: NDArray[np.int64] | None
     ) -> list[rr.TimeColumn]:
         """Columns of time for rows at these frames."""
-        times = self._start + np.round(frames * self._frame_ns).astype(np.int64)
+        times = times_of(frames, self._spec.fps, self._spec.start_ns)
         found = [
             rr.TimeColumn(FRAME, sequence=frames.copy()),
             rr.TimeColumn(LOG_TIME, timestamp=times.astype("datetime64[ns]")),
