@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.signals import BlockSignals
-from replay.runs.log import RunWriter
+from replay.runs.writer import RunWriter
 
 START_NS = 1_451_606_400_000_000_000
 DELTA = 0.0008

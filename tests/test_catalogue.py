@@ -16,6 +16,7 @@ from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.runs.folders import runs_in
 from replay.runs.outline import read_outline
 from replay.view.properties import (
     properties_of,
@@ -32,7 +33,6 @@ from replay.viewer.catalogue import (
     _register,
     add_views,
     ready_view,
-    runs_in,
     serve_catalogue,
     set_layout,
 )

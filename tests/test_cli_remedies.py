@@ -13,7 +13,7 @@ from web_server import serving
 
 from cdmisfa.cli.commands.doctor import EXTRAS
 from cdmisfa.core.errors import LogDamagedError
-from replay.viewer.catalogue import runs_in
+from replay.runs.folders import runs_in
 
 SHORT = ("--set", "learner.tau=10", "--no-rerun")
 

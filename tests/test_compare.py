@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from run_data import VECTOR, having, run_of, write_run
 
-from replay.runs.compare import compare
-from replay.runs.log import RunWriter
+from replay.runs.compare import first_difference
+from replay.runs.writer import RunWriter
 
 
 def write_changed(path, iteration, name, change):
@@ -24,7 +24,7 @@ def write_changed(path, iteration, name, change):
 def test_equal_runs_have_no_difference(tmp_path):
     for name in ("a", "b"):
         write_run(tmp_path / name, VECTOR, 8, seed=3)
-    assert compare(tmp_path / "a", tmp_path / "b") is None
+    assert first_difference(tmp_path / "a", tmp_path / "b") is None
 
 
 def one_bit(value):
@@ -50,7 +50,7 @@ def other_nan(value):
 def test_the_first_difference_is_named(name, change, place, tmp_path):
     write_run(tmp_path / "a", VECTOR, 8, seed=3)
     write_changed(tmp_path / "b", 5, name, change)
-    difference = compare(tmp_path / "a", tmp_path / "b")
+    difference = first_difference(tmp_path / "a", tmp_path / "b")
     assert (difference.iteration, difference.signal, difference.place) == (5, name, place)
     assert str(difference).startswith(f"iteration 5: {name}")
 
@@ -58,7 +58,7 @@ def test_the_first_difference_is_named(name, change, place, tmp_path):
 def test_one_nan_is_as_good_as_another(tmp_path):
     write_run(tmp_path / "a", VECTOR, 8, seed=3)
     write_changed(tmp_path / "b", 5, "reward", other_nan)
-    assert compare(tmp_path / "a", tmp_path / "b") is None
+    assert first_difference(tmp_path / "a", tmp_path / "b") is None
 
 
 def test_a_run_that_ended_early_is_said_so(tmp_path):
@@ -66,5 +66,5 @@ def test_a_run_that_ended_early_is_said_so(tmp_path):
     with RunWriter(tmp_path / "b", VECTOR, {}) as writer:
         for signals, block in list(run_of(VECTOR, 8, seed=3))[:6]:
             writer.block(block, signals, having(np.zeros((1, 2))))
-    difference = compare(tmp_path / "a", tmp_path / "b")
+    difference = first_difference(tmp_path / "a", tmp_path / "b")
     assert str(difference) == "iteration 6: goes on against ended after 6 iterations"

@@ -8,7 +8,7 @@ from rerun.chunk import RrdReader
 from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
-from replay.runs.table import survey
+from replay.runs.compare import side_by_side
 from replay.view.overlay import build_overlay
 
 
@@ -26,7 +26,7 @@ def three(tmp_path, monkeypatch):
 
 def test_the_table_says_which_runs_are_the_first_ones_equals(three):
     runs, _ = three
-    first, equal, other = survey(runs)
+    first, equal, other = side_by_side(runs)
     assert first.difference is None
     assert equal.difference is None
     assert other.difference.iteration == 0
@@ -37,7 +37,7 @@ def test_the_table_says_which_runs_are_the_first_ones_equals(three):
 def test_the_view_holds_each_runs_values(three, tmp_path):
     runs, records = three
     out = tmp_path / "all.rrd"
-    build_overlay(runs, survey(runs), out)
+    build_overlay(runs, side_by_side(runs), out)
     found = {}
     reader = RrdReader(str(out))
     for chunk in reader.stream():
@@ -52,7 +52,7 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         stay = [s.R[0, 0, 0] for s in signals]
         np.testing.assert_array_equal(found[f"/compare/{name}/R_stay/1_x1"], stay)
     with pytest.raises(UsageError, match="--force"):
-        build_overlay(runs, survey(runs), out)
+        build_overlay(runs, side_by_side(runs), out)
 
 
 def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):

@@ -34,7 +34,7 @@ from recorder.config import RecordConfig, SceneConfig
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
-from replay.runs.compare import compare
+from replay.runs.compare import first_difference
 from replay.runs.log import read_events, read_signals
 
 CONFIG = LearnerConfig(
@@ -67,7 +67,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped:
     out = tmp_path / "run"
     go(OscillatorySource(), out, stopped)
     result = go(OscillatorySource(), out, LENGTH, resume=True)
-    assert compare(whole, out) is None
+    assert first_difference(whole, out) is None
     assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
     assert not list(out.glob("*.partial"))
     assert len(checkpoints(out)) <= 2
@@ -159,7 +159,7 @@ def test_kill_9_anywhere_loses_nothing(whole: Path, tmp_path: Path) -> None:
     killed_when(out, False, lambda: partial.exists() and partial.stat().st_size > 20_000)
     killed_when(out, True, reached(2 * EVERY))
     result = go(OscillatorySource(), out, LENGTH, resume=True)
-    assert compare(whole, out) is None
+    assert first_difference(whole, out) is None
     assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
 
 
@@ -170,7 +170,7 @@ def test_a_kill_while_resuming_loses_nothing(whole: Path, tmp_path: Path) -> Non
     (out / "run.mcap").rename(out / SET_ASIDE)
     (out / "run.mcap.partial").write_bytes(half[: len(half) // 3])
     go(OscillatorySource(), out, LENGTH, resume=True)
-    assert compare(whole, out) is None
+    assert first_difference(whole, out) is None
 
 
 def test_a_log_that_lost_its_end_goes_on_from_the_older_checkpoint(
@@ -181,7 +181,7 @@ def test_a_log_that_lost_its_end_goes_on_from_the_older_checkpoint(
     go(OscillatorySource(), short, 50)
     shutil.copy(short / "run.mcap", out / "run.mcap")
     go(OscillatorySource(), out, LENGTH, resume=True)
-    assert compare(whole, out) is None
+    assert first_difference(whole, out) is None
     assert "resumed at iteration 40" in [event.text for event in read_events(out)]
 
 
@@ -196,7 +196,7 @@ def test_damaged_checkpoints_are_passed_over(whole: Path, tmp_path: Path, damage
         with pytest.raises(LogDamagedError, match=path.name):
             load_checkpoint(path)
     go(OscillatorySource(), out, LENGTH, resume=True)
-    assert compare(whole, out) is None
+    assert first_difference(whole, out) is None
 
 
 def test_a_kill_before_the_log_says_anything_starts_anew(whole: Path, tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_a_kill_before_the_log_says_anything_starts_anew(whole: Path, tmp_path: 
     out.mkdir()
     (out / "run.mcap.partial").write_bytes(b"")
     go(OscillatorySource(), out, LENGTH, resume=True)
-    assert compare(whole, out) is None
+    assert first_difference(whole, out) is None
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,8 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
-from replay.runs import matrix_message, signals_message
+from replay.runs.folders import is_run
 from replay.runs.log import (
-    RunWriter,
-    is_run,
     read_events,
     read_header,
     read_phi,
@@ -33,7 +31,9 @@ from replay.runs.log import (
     read_truth,
     read_watched,
 )
+from replay.runs.messages import decode_matrix, decode_signals, encode_signals
 from replay.runs.modules import load_modules, save_modules
+from replay.runs.writer import RunWriter
 
 
 @given(
@@ -48,7 +48,7 @@ def test_a_record_of_any_shape_comes_back_to_the_bit(seed, streams, tau, modules
     spec = SourceSpec(tuple(f"s{i}" for i in range(streams)), (2,), "float64")
     rng = np.random.default_rng(seed)
     signals = signals_of(spec, k, rng, tau=tau, modules=modules, outputs=outputs)
-    back = signals_message.decode(signals_message.encode(signals))
+    back = decode_signals(encode_signals(signals))
     assert canonical_bytes(back) == canonical_bytes(signals)
 
 
@@ -58,23 +58,23 @@ def test_every_pattern_of_bits_of_a_number_survives(bits):
     signals = signals_of(VECTOR, 1, rng, tau=len(bits), modules=0)
     y = np.array(bits, dtype=np.uint64).view(np.float64)[:, None]
     signals = type(signals)(**{n: getattr(signals, n) for n in SIGNALS if n != "y"}, y=y)
-    back = signals_message.decode(signals_message.encode(signals))
+    back = decode_signals(encode_signals(signals))
     assert back.y.tobytes() == y.tobytes()
 
 
 @given(data=st.binary(max_size=300))
 def test_bytes_that_are_no_record_fail_in_words_or_not_at_all(data):
-    for decode in (signals_message.decode, matrix_message.decode):
+    for decode in (decode_signals, decode_matrix):
         with contextlib.suppress(LogDamagedError):
             decode(data, "here")
 
 
 def test_a_record_whose_sizes_lie_is_refused():
     rng = np.random.default_rng(0)
-    data = signals_message.encode(signals_of(VECTOR, 1, rng, tau=77, modules=0))
+    data = encode_signals(signals_of(VECTOR, 1, rng, tau=77, modules=0))
     at = data.rindex(bytes((77, 1, 0, 77, 1)))  # the sizes of y and y_frozen
     with pytest.raises(LogDamagedError, match=r"y has 77 values for shape \(78, 1\)"):
-        signals_message.decode(data[:at] + b"\x4e" + data[at + 1 :])
+        decode_signals(data[:at] + b"\x4e" + data[at + 1 :])
 
 
 @pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
@@ -137,7 +137,7 @@ def test_the_log_opens_without_us_and_tells_its_units(tmp_path):
 def test_a_header_that_no_source_has_is_damage(tmp_path, monkeypatch, key, value, words):
     path = tmp_path / "run.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("replay.runs.log.asdict", lambda spec: asdict(spec) | {key: value})
+        patch.setattr("replay.runs.writer.asdict", lambda spec: asdict(spec) | {key: value})
         write_run(path, VECTOR, 2)
     with pytest.raises(LogDamagedError, match=f"its metadata cdmisfa.run is broken .*{words}"):
         list(read_signals(path))
@@ -147,7 +147,7 @@ def test_a_header_that_no_source_has_is_damage(tmp_path, monkeypatch, key, value
 def test_a_version_that_is_none_is_damage(tmp_path, monkeypatch, version):
     path = tmp_path / "run.mcap"
     with monkeypatch.context() as patch:
-        patch.setattr("replay.runs.log.SCHEMA_VERSION", version)
+        patch.setattr("replay.runs.writer.SCHEMA_VERSION", version)
         write_run(path, VECTOR, 2)
     with pytest.raises(LogDamagedError, match=r"metadata cdmisfa\.run is broken"):
         list(read_signals(path))
@@ -160,13 +160,13 @@ def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
         from pathlib import Path
         import numpy as np
         from run_data import VECTOR, having, run_of
-        from replay.runs import log as runlog
-        runlog.FLUSH_SECONDS = 0.2
-        writer = runlog.RunWriter(Path(sys.argv[1]), VECTOR, {})
+        from replay.runs import writer
+        writer.FLUSH_SECONDS = 0.2
+        log = writer.RunWriter(Path(sys.argv[1]), VECTOR, {})
         for signals, block in run_of(VECTOR, 22):
             if signals.iteration == 20:
                 time.sleep(0.25)
-            writer.block(block, signals, having(np.zeros((1, 2))))
+            log.block(block, signals, having(np.zeros((1, 2))))
         os.kill(os.getpid(), signal.SIGKILL)
     """
     path = tmp_path / "run.mcap"
@@ -183,7 +183,7 @@ def test_a_run_that_was_killed_reads_up_to_the_last_second(tmp_path):
 
 
 def test_a_partial_log_reads_wherever_it_was_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("replay.runs.log.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("replay.runs.writer.CHUNK_BYTES", 4096)
     whole = tmp_path / "whole.mcap"
     expected = [canonical_bytes(s) for s in write_run(whole, VECTOR, 20)]
     data = whole.read_bytes()

@@ -19,10 +19,11 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
 from cdmisfa.experiments.checkpoint import refuse_difference
-from replay.runs import signals_message
-from replay.runs.compare import compare
-from replay.runs.log import RunWriter, read_header, read_phi, read_signals, read_truth, read_watched
+from replay.runs.compare import first_difference
+from replay.runs.log import read_header, read_phi, read_signals, read_truth, read_watched
+from replay.runs.messages import decode_signals, encode_signals
 from replay.runs.outline import read_outline
+from replay.runs.writer import RunWriter
 from replay.view import layout
 
 OLD = Path(__file__).parent / "data" / "signals_v1"
@@ -88,15 +89,15 @@ def written(folder: Path, records: list[BlockSignals]) -> Path:
 
 def test_two_versions_differ_by_that_and_nothing_else(cdmisfa, tmp_path) -> None:
     new = written(tmp_path / "new", list(read_signals(OLD)))
-    difference = compare(OLD, new)
+    difference = first_difference(OLD, new)
     assert difference is not None
     assert str(difference) == (
         f"signals of version 1 against {SCHEMA_VERSION}; of those in both: all the same, "
         "bit for bit"
     )
     assert difference.as_json()["versions"] == [1, SCHEMA_VERSION]
-    assert compare(OLD, OLD) is None
-    assert compare(new, new) is None
+    assert first_difference(OLD, OLD) is None
+    assert first_difference(new, new) is None
     said = cdmisfa("compare", OLD, new)
     assert (said.code, said.out) == (4, f"{difference}\n")
     table = cdmisfa("compare", OLD, new, OLD, "--save", tmp_path / "both.rrd")
@@ -108,7 +109,7 @@ def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
     records = list(read_signals(OLD))
     records[5] = replace(records[5], epsilon=0.5)
     new = written(tmp_path / "new", records)
-    difference = compare(OLD, new)
+    difference = first_difference(OLD, new)
     assert difference is not None
     assert (difference.iteration, difference.signal) == (5, "epsilon")
     assert difference.versions == (1, SCHEMA_VERSION)
@@ -118,7 +119,7 @@ def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
 @pytest.mark.parametrize("command", ["view", "plot", "compare"])
 def test_a_later_version_is_refused_in_one_line(cdmisfa, tmp_path, monkeypatch, command) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("replay.runs.log.SCHEMA_VERSION", 9)
+        patch.setattr("replay.runs.writer.SCHEMA_VERSION", 9)
         newer = written(tmp_path / "newer", list(read_signals(OLD)))
     more = {"view": ["--save", tmp_path / "x.rrd"], "plot": [], "compare": [OLD]}[command]
     refused = cdmisfa(command, newer, *more)
@@ -143,7 +144,7 @@ def test_sizes_without_values_allocate_nothing() -> None:
     fields = {name: np.empty(shape) for name, shape in empty.items()}
     hostile = replace(records[0], **fields, roc_error_frozen=np.empty(0))
     with pytest.raises(LogDamagedError, match="sizes without values"):
-        signals_message.decode(signals_message.encode(hostile), version=1)
+        decode_signals(encode_signals(hostile), version=1)
 
 
 def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:

@@ -272,7 +272,7 @@ def test_many_streams_show_the_most_watched(tmp_path):
 
 
 def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("replay.runs.log.CHUNK_BYTES", 4096)
+    monkeypatch.setattr("replay.runs.writer.CHUNK_BYTES", 4096)
     write_run(tmp_path / "run.mcap", VECTOR, 0)
     build_view(tmp_path, tmp_path / "empty.rrd")
     assert "/signals/y" not in rows_of(tmp_path / "empty.rrd")

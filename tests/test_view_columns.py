@@ -11,10 +11,11 @@ from run_data import IMAGE, VECTOR, run_of, write_run
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS
 from replay.mcap.records import MalformedRecord
-from replay.runs import matrix_message, signals_message
+from replay.runs import messages as codec
 from replay.runs import stretches as stretch
 from replay.runs.columns import columns_of_messages, columns_of_records
 from replay.runs.log import read_events, read_header, read_phi, read_truth, read_watched
+from replay.runs.messages import decode_signals, encode_matrix, encode_signals
 from replay.runs.outline import read_outline
 from replay.runs.stretches import read_stretches
 from replay.runs.wire import alike, spans
@@ -49,12 +50,12 @@ def same(columns, expected):
 @pytest.mark.parametrize("outputs", [1, 3])
 def test_messages_become_columns_bit_for_bit(outputs):
     written = records(outputs)
-    messages = [signals_message.encode(s) for s in written]
+    messages = [encode_signals(s) for s in written]
     calls = []
 
     def decode(data):
         calls.append(data)
-        return signals_message.decode(data)
+        return decode_signals(data)
 
     assert same(columns_of_messages(messages, decode), written) == 3  # 0, 1 and 2 modules
     assert len(calls) == 3  # one of each layout was decoded by itself
@@ -66,26 +67,26 @@ def test_messages_laid_out_otherwise_are_decoded_one_by_one():
     written = records()[:8]
     other = []
     for i, signals in enumerate(written):
-        message = signals_message._CLASS.FromString(signals_message.encode(signals))
+        message = codec._SIGNALS.FromString(encode_signals(signals))
         data = message.SerializeToString()
-        other.append(data if i % 2 else signals_message.encode(signals))
-    same(columns_of_messages(other, signals_message.decode), written)
-    turned = [signals_message.encode(s) for s in written]
+        other.append(data if i % 2 else encode_signals(signals))
+    same(columns_of_messages(other, decode_signals), written)
+    turned = [encode_signals(s) for s in written]
     first = spans(turned[0])[1]
     turned[1] = turned[1][first[1] :] + turned[1][: first[1]]  # of the same size
     assert len(turned[1]) == len(turned[0])
-    same(columns_of_messages(turned, signals_message.decode), written)
+    same(columns_of_messages(turned, decode_signals), written)
 
 
 def test_a_message_is_walked_over_and_damage_is_seen():
-    data = matrix_message.encode(7, np.ones((2, 3)))
+    data = encode_matrix(7, np.ones((2, 3)))
     assert spans(data) == {1: (1, 9), 2: (10, 14), 3: (20, 68)}
     for broken in (data[:-1], b"\x08", b"\xff" * 12, b"\x0b\x00", b"\x08\x01\x08\x01"):
         with pytest.raises(MalformedRecord):
             spans(broken)
     assert alike([data, data[:-1]], [(1, 9)]) is None
-    assert alike([data, matrix_message.encode(8, np.ones((2, 3)))], [(1, 9)]) is not None
-    assert alike([data, matrix_message.encode(8, np.ones((2, 3)))], [(20, 68)]) is None
+    assert alike([data, encode_matrix(8, np.ones((2, 3)))], [(1, 9)]) is not None
+    assert alike([data, encode_matrix(8, np.ones((2, 3)))], [(20, 68)]) is None
 
 
 @pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])

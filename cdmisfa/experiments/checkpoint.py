@@ -173,7 +173,7 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path 
         UsageError: there is no run, or it was made with another configuration or source.
     """
     from recorder.log.whole import partial_path
-    from replay.runs.log import RUN_FILE
+    from replay.runs.folders import RUN_FILE
 
     whole, aside = run / RUN_FILE, run / SET_ASIDE
     found = log_to_go_on_with(run)
@@ -191,7 +191,7 @@ def log_to_go_on_with(run: Path) -> Path:
         UsageError: there is no run.
     """
     from recorder.log.whole import partial_path
-    from replay.runs.log import RUN_FILE
+    from replay.runs.folders import RUN_FILE
 
     whole = run / RUN_FILE
     for found in (run / SET_ASIDE, partial_path(whole), whole):

@@ -256,7 +256,7 @@ def _run_log(
             raise UsageError("which run to go on with? name its folder")
         yield None
         return
-    from replay.runs.log import RunWriter
+    from replay.runs.writer import RunWriter
 
     manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
     if command is not None:

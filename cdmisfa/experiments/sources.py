@@ -257,7 +257,7 @@ def _refuse_what_is_no_log(path: Location) -> None:
     """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
     from replay.camera_logs.opening import only_foreign
     from replay.mcap.identity import starts_as_log
-    from replay.runs.log import RUN_FILE, is_run
+    from replay.runs.folders import RUN_FILE, is_run
     from replay.storage.location import Url
 
     if isinstance(path, Url):  # opened only once: see `_refuse_remote_run`

@@ -18,7 +18,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import partial_path
 from replay.export.history import History, read_history
 from replay.palette import GREY, VERMILLION, Rgb, colour
-from replay.runs.log import run_log
+from replay.runs.folders import run_log
 
 FOLDER = "figures"
 """Where the figures of a run go, within its folder."""

@@ -32,7 +32,8 @@ from replay.export.images import check_images, write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.videos import write_film, write_films
 from replay.recordings.source import RecordedSource
-from replay.runs.log import RunHeader, is_run, read_header, read_signals
+from replay.runs.folders import is_run
+from replay.runs.log import RunHeader, read_header, read_signals
 from replay.runs.outline import read_outline
 
 TABLES = ("parquet", "npz", "csv", "arrow")

@@ -17,9 +17,9 @@ from recorder.log.messages import METADATA
 from replay.mcap.reader import Crc, LogReader
 from replay.mcap.records import MalformedRecord
 from replay.mcap.segments import Segment
-from replay.runs.log import METADATA as RUN_METADATA
-from replay.runs.log import RUN_FILE
-from replay.runs.signals_message import missing
+from replay.runs.folders import METADATA as RUN_METADATA
+from replay.runs.folders import RUN_FILE
+from replay.runs.messages import missing
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
 

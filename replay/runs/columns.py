@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS, BlockSignals
 from replay.mcap.records import MalformedRecord
-from replay.runs.signals_message import file_descriptor
+from replay.runs.messages import NUMBERS
 from replay.runs.wire import Span, alike, column, spans
 
 Decode = Callable[[bytes], BlockSignals]
-
-_NUMBERS = {field.name: field.number for field in file_descriptor().message_type[0].field}
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +90,7 @@ def _at_once(messages: Sequence[bytes], first: BlockSignals) -> SignalColumns | 
         places = spans(messages[0])
     except MalformedRecord:
         return None
-    fields: dict[str, Span] = {n: places[k] for n, k in _NUMBERS.items() if k in places}
+    fields: dict[str, Span] = {n: places[k] for n, k in NUMBERS.items() if k in places}
     stored = {name: fields[name] for name in SIGNALS if name in fields}
     rows = alike(messages, list(stored.values()))
     if rows is None:

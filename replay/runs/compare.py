@@ -1,8 +1,8 @@
-"""Whether two runs are the same, bit for bit, and where they part if they are not."""
+"""Whether runs are the same, bit for bit, and what many of them came to, side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import BlockSignals, canonical_bytes, values
+from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_signals
+from replay.runs.outline import Outline, read_outline
 
 Pair = tuple[BlockSignals | None, BlockSignals | None]
 
@@ -64,7 +66,7 @@ class Difference:
         }
 
 
-def compare(
+def first_difference(
     first: Path, second: Path, headers: tuple[RunHeader, RunHeader] | None = None
 ) -> Difference | None:
     """The first difference between two runs' signals, or None where every bit is the same.
@@ -84,14 +86,14 @@ def compare(
     a, b = headers or (read_header(first), read_header(second))
     versions = a.schema, b.schema
     pairs = zip_longest(read_signals(first, a), read_signals(second, b))
-    found = _first_difference(pairs, min(versions))
+    found = _first_of(pairs, min(versions))
     if versions[0] == versions[1]:
         return found
     found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
     return replace(found, versions=versions)
 
 
-def _first_difference(pairs: Iterable[Pair], version: int) -> Difference | None:
+def _first_of(pairs: Iterable[Pair], version: int) -> Difference | None:
     """The first difference among the signals of a version of the record."""
     for iteration, (a, b) in enumerate(pairs):
         if a is None or b is None:
@@ -129,3 +131,60 @@ def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
 def _text(value: Any) -> str:
     """A number with every digit that tells it from its neighbours."""
     return repr(value.item())
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A run in a table of runs.
+
+    Attributes:
+        name: of the run's folder.
+        outline: the run in short.
+        difference: where its signals first differ from the first run's; None where every
+            bit is the same, as for the first run itself.
+    """
+
+    name: str
+    outline: Outline
+    difference: Difference | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The row as JSON values."""
+        streams = self.outline.names()
+        return {
+            "run": self.name,
+            "seed": self.outline.header.manifest.get("seed"),
+            "iterations": self.outline.iterations,
+            "modules": [streams[saved.stream] for saved in self.outline.saved],
+            "first_difference": None if self.difference is None else self.difference.as_json(),
+        }
+
+    def cells(self) -> tuple[str, ...]:
+        """The row as words, in the order of `HEAD`."""
+        found = self.as_json()
+        same = "identical, bit for bit" if self.difference is None else str(self.difference)
+        learned = ", ".join(found["modules"]) or "none"
+        return self.name, str(found["seed"]), str(found["iterations"]), learned, same
+
+
+HEAD = ("run", "seed", "iterations", "modules", "against the first run")
+
+
+def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
+    """What each run came to, and where it first differs from the first one.
+
+    Raises:
+        UsageError: one of them is no run.
+        LogDamagedError: one of them cannot be read.
+    """
+    rows: list[Row] = []
+    for run in runs:
+        outline, found = read_outline(run), None
+        if rows:
+            found = first_difference(runs[0], run, (rows[0].outline.header, outline.header))
+        rows.append(Row(_name(run), outline, found))
+    return tuple(rows)
+
+
+def _name(run: Path) -> str:
+    return run_log(run).resolve().parent.name

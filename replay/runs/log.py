@@ -10,49 +10,30 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
 from google.protobuf import message
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
-from recorder.log.logfile import LogFile
-from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
-from recorder.log.whole import PARTIAL, partial_path
+from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
-from replay.runs import matrix_message, signals_message
-
-RUN_FILE = "run.mcap"
-"""Name of the log in a run's folder."""
-
-METADATA = "cdmisfa.run"
-"""Name of the metadata record with the run's configuration."""
+from replay.runs.folders import METADATA, RUN_FILE, run_log
+from replay.runs.messages import decode_matrix, decode_signals, missing
 
 SIGNALS_TOPIC = "/signals"
 WATCHED_TOPIC = "/watched"
 PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
-
-NEVER_NS = 2**62
-"""More log time than any run has."""
-
-CHUNK_BYTES = 1024 * 1024
-"""Size at which a chunk of the log is closed."""
-
-FLUSH_SECONDS = 1.0
-"""Longest time for which something that was written waits for the operating system."""
 
 _ITERATION = re.compile(r"iteration (\d{1,18})")
 
@@ -76,7 +57,7 @@ class RunHeader:
     @property
     def missing(self) -> tuple[str, ...]:
         """Signals that this log lacks, being older: they are read as NaN."""
-        return signals_message.missing(self.schema)
+        return missing(self.schema)
 
     def setting(self, section: str, key: str, default: Any = None) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`."""
@@ -97,200 +78,6 @@ class Event:
     iteration: int
     text: str
     level: str
-
-
-class RunWriter(Sink):
-    """Writes run.mcap; a context manager that finishes on success.
-
-    Args:
-        path: the file's name.
-        spec: what the source delivers.
-        manifest: what the run was started with, JSON values: `config` by sections, `seed`,
-            `source`.
-        force: overwrite what is there.
-        watched_every: keep every this many frames of images; vectors are all kept.
-        phi_every: keep the weights every this many iterations, and on each save.
-
-    Raises:
-        UsageError: the file exists and `force` is not set.
-        LogWriteError: it cannot be written, here or in any later call.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        spec: SourceSpec,
-        manifest: Mapping[str, Any],
-        *,
-        force: bool = False,
-        watched_every: int = 10,
-        phi_every: int = 50,
-    ) -> None:
-        self.spec = spec
-        self._watched_every = max(watched_every, 1)
-        self._phi_every = max(phi_every, 1)
-        # The learner is quicker than the log's clock: what waits is flushed by the wall's. Of
-        # images zstd leaves a tenth less than lz4, and takes twice as long.
-        self._log = LogFile(
-            path,
-            force=force,
-            library="cdmisfa",
-            compression="lz4",
-            chunk_size=CHUNK_BYTES,
-            flush_ns=NEVER_NS,
-        )
-        self._next_flush = time.monotonic() + FLUSH_SECONDS
-        self._log.add_metadata(
-            METADATA,
-            {
-                "schema": str(SCHEMA_VERSION),
-                "spec": json.dumps(asdict(spec)),
-                "manifest": json.dumps(manifest, sort_keys=True),
-                "watched_every": str(self._watched_every),
-            },
-        )
-        matrix = (matrix_message.MESSAGE, matrix_message.schema_data())
-        self._signals = self._channel(
-            SIGNALS_TOPIC, signals_message.MESSAGE, signals_message.schema_data()
-        )
-        self._phi = self._channel(PHI_TOPIC, *matrix)
-        self._truth = self._channel(TRUTH_TOPIC, *matrix)
-        self._event = self._channel(
-            EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR)
-        )
-        self._images: dict[int, ImageEncoder] = {}
-        if is_image(spec):
-            height, width = spec.frame_shape
-            encoders = [ImageEncoder(height, width, name) for name in spec.streams]
-            self._images = dict(enumerate(encoders))
-            self._watched = self._channel(
-                WATCHED_TOPIC, ImageEncoder.schema, encoders[0].schema_data()
-            )
-        else:
-            self._watched = self._channel(WATCHED_TOPIC, *matrix)
-
-    @property
-    def path(self) -> Path:
-        """The file's name once it is finished."""
-        return self._log.path
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """Write what one iteration gave; see `Sink`."""
-        at, k = signals.log_time, signals.iteration
-        sequence = k & 0xFFFFFFFF
-        self._log.write(self._signals, at, signals_message.encode(signals), sequence)
-        if block.truth.shape[1]:
-            self._log.write(self._truth, at, matrix_message.encode(block.t, block.truth), sequence)
-        if self._images:
-            encode = self._images[block.stream]
-            for i in range(-block.t % self._watched_every, len(block), self._watched_every):
-                shown = self.spec.time_ns(block.t + i)
-                self._log.write(self._watched, shown, encode(shown, block.frames[i]), sequence)
-        else:
-            frames = block.frames.reshape(len(block), -1)
-            self._log.write(self._watched, at, matrix_message.encode(block.t, frames), sequence)
-        if k % self._phi_every == 0 or signals.saved:
-            phi = weights_after(signals, learner)
-            self._log.write(self._phi, at, matrix_message.encode(block.t, phi), sequence)
-        if time.monotonic() >= self._next_flush:
-            self.flush()
-
-    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
-        """Write in words what happened at frame t; see `Sink`."""
-        entry = Log_pb2.Log(
-            level=Log_pb2.Log.Level.Value(level), message=text, name=f"iteration {iteration}"
-        )
-        at = self.spec.time_ns(t)
-        entry.timestamp.FromNanoseconds(at)
-        self._log.write(self._event, at, entry.SerializeToString(), iteration & 0xFFFFFFFF)
-
-    def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
-        """Copy what another log of the same run holds of its first iterations.
-
-        Messages are copied as they are, so a run that goes on keeps its past bit for bit.
-
-        Args:
-            log: the log to copy from.
-            iterations: how many.
-
-        Yields:
-            The signals that were copied, in order.
-        """
-        channels = {
-            SIGNALS_TOPIC: self._signals,
-            WATCHED_TOPIC: self._watched,
-            PHI_TOPIC: self._phi,
-            TRUTH_TOPIC: self._truth,
-            EVENT_TOPIC: self._event,
-        }
-        with LogReader(log) as reader:
-            for entry in reader.messages(channels, ordered=False):
-                topic, signals = entry.channel.topic, None
-                if topic == SIGNALS_TOPIC:
-                    signals = signals_message.decode(entry.data, f"{log} {topic}")
-                    if signals.iteration >= iterations:
-                        return
-                self._log.write(channels[topic], entry.log_time, entry.data, entry.sequence)
-                if signals is not None:
-                    yield signals
-
-    def flush(self) -> None:
-        """Hand everything written so far to the operating system."""
-        self._log.flush()
-        self._next_flush = time.monotonic() + FLUSH_SECONDS
-
-    def finish(self) -> None:
-        """Write the index and give the file its name."""
-        self._log.finish()
-
-    def abandon(self) -> None:
-        """Leave a readable NAME.partial."""
-        self._log.abandon()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._log.__exit__(kind, error, trace)
-
-    def _channel(self, topic: str, name: str, data: bytes) -> int:
-        return self._log.add_channel(topic, self._log.add_schema(name, ENCODING, data))
-
-
-def run_log(path: Path) -> Path:
-    """The log of a run, given its folder or the log itself; a partial one where it was cut short.
-
-    Raises:
-        UsageError: there is none.
-    """
-    path = Path(path)
-    whole = path / RUN_FILE if path.is_dir() else path
-    for candidate in (whole, partial_path(whole)):
-        if candidate.is_file():
-            return candidate
-    if path.is_dir():
-        raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
-    raise UsageError(f"{path} does not exist: name a run's folder or its {RUN_FILE}")
-
-
-def is_run(path: Path) -> bool:
-    """Whether a folder or a log is that of a run.
-
-    Raises:
-        UsageError: it does not exist.
-        LogDamagedError: it is no log, or a damaged one.
-    """
-    path = Path(path)
-    if path.is_dir():
-        whole = path / RUN_FILE
-        return whole.is_file() or partial_path(whole).is_file()
-    with LogReader(run_log(path)) as reader:
-        return any(record.name == METADATA for record in reader.metadata)
 
 
 def read_header(path: Path) -> RunHeader:
@@ -345,7 +132,7 @@ def read_signals(path: Path, header: RunHeader | None = None) -> Iterator[BlockS
     log = run_log(path)
     version = (header or read_header(log)).schema
     for _, data in _messages(log, SIGNALS_TOPIC):
-        yield signals_message.decode(data, f"{log} {SIGNALS_TOPIC}", version)
+        yield decode_signals(data, f"{log} {SIGNALS_TOPIC}", version)
 
 
 def count_iterations(path: Path) -> int:
@@ -359,10 +146,10 @@ def read_watched(path: Path) -> Iterator[tuple[int, NDArray[Any]]]:
     header = read_header(log)
     shape = header.spec.frame_shape
     for at, data in _messages(log, WATCHED_TOPIC):
-        if is_image(header.spec):
+        if header.spec.images:
             yield header.frame_at(at), decode_image(data, shape, log)[None]
         else:
-            t, values = matrix_message.decode(data, f"{log} {WATCHED_TOPIC}")
+            t, values = decode_matrix(data, f"{log} {WATCHED_TOPIC}")
             yield t, reshaped(values, (-1, *shape), log)
 
 
@@ -371,7 +158,7 @@ def read_truth(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
     log = run_log(path)
     columns = len(read_header(log).spec.truth)
     for _, data in _messages(log, TRUTH_TOPIC):
-        t, values = matrix_message.decode(data, f"{log} {TRUTH_TOPIC}")
+        t, values = decode_matrix(data, f"{log} {TRUTH_TOPIC}")
         yield t, reshaped(values, (-1, columns), log)
 
 
@@ -379,7 +166,7 @@ def read_phi(path: Path) -> Iterator[tuple[int, NDArray[np.float64]]]:
     """The abstraction's weights as (t of the block's first frame, (J, I)), in order."""
     log = run_log(path)
     for _, data in _messages(log, PHI_TOPIC):
-        yield matrix_message.decode(data, f"{log} {PHI_TOPIC}")
+        yield decode_matrix(data, f"{log} {PHI_TOPIC}")
 
 
 def read_events(path: Path) -> Iterator[Event]:
@@ -388,11 +175,6 @@ def read_events(path: Path) -> Iterator[Event]:
     header = read_header(log)
     for at, data in _messages(log, EVENT_TOPIC):
         yield decode_event(data, header.frame_at(at), log)
-
-
-def is_image(spec: SourceSpec) -> bool:
-    """Whether frames are images, not vectors."""
-    return spec.dtype == "uint8" and len(spec.frame_shape) == 2
 
 
 def decode_event(data: bytes, t: int, log: Path) -> Event:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay.runs.columns import SignalColumns
-from replay.runs.log import RunHeader, read_header, run_log
+from replay.runs.folders import run_log
+from replay.runs.log import RunHeader, read_header
 from replay.runs.stretches import read_columns
 
 Float = NDArray[np.float64]

@@ -15,7 +15,6 @@ from cdmisfa.core.errors import LogDamagedError
 from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
-from replay.runs import matrix_message, signals_message
 from replay.runs.columns import SignalColumns, columns_of_messages
 from replay.runs.log import (
     EVENT_TOPIC,
@@ -27,9 +26,9 @@ from replay.runs.log import (
     RunHeader,
     decode_event,
     decode_image,
-    is_image,
     reshaped,
 )
+from replay.runs.messages import decode_matrix, decode_signals
 from replay.runs.wire import alike, column, spans
 
 ITERATIONS = 500
@@ -119,7 +118,7 @@ class _Kept:
         self._log = log
         self._header = header
         self._every = every
-        self._images = is_image(header.spec)
+        self._images = header.spec.images
         self._data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self._frames: dict[str, list[int]] = {topic: [] for topic in TOPICS}
         self._bytes = 0
@@ -155,14 +154,14 @@ class _Kept:
             signals=self._records(data[SIGNALS_TOPIC]),
             watched=watched,
             truth=self._matrices(TRUTH_TOPIC, data, (len(spec.truth),)),
-            phi=tuple(matrix_message.decode(d, f"{log} {PHI_TOPIC}") for d in data[PHI_TOPIC]),
+            phi=tuple(decode_matrix(d, f"{log} {PHI_TOPIC}") for d in data[PHI_TOPIC]),
             events=tuple(decode_event(d, t, log) for d, t in events),
         )
 
     def _records(self, data: list[bytes]) -> tuple[SignalColumns, ...]:
         where = f"{self._log} {SIGNALS_TOPIC}"
         version = self._header.schema
-        found = columns_of_messages(data, lambda d: signals_message.decode(d, where, version))
+        found = columns_of_messages(data, lambda d: decode_signals(d, where, version))
         streams = len(self._header.spec.streams)
         return tuple(_checked(columns, streams, where) for columns in found)
 
@@ -181,7 +180,7 @@ class _Kept:
         """Rows of matrix messages with a frame each, all of one size together."""
 
         def decode(entry: bytes) -> tuple[int, NDArray[np.float64]]:
-            return matrix_message.decode(entry, f"{self._log} {topic}")
+            return decode_matrix(entry, f"{self._log} {topic}")
 
         return tuple(
             (frames, reshaped(values, (-1, *shape), self._log))

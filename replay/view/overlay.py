@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS, BlockSignals
 from replay.palette import colour, packed
-from replay.runs.compare import Difference
+from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.log import read_signals
-from replay.runs.table import HEAD, Row
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, Clock, Column
 from replay.view.config import ViewConfig

@@ -15,7 +15,7 @@ import pyarrow as pa
 from rerun_bindings import ChunkInternal, ChunkStoreInternal, ComponentDescriptor
 
 from cdmisfa.core.errors import CdmisfaError
-from replay.runs.log import run_log
+from replay.runs.folders import run_log
 from replay.view.labels import label
 
 if TYPE_CHECKING:

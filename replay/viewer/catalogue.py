@@ -9,7 +9,6 @@ programs on this machine can connect.
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import subprocess
 import sys
@@ -23,20 +22,13 @@ from typing import Any
 
 from rerun_bindings import CatalogClientInternal, RrdReaderInternal
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from recorder.log.whole import PARTIAL
-from replay.runs.log import is_run, run_log
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.runs.folders import run_log, runs_in
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
 from replay.viewer.program import free_port, has_display, running
 
 VIEW_FILE = "run.rrd"
 """Name of the view in a run's folder."""
-
-REQUEST = "sweep.json"
-"""File of a sweep that names the trials it was asked for last."""
-
-TRIALS = "trials"
-"""Folder of a sweep that holds its runs."""
 
 ROWS = "base"
 """Name of the layer of rows."""
@@ -60,39 +52,6 @@ Progress = Callable[[int, int], None]
 
 REFUSALS = (OSError, RuntimeError, ValueError)
 """What Rerun's client raises when the server refuses, or is not there."""
-
-
-def runs_in(folder: Path) -> list[Path]:
-    """The folders of runs in a folder or in its `trials`; none where it is itself a run.
-
-    Of a sweep's trials they are those that it was asked for last.
-
-    Args:
-        folder: of a sweep, or any other.
-
-    Raises:
-        LogDamagedError: the sweep's request cannot be read.
-    """
-    folder = Path(folder)
-    if not folder.is_dir() or is_run(folder):
-        return []
-    trials = list((folder / TRIALS).iterdir()) if (folder / TRIALS).is_dir() else []
-    if is_sweep(folder):
-        asked = _asked(folder / REQUEST)
-        trials = [trial for trial in trials if trial.name.removesuffix(PARTIAL) in asked]
-    return sorted(p for p in (*folder.iterdir(), *trials) if p.is_dir() and is_run(p))
-
-
-def is_sweep(folder: Path) -> bool:
-    """Whether a folder is that of a sweep."""
-    return (Path(folder) / REQUEST).is_file()
-
-
-def _asked(request: Path) -> set[str]:
-    try:
-        return {str(trial["id"]) for trial in json.loads(request.read_text("utf-8"))["trials"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise LogDamagedError(f"{request} is damaged: run the sweep again to write it") from error
 
 
 def ready_view(run: Path) -> Path:

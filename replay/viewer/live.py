@@ -24,7 +24,8 @@ from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from replay.runs.columns import columns_of_records
-from replay.runs.log import RunHeader, read_header, run_log
+from replay.runs.folders import run_log
+from replay.runs.log import RunHeader, read_header
 from replay.runs.outline import LINES, Outline
 from replay.runs.stretches import read_stretches
 from replay.view.config import ViewConfig

@@ -31,9 +31,9 @@ def compare_command(
     """
     if len(runs) < 2:
         raise click.UsageError("name two runs, or more")
-    from replay.runs.table import HEAD, survey
+    from replay.runs.compare import HEAD, side_by_side
 
-    rows = survey(runs)
+    rows = side_by_side(runs)
     if save is not None:
         from replay.view.overlay import build_overlay  # takes half a second
 

@@ -55,7 +55,8 @@ def view_command(
         raise click.UsageError("choose one of --save, --web and --screenshot")
     if at is not None and screenshot is None:
         raise click.UsageError("--at goes with --screenshot")
-    from replay.viewer.catalogue import is_sweep, runs_in, serve_catalogue
+    from replay.runs.folders import is_sweep, runs_in
+    from replay.viewer.catalogue import serve_catalogue
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)

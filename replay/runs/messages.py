@@ -1,15 +1,20 @@
-"""`BlockSignals` as a protobuf message, generated from the table of signals.
+"""What is in a run's log, as protobuf messages of our own.
 
-Every number has a fixed width, so a record that is read is, bit for bit, the record
-that was written. The sizes of all arrays stand in one more field: an empty array
-keeps its shape. A field's number never changes: those of a later version of the
-record follow all of the versions before.
+`cdmisfa.BlockSignals` is generated from the table of signals. The sizes of all arrays stand in
+one more field: an empty array keeps its shape. A field's number never changes: those of a later
+version of the record follow all of the versions before.
+
+`cdmisfa.Matrix` holds rows of float64 from frame t on: a block's vectors, its ground truth, or
+the abstraction's weights.
+
+Every number has a fixed width, so what is read is, bit for bit, what was written.
 """
 
 from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,8 +25,8 @@ from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
 from recorder.log.messages import varint
 
-MESSAGE = "cdmisfa.BlockSignals"
-"""Full name of the message in the log's schema."""
+SIGNALS_SCHEMA = "cdmisfa.BlockSignals"
+MATRIX_SCHEMA = "cdmisfa.Matrix"
 
 SHAPES = "shapes"
 """Field with the sizes of every dimension of every array, the oldest arrays first."""
@@ -37,10 +42,18 @@ _SCALARS = tuple(s for s in _BY_AGE if not s.dims)
 _ARRAYS = tuple(s for s in _BY_AGE if s.dims)
 _FIRST = tuple(s.name for s in _BY_AGE if s.since == 1)
 _LATER = tuple(s.name for s in _BY_AGE if s.since > 1)
-_NUMBER = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
+NUMBERS = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
+"""Number of each signal's field."""
+
+_HEAD = struct.Struct("<BqBIBI")
+"""Tag and value of t, of the number of columns, and the values' tag and length.
+
+The length of the values is written as a varint of five bytes, which any reader
+takes and which has a fixed place.
+"""
 
 
-def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
+def _signals_file() -> descriptor_pb2.FileDescriptorProto:
     """The message's definition, with each signal's symbol, unit and meaning as its comment."""
     file = descriptor_pb2.FileDescriptorProto(
         name="cdmisfa/block_signals.proto", package="cdmisfa", syntax="proto3"
@@ -49,13 +62,13 @@ def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
     for signal in _BY_AGE:
         definition.field.add(
             name=signal.name,
-            number=_NUMBER[signal.name],
+            number=NUMBERS[signal.name],
             type=_TYPES[signal.dtype],
             label=_FIELD.LABEL_REPEATED if signal.dims else _FIELD.LABEL_OPTIONAL,
         )
         _comment(file, len(definition.field) - 1, _sentence(signal))
     definition.field.add(
-        name=SHAPES, number=_NUMBER[SHAPES], type=_FIELD.TYPE_UINT32, label=_FIELD.LABEL_REPEATED
+        name=SHAPES, number=NUMBERS[SHAPES], type=_FIELD.TYPE_UINT32, label=_FIELD.LABEL_REPEATED
     )
     _comment(
         file,
@@ -65,15 +78,22 @@ def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
     return file
 
 
-def schema_data() -> bytes:
-    """The definition as a log stores it: a FileDescriptorSet."""
-    data: bytes = descriptor_pb2.FileDescriptorSet(file=[file_descriptor()]).SerializeToString(
-        deterministic=True
+def _matrix_file() -> descriptor_pb2.FileDescriptorProto:
+    """The message's definition."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name="cdmisfa/matrix.proto", package="cdmisfa", syntax="proto3"
     )
-    return data
+    definition = file.message_type.add(name="Matrix")
+    for name, number, kind, label in (
+        ("t", 1, _FIELD.TYPE_SFIXED64, _FIELD.LABEL_OPTIONAL),
+        ("columns", 2, _FIELD.TYPE_FIXED32, _FIELD.LABEL_OPTIONAL),
+        ("values", 3, _FIELD.TYPE_DOUBLE, _FIELD.LABEL_REPEATED),
+    ):
+        definition.field.add(name=name, number=number, type=kind, label=label)
+    return file
 
 
-def encode(signals: BlockSignals) -> bytes:
+def encode_signals(signals: BlockSignals) -> bytes:
     """A record as the bytes of its message."""
     scalars = list(_TAGGED)
     scalars[1::2] = [getattr(signals, s.name) for s in _SCALARS]
@@ -93,26 +113,49 @@ def encode(signals: BlockSignals) -> bytes:
     return b"".join(parts)
 
 
+def encode_matrix(t: int, matrix: NDArray[np.float64]) -> bytes:
+    """(rows, columns) values from frame t on as the bytes of a message."""
+    values = np.asarray(matrix, dtype="<f8")
+    return (
+        _HEAD.pack(0x09, t, 0x15, values.shape[1], 0x1A, _padded_varint(values.nbytes))
+        + bytes((values.nbytes >> 28 & 0x7F,))
+        + values.tobytes()
+    )
+
+
+def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.float64]]:
+    """The frame counter and the (rows, columns) values of a message.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message.
+    """
+    decoded = _parsed(_MATRIX, data, where)
+    values = np.array(decoded.values, dtype=np.float64)
+    if values.size and (decoded.columns == 0 or values.size % decoded.columns):
+        raise LogDamagedError(f"{where}: {values.size} values in rows of {decoded.columns}")
+    rows = values.size // decoded.columns if decoded.columns else 0
+    return decoded.t, values.reshape(rows, decoded.columns)
+
+
 def missing(version: int) -> tuple[str, ...]:
     """Names of the signals that a version of the record lacks."""
     return tuple(s.name for s in SIGNALS.values() if s.since > version)
 
 
-def decode(data: bytes, where: str = "record", version: int = SCHEMA_VERSION) -> BlockSignals:
+def decode_signals(
+    data: bytes, where: str = "record", version: int = SCHEMA_VERSION
+) -> BlockSignals:
     """The record in the bytes of a message; NaN where its version lacks a signal.
 
     Args:
-        data: what `encode` of that version made.
+        data: what `encode_signals` of that version made.
         where: what to name in an error.
         version: of the record.
 
     Raises:
         LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
     """
-    try:
-        decoded = _CLASS.FromString(data)
-    except message.DecodeError as error:
-        raise LogDamagedError(f"{where}: not a {MESSAGE} message, see cdmisfa verify") from error
+    decoded = _parsed(_SIGNALS, data, where)
     sizes = iter(getattr(decoded, SHAPES))
     fields: dict[str, Any] = {
         s.name: getattr(decoded, s.name) if s.since <= version else math.nan for s in _SCALARS
@@ -129,6 +172,14 @@ def decode(data: bytes, where: str = "record", version: int = SCHEMA_VERSION) ->
                 raise LogDamagedError(f"{where}: sizes without values, see cdmisfa verify")
             fields[signal.name] = np.full(shape, math.nan)
     return BlockSignals(**fields)
+
+
+def _parsed(kind: Any, data: bytes, where: str) -> Any:
+    try:
+        return kind.FromString(data)
+    except message.DecodeError as error:
+        name = kind.DESCRIPTOR.full_name
+        raise LogDamagedError(f"{where}: not a {name} message, see cdmisfa verify") from error
 
 
 def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> NDArray[Any]:
@@ -157,20 +208,36 @@ def _sentence(signal: Signal) -> str:
 
 
 def _tag(name: str, wire_type: int) -> bytes:
-    return varint(_NUMBER[name] << 3 | wire_type)
+    return varint(NUMBERS[name] << 3 | wire_type)
 
 
 def _length_prefix(tag: bytes, length: int) -> bytes:
     return tag + (bytes((length,)) if length < 0x80 else varint(length))
 
 
-def _message_class() -> Any:
+def _padded_varint(value: int) -> int:
+    """The first four of a varint's five bytes, as a little-endian number."""
+    number = 0
+    for byte in range(4):
+        number |= (value >> 7 * byte & 0x7F | 0x80) << 8 * byte
+    return number
+
+
+def _message_class(file: descriptor_pb2.FileDescriptorProto, name: str) -> Any:
     pool = descriptor_pool.DescriptorPool()
-    pool.Add(file_descriptor())
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(MESSAGE))
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-_CLASS = _message_class()
+_FILES = {SIGNALS_SCHEMA: _signals_file(), MATRIX_SCHEMA: _matrix_file()}
+_SIGNALS, _MATRIX = (_message_class(file, name) for name, file in _FILES.items())
+
+SCHEMAS: Mapping[str, bytes] = {
+    name: descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(deterministic=True)
+    for name, file in _FILES.items()
+}
+"""Each message's definition as a log stores it: a FileDescriptorSet."""
+
 _TAGGED: tuple[Any, ...] = tuple(
     part for s in _SCALARS for part in (_tag(s.name, _WIRE[s.dtype]), None)
 )

@@ -1,0 +1,100 @@
+"""Where runs lie on disk, and which of them are in a folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.log.whole import PARTIAL, partial_path
+from replay.mcap.reader import LogReader
+
+RUN_FILE = "run.mcap"
+"""Name of the log in a run's folder."""
+
+MANIFEST_FILE = "run.json"
+"""Name of the file that says how a run was begun and what came of it."""
+
+METADATA = "cdmisfa.run"
+"""Name of the metadata record that makes a log that of a run."""
+
+REQUEST = "sweep.json"
+"""File of a sweep that names the trials it was asked for last."""
+
+TRIALS = "trials"
+"""Folder of a sweep that holds its runs."""
+
+
+def run_log(path: Path) -> Path:
+    """The log of a run, given its folder or the log itself; a partial one where it was cut short.
+
+    Raises:
+        UsageError: there is none.
+    """
+    path = Path(path)
+    whole = path / RUN_FILE if path.is_dir() else path
+    for candidate in (whole, partial_path(whole)):
+        if candidate.is_file():
+            return candidate
+    if path.is_dir():
+        raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
+    raise UsageError(f"{path} does not exist: name a run's folder or its {RUN_FILE}")
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder or a log is that of a run.
+
+    Raises:
+        UsageError: it does not exist.
+        LogDamagedError: it is no log, or a damaged one.
+    """
+    path = Path(path)
+    if path.is_dir():
+        whole = path / RUN_FILE
+        return whole.is_file() or partial_path(whole).is_file()
+    with LogReader(run_log(path)) as reader:
+        return any(record.name == METADATA for record in reader.metadata)
+
+
+def read_manifest(folder: Path) -> Mapping[str, Any]:
+    """How a run was begun and what came of it; empty where nothing readable says so."""
+    try:
+        document = json.loads((folder / MANIFEST_FILE).read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return document if isinstance(document, Mapping) else {}
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """The folders of runs in a folder or in its `trials`; none where it is itself a run.
+
+    Of a sweep's trials they are those that it was asked for last.
+
+    Args:
+        folder: of a sweep, or any other.
+
+    Raises:
+        LogDamagedError: the sweep's request cannot be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir() or is_run(folder):
+        return []
+    trials = list((folder / TRIALS).iterdir()) if (folder / TRIALS).is_dir() else []
+    if is_sweep(folder):
+        wanted = _requested(folder / REQUEST)
+        trials = [trial for trial in trials if trial.name.removesuffix(PARTIAL) in wanted]
+    return sorted(p for p in (*folder.iterdir(), *trials) if p.is_dir() and is_run(p))
+
+
+def is_sweep(folder: Path) -> bool:
+    """Whether a folder is that of a sweep."""
+    return (Path(folder) / REQUEST).is_file()
+
+
+def _requested(request: Path) -> set[str]:
+    try:
+        return {str(trial["id"]) for trial in json.loads(request.read_text("utf-8"))["trials"]}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise LogDamagedError(f"{request} is damaged: run the sweep again to write it") from error

@@ -1,0 +1,192 @@
+"""Writing run.mcap: readable while it is being written, and up to the cut after a crash."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from foxglove_schemas_protobuf import Log_pb2
+
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.learning import Learner, Sink, weights_after
+from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
+from recorder.log.logfile import LogFile
+from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
+from replay.mcap.reader import LogReader
+from replay.runs.folders import METADATA
+from replay.runs.log import EVENT_TOPIC, PHI_TOPIC, SIGNALS_TOPIC, TRUTH_TOPIC, WATCHED_TOPIC
+from replay.runs.messages import (
+    MATRIX_SCHEMA,
+    SCHEMAS,
+    SIGNALS_SCHEMA,
+    decode_signals,
+    encode_matrix,
+    encode_signals,
+)
+
+NEVER_NS = 2**62
+"""More log time than any run has."""
+
+CHUNK_BYTES = 1024 * 1024
+"""Size at which a chunk of the log is closed."""
+
+FLUSH_SECONDS = 1.0
+"""Longest time for which something that was written waits for the operating system."""
+
+
+class RunWriter(Sink):
+    """Writes run.mcap; a context manager that finishes on success.
+
+    Args:
+        path: the file's name.
+        spec: what the source delivers.
+        manifest: what the run was started with, JSON values: `config` by sections, `seed`,
+            `source`.
+        force: overwrite what is there.
+        watched_every: keep every this many frames of images; vectors are all kept.
+        phi_every: keep the weights every this many iterations, and on each save.
+
+    Raises:
+        UsageError: the file exists and `force` is not set.
+        LogWriteError: it cannot be written, here or in any later call.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        spec: SourceSpec,
+        manifest: Mapping[str, Any],
+        *,
+        force: bool = False,
+        watched_every: int = 10,
+        phi_every: int = 50,
+    ) -> None:
+        self.spec = spec
+        self._watched_every = max(watched_every, 1)
+        self._phi_every = max(phi_every, 1)
+        # The learner is quicker than the log's clock: what waits is flushed by the wall's. Of
+        # images zstd leaves a tenth less than lz4, and takes twice as long.
+        self._log = LogFile(
+            path,
+            force=force,
+            library="cdmisfa",
+            compression="lz4",
+            chunk_size=CHUNK_BYTES,
+            flush_ns=NEVER_NS,
+        )
+        self._next_flush = time.monotonic() + FLUSH_SECONDS
+        self._log.add_metadata(
+            METADATA,
+            {
+                "schema": str(SCHEMA_VERSION),
+                "spec": json.dumps(asdict(spec)),
+                "manifest": json.dumps(manifest, sort_keys=True),
+                "watched_every": str(self._watched_every),
+            },
+        )
+        self._channels: dict[str, int] = {}
+        self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA, SCHEMAS[SIGNALS_SCHEMA])
+        for topic in (PHI_TOPIC, TRUTH_TOPIC):
+            self._add_channel(topic, MATRIX_SCHEMA, SCHEMAS[MATRIX_SCHEMA])
+        self._add_channel(EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
+        self._images: list[ImageEncoder] = []
+        if spec.images:
+            height, width = spec.frame_shape
+            self._images = [ImageEncoder(height, width, name) for name in spec.streams]
+            data = self._images[0].schema_data()
+            self._add_channel(WATCHED_TOPIC, ImageEncoder.schema, data)
+        else:
+            self._add_channel(WATCHED_TOPIC, MATRIX_SCHEMA, SCHEMAS[MATRIX_SCHEMA])
+
+    @property
+    def path(self) -> Path:
+        """The file's name once it is finished."""
+        return self._log.path
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """Write what one iteration gave; see `Sink`."""
+        at, k = signals.log_time, signals.iteration
+        self._write(SIGNALS_TOPIC, at, k, encode_signals(signals))
+        if block.truth.shape[1]:
+            self._write(TRUTH_TOPIC, at, k, encode_matrix(block.t, block.truth))
+        if self._images:
+            encode = self._images[block.stream]
+            for i in range(-block.t % self._watched_every, len(block), self._watched_every):
+                shown = self.spec.time_ns(block.t + i)
+                self._write(WATCHED_TOPIC, shown, k, encode(shown, block.frames[i]))
+        else:
+            frames = block.frames.reshape(len(block), -1)
+            self._write(WATCHED_TOPIC, at, k, encode_matrix(block.t, frames))
+        if k % self._phi_every == 0 or signals.saved:
+            phi = weights_after(signals, learner)
+            self._write(PHI_TOPIC, at, k, encode_matrix(block.t, phi))
+        if time.monotonic() >= self._next_flush:
+            self.flush()
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """Write in words what happened at frame t; see `Sink`."""
+        entry = Log_pb2.Log(
+            level=Log_pb2.Log.Level.Value(level), message=text, name=f"iteration {iteration}"
+        )
+        at = self.spec.time_ns(t)
+        entry.timestamp.FromNanoseconds(at)
+        self._write(EVENT_TOPIC, at, iteration, entry.SerializeToString())
+
+    def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
+        """Copy what another log of the same run holds of its first iterations.
+
+        Messages are copied as they are, so a run that goes on keeps its past bit for bit.
+
+        Args:
+            log: the log to copy from.
+            iterations: how many.
+
+        Yields:
+            The signals that were copied, in order.
+        """
+        with LogReader(log) as reader:
+            for entry in reader.messages(self._channels, ordered=False):
+                topic, signals = entry.channel.topic, None
+                if topic == SIGNALS_TOPIC:
+                    signals = decode_signals(entry.data, f"{log} {topic}")
+                    if signals.iteration >= iterations:
+                        return
+                self._log.write(self._channels[topic], entry.log_time, entry.data, entry.sequence)
+                if signals is not None:
+                    yield signals
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+        self._log.flush()
+        self._next_flush = time.monotonic() + FLUSH_SECONDS
+
+    def finish(self) -> None:
+        """Write the index and give the file its name."""
+        self._log.finish()
+
+    def abandon(self) -> None:
+        """Leave a readable NAME.partial."""
+        self._log.abandon()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._log.__exit__(kind, error, trace)
+
+    def _add_channel(self, topic: str, name: str, data: bytes) -> None:
+        schema = self._log.add_schema(name, ENCODING, data)
+        self._channels[topic] = self._log.add_channel(topic, schema)
+
+    def _write(self, topic: str, at: int, iteration: int, data: bytes) -> None:
+        self._log.write(self._channels[topic], at, data, iteration & 0xFFFFFFFF)
