@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, cast
@@ -17,7 +17,8 @@ from cdmisfa.core.blocks import FrameSource, HeadPose, SourceSpec
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.folder import Asked, answered, ask, asked, held
+from recorder.log.folder import held
+from recorder.log.manifest import Manifest, forget_views, keep_recording, read_recording
 from recorder.log.parts import Split, ViewParts, view_logs
 from recorder.log.viewlog import FramesHeld, Identity, frames_held, sha256
 from recorder.world.rendering import render_here, render_in_processes, requests
@@ -144,7 +145,8 @@ def record(
             limits = {} if split is None else dict.fromkeys(unfinished, str(split))
             lengths = dict.fromkeys(unfinished, frames)
             if unfinished:
-                _note(ask, folder, Asked(lengths, limits, kind, scene.seed or 0))
+                options = {"seed": scene.seed or 0, "frames": lengths, "split": limits}
+                keep_recording(folder, Manifest((kind,), options))
             for log in logs:
                 open_logs.callback(log.abandon)
                 log.open()
@@ -164,7 +166,7 @@ def record(
                         raise _StoppedError(f"{folder} is not finished: go on with --resume")
             for log in logs:
                 log.finish()
-            _note(answered, folder, names)
+            forget_views(folder, names)
     return [written(log.view, path, n) for log in logs for path, n in log.parts]
 
 
@@ -243,7 +245,8 @@ def _length(
                 f"nothing, give --frames {there.end} or more, or overwrite with --force"
             )
         longest = max(longest, there.end)
-    wanted = asked(folder).length(list(earlier))
+    begun = read_recording(folder).options["frames"]
+    wanted = max((begun[view] for view in earlier if view in begun), default=0)
     return frames or max(longest, wanted or (longest if _finished(earlier) else DEFAULT_FRAMES))
 
 
@@ -255,18 +258,15 @@ def _as_begun(
     Raises:
         UsageError: it was begun with another scene, seed or split.
     """
-    known = asked(folder)
-    limits = sorted({known.split[view] for view in views if view in known.split})
-    pairs = [("", known.scene or kind, kind)]
-    pairs.append(("--seed ", str(seed if known.seed is None else known.seed), str(seed)))
+    begun = read_recording(folder)
+    splits = begun.options["split"]
+    limits = sorted({splits[view] for view in views if view in splits})
+    now = {"": kind, "seed": seed}
     if limits and split is not None:
-        pairs.append(("--split ", limits[0], str(split)))
-    for option, before, now in pairs:
-        if before != now:
-            raise UsageError(
-                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
-                "same, or overwrite with --force"
-            )
+        now["split"] = str(split)
+    replace(begun, options={**begun.options, "split": limits[0] if limits else ""}).refuse_other(
+        folder, now
+    )
     return split if split is not None or not limits else Split.parse(limits[0])
 
 
@@ -275,18 +275,6 @@ def _finished(earlier: Mapping[str, Mapping[Path, FramesHeld]]) -> bool:
     return all(
         files and all(path.suffix == ".mcap" for path in files) for files in earlier.values()
     )
-
-
-def _note(change: Callable[..., None], folder: Path, *what: Any) -> None:
-    """Change what a folder says it was asked for.
-
-    Raises:
-        LogWriteError: the disk does not take it.
-    """
-    try:
-        change(folder, *what)
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
 
 
 @contextlib.contextmanager

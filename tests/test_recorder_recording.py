@@ -19,7 +19,8 @@ from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder import recording
 from recorder.config import RecordConfig, SceneConfig
 from recorder.log import viewlog
-from recorder.log.folder import ASKED, held
+from recorder.log.folder import held
+from recorder.log.manifest import RECORDING
 from recorder.log.parts import Split
 from recorder.log.viewlog import METADATA, frames_held, sha256
 from recorder.log.whole import partial_path
@@ -235,7 +236,7 @@ def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path)
     assert code == -signal.SIGKILL
     for view in STREAMS:
         assert whole_frames(partial_path(folder / f"{view}.mcap"), view) >= told - 50
-    noted = json.loads((folder / ASKED).read_text())
+    noted = json.loads((folder / RECORDING).read_text())
     assert noted["frames"] == dict.fromkeys(STREAMS, 1000000)
     files = record("oscillatory", folder, frames=3000, resume=True)
     assert [f.frames for f in files] == [3000] * 3

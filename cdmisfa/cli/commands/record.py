@@ -67,16 +67,16 @@ def record_command(
     same seed gives the same bytes.
     """
     from cdmisfa.experiments.sources import configure_scene
-    from recorder.log.folder import Asked, asked
+    from recorder.log.manifest import Manifest, read_recording
     from recorder.world.scenes import SCENES
 
-    begun = asked(out) if resume and out is not None else Asked()
-    scene = scene or begun.scene
+    begun = read_recording(out) if resume and out is not None else Manifest()
+    scene = scene or "".join(begun.source)
     if not scene:
         where = f"{out} does not say of what it is: " if resume and out is not None else ""
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
-    if begun.seed is not None and ctx.get_parameter_source("seed") is ParameterSource.DEFAULT:
-        seed = begun.seed
+    if ctx.get_parameter_source("seed") is ParameterSource.DEFAULT:
+        seed = begun.options.get("seed", seed)
     configuration = configure_scene(scene, preset, settings, seed)
     if scene_picture is not None:
         if scene != "icub":

@@ -1,0 +1,165 @@
+"""How something was begun, kept with it, so that it can be resumed without being told again.
+
+`Manifest` is the one form of it: the words that named the source, and the options of the command
+that make the result what it is. A run keeps its manifest in its log, a recording that is not
+finished keeps its own in RECORDING. Paths are kept relative to the folder, so that the folder can
+be moved together with what it was made from.
+
+Example:
+    >>> begun = Manifest(("logs/a.mcap",), {"seed": 7})
+    >>> begun.as_json(Path("runs/a"))
+    {'source': ['./../../logs/a.mcap'], 'seed': 7}
+    >>> Manifest.from_json(begun.as_json(Path("runs/a")), Path("runs/a")) == begun
+    True
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.log.whole import whole
+
+RECORDING = "recording.json"
+"""Manifest of a recording; gone when every view is finished.
+
+Beside the logs, because these hold the same bytes whatever length was wanted first.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """How something was begun.
+
+    Attributes:
+        source: the words that name the source: a scene, paths or URLs; empty where nobody knows.
+        options: what else makes the result what it is, by name, as JSON values.
+    """
+
+    source: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def as_json(self, folder: Path, names: Collection[str] = ()) -> dict[str, Any]:
+        """The manifest as JSON values, to be kept in a folder.
+
+        Args:
+            folder: to which paths become relative.
+            names: words that are no paths, as those of scenes; URLs are not, either.
+        """
+        return {"source": [kept_path(word, folder, names) for word in self.source], **self.options}
+
+    @classmethod
+    def from_json(cls, values: object, folder: Path) -> Manifest | None:
+        """The manifest that a folder keeps; None where the values are not one."""
+        if not isinstance(values, Mapping) or not isinstance(values.get("source"), list):
+            return None
+        options = {str(name): value for name, value in values.items() if name != "source"}
+        return cls(tuple(found_path(str(word), folder) for word in values["source"]), options)
+
+    def refuse_other(self, folder: Path, now: Mapping[str, Any]) -> None:
+        """Refuse to resume what was begun with other options.
+
+        Args:
+            folder: what is resumed.
+            now: option and value; "" is the source. Options that nobody knows are not compared.
+
+        Raises:
+            UsageError: at the first that differs.
+        """
+        known = {"": " ".join(self.source), **self.options}
+        for option, value in now.items():
+            before = known.get(option, value)
+            if before not in ("", value):
+                name = f"--{option} " if option else ""
+                raise UsageError(
+                    f"{folder} was begun with {name}{before}, not {name}{value}: go on with the "
+                    "same, or overwrite with --force"
+                )
+
+
+def kept_path(word: str, folder: Path, names: Collection[str] = ()) -> str:
+    """A path relative to the folder that keeps it; other words as they are."""
+    if word in names or "://" in word:
+        return word
+    return os.path.join(os.curdir, os.path.relpath(word, folder))
+
+
+def found_path(word: str, folder: Path) -> str:
+    """A word of `kept_path` as it was, or where it lies now."""
+    return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
+
+
+def read_recording(folder: Path) -> Manifest:
+    """The manifest of an unfinished recording, as far as it has a readable one.
+
+    Returns:
+        The scene as its source, and the options `seed`, `frames` and `split`; the latter two are
+        given for each unfinished view.
+    """
+    try:
+        values = json.loads((folder / RECORDING).read_text("utf-8"))
+        frames = {str(view): n for view, n in values["frames"].items() if _is_count(n) and n > 0}
+        split = {v: limit for v, limit in values.get("split", {}).items() if isinstance(limit, str)}
+        scene, seed = values.get("scene", ""), values.get("seed")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return Manifest((), {"frames": {}, "split": {}})
+    known = {"seed": seed} if _is_count(seed) and 0 <= seed < 2**63 else {}
+    return Manifest(
+        (scene,) if scene and isinstance(scene, str) else (),
+        {"frames": frames, "split": split, **known},
+    )
+
+
+def keep_recording(folder: Path, manifest: Manifest) -> None:
+    """Keep the manifest of a recording, beside what is known of its other views.
+
+    Raises:
+        LogWriteError: the disk does not take it.
+    """
+    others = _without(read_recording(folder), list(manifest.options["frames"]))
+    views = {
+        option: {**others.options[option], **manifest.options[option]}
+        for option in ("frames", "split")
+    }
+    _write_recording(folder, replace(manifest, options={**manifest.options, **views}))
+
+
+def forget_views(folder: Path, views: Sequence[str]) -> None:
+    """Take views that are finished out of the manifest of a recording.
+
+    Raises:
+        LogWriteError: the disk does not take it.
+    """
+    _write_recording(folder, _without(read_recording(folder), views))
+
+
+def _without(manifest: Manifest, views: Sequence[str]) -> Manifest:
+    left = {
+        option: {v: value for v, value in manifest.options[option].items() if v not in views}
+        for option in ("frames", "split")
+    }
+    return replace(manifest, options={**manifest.options, **left})
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _write_recording(folder: Path, manifest: Manifest) -> None:
+    path = folder / RECORDING
+    options = manifest.options
+    if options["frames"]:
+        scene = {"scene": "".join(manifest.source), "seed": options.get("seed")}
+        values = {"frames": options["frames"], "split": options["split"], **scene}
+        with whole(path) as partial:
+            partial.write_text(json.dumps(values) + "\n", "utf-8")
+        return
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

@@ -1,0 +1,81 @@
+"""How something was begun: kept relative to its folder, read as far as it makes sense."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.log.manifest import (
+    RECORDING,
+    Manifest,
+    forget_views,
+    keep_recording,
+    read_recording,
+)
+
+
+def test_paths_move_with_the_folder_and_other_words_stay(tmp_path: Path) -> None:
+    words = (str(tmp_path / "logs" / "a.mcap"), "icub", "s3://bucket/b.mcap")
+    values = Manifest(words, {"seed": 7}).as_json(tmp_path / "run", names=("icub",))
+    assert values == {"source": ["./../logs/a.mcap", "icub", "s3://bucket/b.mcap"], "seed": 7}
+    moved = Manifest.from_json(json.loads(json.dumps(values)), tmp_path / "new" / "run")
+    assert moved is not None
+    assert moved.source == (str(tmp_path / "new" / "logs" / "a.mcap"), *words[1:])
+    assert moved.options == {"seed": 7}
+
+
+@pytest.mark.parametrize("values", [None, [], "x", {}, {"source": "icub"}, {"source": None}])
+def test_what_is_no_manifest_is_none(values: object) -> None:
+    assert Manifest.from_json(values, Path()) is None
+
+
+def test_other_options_are_refused_and_unknown_ones_are_not_compared() -> None:
+    begun = Manifest(("icub",), {"seed": 7})
+    begun.refuse_other(Path("rec"), {"": "icub", "seed": 7, "split": "5s"})
+    Manifest().refuse_other(Path("rec"), {"": "icub", "seed": 7})
+    for now, words in (
+        ({"": "oscillatory"}, "rec was begun with icub, not oscillatory"),
+        ({"seed": 8}, "begun with --seed 7, not --seed 8: .*--force"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            begun.refuse_other(Path("rec"), now)
+
+
+def test_a_recording_keeps_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:
+    first = {"seed": 1, "frames": {"a": 5, "b": 5}, "split": {"a": "5s", "b": "5s"}}
+    keep_recording(tmp_path, Manifest(("icub",), first))
+    keep_recording(tmp_path, Manifest(("icub",), {"seed": 1, "frames": {"a": 9}, "split": {}}))
+    begun = read_recording(tmp_path)
+    assert begun.source == ("icub",)
+    assert begun.options == {"seed": 1, "frames": {"a": 9, "b": 5}, "split": {"b": "5s"}}
+    forget_views(tmp_path, ["a"])
+    assert read_recording(tmp_path).options["frames"] == {"b": 5}
+    forget_views(tmp_path, ["b"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "noted",
+    [
+        "{",
+        "[]",
+        "7",
+        '{"frames": 3}',
+        '{"frames": {"a": true, "b": -1, "c": "x"}, "split": {"a": 3}, "scene": 4, "seed": -1}',
+        '{"frames": {}, "seed": 1e300}',
+    ],
+)
+def test_what_makes_no_sense_in_it_is_passed_over(tmp_path: Path, noted: str) -> None:
+    (tmp_path / RECORDING).write_text(noted)
+    begun = read_recording(tmp_path)
+    assert (begun.source, dict(begun.options)) == ((), {"frames": {}, "split": {}})
+
+
+def test_a_disk_that_does_not_take_it_is_named(tmp_path: Path) -> None:
+    values: dict[str, Any] = {"frames": {"a": 1}, "split": {}}
+    with pytest.raises(LogWriteError, match=r"nowhere/recording\.json cannot be written"):
+        keep_recording(tmp_path / "nowhere", Manifest((), values))
