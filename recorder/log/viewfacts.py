@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.clock import frames_of, times_of
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import SCHEMA_VERSION
 
@@ -47,14 +47,11 @@ class ViewFacts:
 
     def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
         """Log times of frames, as `SourceSpec.time_ns` gives them."""
-        offsets = np.rint(frames * NANOSECONDS / self.fps).astype(np.int64)
-        return (self.start_ns + offsets).astype(np.uint64)
+        return times_of(frames, self.fps, self.start_ns).astype(np.uint64)
 
     def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
         """Frames at log times; one that is not exactly a frame's gets a frame near it."""
-        offsets = times.astype(np.int64) - self.start_ns
-        frames = np.rint(offsets * (self.fps / NANOSECONDS))
-        return np.asarray(np.clip(frames, -1, MAX_FRAMES), dtype=np.int64)
+        return np.clip(frames_of(times, self.fps, self.start_ns), -1, MAX_FRAMES)
 
 
 def view_facts(path: object, values: Mapping[str, str]) -> ViewFacts:
