@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.recordings import SAMPLE
 from benchmarks.report import ratio, save
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.run import learn
+from cdmisfa.experiments.runs import run
 from replay.recordings.source import RecordedSource
 
 CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40, expansion="none")
@@ -28,7 +28,7 @@ def learning(out: Path | None, *, rerun: bool) -> Callable[[int], None]:
 
     def call(iterations: int) -> None:
         source.seek(0)
-        learn(source, CONFIG, out, max_iterations=iterations, force=True, rerun=rerun)
+        run(source, CONFIG, out, max_iterations=iterations, force=True, rerun=rerun)
 
     return call
 

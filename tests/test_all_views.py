@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.run import learn
+from cdmisfa.experiments.runs import run
 from recorder.config import SceneConfig
 from recorder.recording import record
 from replay.recordings.poses import head_poses, yaw_of
@@ -26,7 +26,7 @@ def made(tmp_path_factory):
     place = tmp_path_factory.mktemp("made")
     record("oscillatory", place / "rec", SceneConfig(kind="oscillatory"), frames=500)
     source = RecordedSource(place / "rec", loop=True)
-    learn(source, LearnerConfig(), place / "run", max_iterations=8, rerun=False)
+    run(source, LearnerConfig(), place / "run", max_iterations=8, rerun=False)
     source.close()
     return place
 
@@ -76,7 +76,7 @@ def test_the_head_turns_to_what_is_watched(tmp_path):
     assert yaws["left"] > yaws["center"] > yaws["right"]
     source = RecordedSource(sample)
     config = LearnerConfig(expansion="none", components=5)
-    learn(source, config, tmp_path / "run", max_iterations=6, rerun=False)
+    run(source, config, tmp_path / "run", max_iterations=6, rerun=False)
     source.close()
     build_view(tmp_path / "run", tmp_path / "v.rrd", all_views=sample)
     shown, gazes = {}, {}

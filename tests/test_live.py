@@ -14,8 +14,8 @@ from run_data import IMAGE, VECTOR, having, run_of
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments import run
-from cdmisfa.experiments.run import learn
+from cdmisfa.experiments import runs
+from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings import kernels as scan
 from replay.runs.log import read_signals
@@ -73,8 +73,8 @@ def test_it_listens_on_this_machine_only():
 def test_a_run_gives_the_same_with_and_without(tmp_path):
     said = []
     config = LearnerConfig()
-    quiet = learn(OscillatorySource(), config, None, max_iterations=60)
-    shown = learn(
+    quiet = run(OscillatorySource(), config, None, max_iterations=60)
+    shown = run(
         OscillatorySource(),
         config,
         tmp_path / "run",
@@ -96,9 +96,9 @@ def test_a_run_that_goes_on_shows_what_went_before(tmp_path, monkeypatch):
             sent.append(np.array(values).reshape(-1))
 
     folder = tmp_path / "run"
-    learn(OscillatorySource(), config, folder, max_iterations=30, rerun=False)
+    run(OscillatorySource(), config, folder, max_iterations=30, rerun=False)
     monkeypatch.setattr("replay.view.columns.Column.send", keep)
-    learn(
+    run(
         OscillatorySource(),
         config,
         folder,
@@ -114,12 +114,12 @@ def test_a_run_that_goes_on_shows_what_went_before(tmp_path, monkeypatch):
 
 def test_the_wait_for_compiling_the_reader_is_said(monkeypatch, capsys):
     cold = [scan.scan]
-    monkeypatch.setattr(run, "needs_compiling", lambda function: function in cold)
-    monkeypatch.setattr(run.sys.stderr, "isatty", lambda: True, raising=False)
-    run._say_if_compiling()
+    monkeypatch.setattr(runs, "needs_compiling", lambda function: function in cold)
+    monkeypatch.setattr(runs.sys.stderr, "isatty", lambda: True, raising=False)
+    runs._say_if_compiling()
     assert "compiling" in capsys.readouterr().err
     cold.clear()
-    run._say_if_compiling()
+    runs._say_if_compiling()
     assert capsys.readouterr().err == ""
 
 

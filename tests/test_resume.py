@@ -18,18 +18,18 @@ import pytest
 from conftest import Cdmisfa
 
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
-from cdmisfa.core.learning import LearnerState
+from cdmisfa.core.learning import Learner, LearnerState, Sink
+from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.checkpoint import (
-    SET_ASIDE,
     checkpoints,
-    differences,
     load_checkpoint,
     newest_covered,
 )
-from cdmisfa.experiments.run import Progress, RunResult, learn
+from cdmisfa.experiments.manifest import SET_ASIDE, differences
+from cdmisfa.experiments.runs import RunResult, run
 from recorder.config import RecordConfig, SceneConfig
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource
@@ -46,11 +46,30 @@ LENGTH = 90
 EVERY = 20
 
 
+class ForwardOnly:
+    """The oscillatory streams as a camera would show them."""
+
+    def __init__(self) -> None:
+        source = OscillatorySource()
+        self.spec, self.take, self.take_all = source.spec, source.take, source.take_all
+        self.t, self.describe, self.close = 0, source.describe, source.close
+
+
+class Told(Sink):
+    """Calls a function with the learner after every block."""
+
+    def __init__(self, tell: Callable[[Learner], object]) -> None:
+        self.tell = tell
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        self.tell(learner)
+
+
 def go(
     source: FrameSource, out: Path | None, iterations: int, config: LearnerConfig = CONFIG, **more
 ) -> RunResult:
     more = {"max_modules": 99, "seed": 3, "rerun": False, "checkpoint_every": EVERY} | more
-    return learn(source, config, out, max_iterations=iterations, **more)
+    return run(source, config, out, max_iterations=iterations, **more)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +150,7 @@ from pathlib import Path
 import test_resume as case
 from recorder.world.oscillatory import OscillatorySource
 case.go(OscillatorySource(), Path(sys.argv[1]), case.LENGTH, resume=sys.argv[2] == "resume",
-        progress=lambda _: time.sleep(.02))
+        sinks=[case.Told(lambda _: time.sleep(.02))])
 """
 
 
@@ -230,23 +249,34 @@ def test_a_changed_run_is_refused_and_left_alone(
 
 
 def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no run to go on with"):
+    with pytest.raises(UsageError, match="no run to resume"):
         go(OscillatorySource(), tmp_path, 10, resume=True)
     with pytest.raises(UsageError, match="name its folder"):
         go(OscillatorySource(), None, 10, resume=True)
+
+
+def test_a_source_that_cannot_go_back_is_refused_and_the_run_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    go(OscillatorySource(), out, 30)
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    with pytest.raises(
+        UsageError, match=r"oscillatory cannot go back .* resume from its recording"
+    ):
+        go(ForwardOnly(), out, 40, resume=True)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_a_run_that_is_still_going_is_left_alone(tmp_path: Path) -> None:
     out = tmp_path / "run"
     refused: list[str] = []
 
-    def meddle(_: Progress) -> None:
+    def meddle(_: Learner) -> None:
         for how in ({"resume": True}, {"force": True}):
             with pytest.raises(UsageError, match="in use by another process") as error:
                 go(OscillatorySource(), out, 30, **how)
             refused.append(str(error.value))
 
-    result = go(OscillatorySource(), out, 2, progress=meddle)
+    result = go(OscillatorySource(), out, 2, sinks=[Told(meddle)])
     assert len(refused) == 4
     assert result.signals_sha256 == go(OscillatorySource(), None, 2).signals_sha256
 

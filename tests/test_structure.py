@@ -33,7 +33,7 @@ def python(*args: str) -> subprocess.CompletedProcess[str]:
 
 FORBIDDEN = {
     "cdmisfa": ("cdmisfa.cli.app",),
-    "cdmisfa.agents": ("cdmisfa.experiments.run", "replay.palette", "recorder.config", "mcap"),
+    "cdmisfa.agents": ("cdmisfa.experiments.runs", "replay.palette", "recorder.config", "mcap"),
     "cdmisfa.cli": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
@@ -54,7 +54,7 @@ FORBIDDEN = {
     "replay.runs": ("replay.recordings.source", "replay.view.config", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.mcap.records", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.images", "pybullet"),
-    "replay.viewer": ("cdmisfa.experiments.run", "recorder.world.world"),
+    "replay.viewer": ("cdmisfa.experiments.runs", "recorder.world.world"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""
 

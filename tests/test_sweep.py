@@ -37,7 +37,7 @@ from cdmisfa.experiments import engines
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
-from cdmisfa.experiments.run import learn
+from cdmisfa.experiments.runs import run
 from cdmisfa.experiments.sweep import ROWS, plan, read_rows, sweep
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource
@@ -114,7 +114,7 @@ def test_the_grid_is_checked_before_anything_runs(tmp_path: Path) -> None:
 def test_a_trial_is_a_run(tmp_path: Path) -> None:
     report = sweep("oscillatory", tmp_path, seeds=[5], keep_logs=True, max_iterations=600)
     (row,) = read_rows(tmp_path)
-    result = learn(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
+    result = run(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
     assert row["result"] == {key: result[key] for key in row["result"]}
     assert (Path(row["run"]) / "run.mcap").is_file()
     assert report.computed == 1

@@ -11,7 +11,7 @@ import pytest
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.run import learn
+from cdmisfa.experiments import runs
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.log import read_signals, read_watched
 from replay.runs.modules import save_modules
@@ -22,7 +22,7 @@ from replay.runs.transformer import SlowFeatures
 def run(tmp_path_factory):
     """A run that saved a module of expanded frames, and went on."""
     out = tmp_path_factory.mktemp("run")
-    learn(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
+    runs.run(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
     return out
 
 

@@ -1,6 +1,6 @@
 """What learns, and what is told about it: `Learner` and `Sink`.
 
-`cdmisfa.experiments.run.learn` brings a source, a learner and sinks together, and knows no more
+`cdmisfa.experiments.loop.learn` brings a source, a learner and sinks together, and knows no more
 of them than is said here.
 """
 
@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:  # sinks of the command line are imported without numpy
+    import numpy as np
+    from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block
-from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import BlockSignals
+    from cdmisfa.core.blocks import Block
+    from cdmisfa.core.modules import Module
+    from cdmisfa.core.signals import BlockSignals
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,7 @@ class Learner(Protocol):
 class Sink(Protocol):
     """Takes what happens in a run, in order: a log, a view, a hash, a progress bar.
 
-    A class that derives from it needs only what it has a use for.
+    A class that derives from it needs `block`, and of the others what it has a use for.
     """
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
@@ -109,9 +110,11 @@ class Sink(Protocol):
             text: one line.
             level: "INFO" or "WARNING".
         """
+        return
 
     def finish(self) -> None:
         """The run is over, for whatever reason, and was not broken off by an error."""
+        return
 
 
 def weights_after(signals: BlockSignals, learner: Learner) -> NDArray[np.float64]:

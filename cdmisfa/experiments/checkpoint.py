@@ -1,8 +1,8 @@
-"""Checkpoints of a run: a learner's state on disk, and going on from it.
+"""Checkpoints of a run: a learner's state on disk, from which the run is resumed.
 
 A checkpoint is one file of plain arrays and a JSON text, written whole or not at all.
 It holds no signals: those are in the run's log, which is always flushed first. So a
-run that was stopped anywhere goes on from the newest checkpoint that its log covers.
+run that was stopped anywhere is resumed from the newest checkpoint that its log covers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import dataclasses
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,24 +20,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.learning import LearnerState
+from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.manifest import SET_ASIDE, log_to_resume, refuse_difference, versions
+from recorder.log.whole import partial_path, whole
 
 SCHEMA = 1
 """Version of the file; rises when the state of a learner changes its meaning."""
 
 KEPT = 2
 """Checkpoints that a run's folder keeps: the newest, and one in case its log was lost."""
-
-SET_ASIDE = "run.before.mcap.partial"
-"""The log of a run that goes on, until the new one has taken over what counts."""
-
-COMMAND = "command"
-"""Key of a manifest: how the run was begun, which may differ when it goes on."""
 
 _HEAD = "checkpoint"
 _MODULES = "modules."
@@ -50,7 +45,7 @@ class Checkpoint:
 
     Attributes:
         iteration: iterations done.
-        t: frame at which the source goes on.
+        t: the source's next frame.
         state: of the learner.
         versions: of the packages that computed it.
     """
@@ -67,7 +62,6 @@ def save_checkpoint(run: Path, checkpoint: Checkpoint) -> Path:
     The run's log must already hold every iteration before it.
     """
     path = run / f"checkpoint-{checkpoint.iteration:012d}.npz"
-    partial = path.with_name(path.name + ".partial")
     head = {
         "schema": SCHEMA,
         "iteration": checkpoint.iteration,
@@ -80,10 +74,9 @@ def save_checkpoint(run: Path, checkpoint: Checkpoint) -> Path:
         values = [getattr(module, field.name) for module in checkpoint.state.modules]
         arrays[_MODULES + field.name] = np.array(values)
     arrays.update(checkpoint.state.arrays)
-    with open(partial, "wb") as file:
-        # Not synced to disk: a power cut costs time, as damaged checkpoints are passed over.
+    # Not synced to disk: a power cut costs time, as damaged checkpoints are passed over.
+    with whole(path, sync=False) as partial, open(partial, "wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-    os.replace(partial, path)
     for old in checkpoints(run)[KEPT:]:
         old.unlink()
     return path
@@ -149,7 +142,44 @@ def newest_covered(run: Path, iterations: int) -> Checkpoint | None:
     return None
 
 
-def restore(learner: CuriousLearner, checkpoint: Checkpoint) -> None:
+class Checkpoints(Sink):
+    """Saves where a run stands, every so many iterations and at its end.
+
+    It comes after the run's log, which must hold every iteration before a checkpoint.
+
+    Args:
+        run: the folder.
+        source: of the run.
+        learner: of the run.
+        every: iterations between two; 0 saves one at the end only.
+        flush: lets the disk have all of the log.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        source: FrameSource,
+        learner: Learner,
+        every: int,
+        flush: Callable[[], None],
+    ) -> None:
+        self._run, self._source, self._learner = run, source, learner
+        self._every, self._flush = every, flush
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        if self._every and learner.iteration % self._every == 0:
+            self._flush()
+            self.finish()
+
+    def finish(self) -> None:
+        """See `Sink`; the log is finished before."""
+        learner = self._learner
+        checkpoint = Checkpoint(learner.iteration, self._source.t, learner.state, versions())
+        save_checkpoint(self._run, checkpoint)
+
+
+def restore(learner: Learner, checkpoint: Checkpoint) -> None:
     """Put a learner where the checkpoint stands.
 
     Raises:
@@ -164,7 +194,7 @@ def restore(learner: CuriousLearner, checkpoint: Checkpoint) -> None:
 
 
 def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path | None:
-    """Move the log of a run that shall go on out of the way, after checking that it may.
+    """Move the log of a run that is to be resumed out of the way, after checking that it may.
 
     Returns:
         Where it is now; None where the run was stopped before its log said anything.
@@ -172,32 +202,15 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path 
     Raises:
         UsageError: there is no run, or it was made with another configuration or source.
     """
-    from recorder.log.whole import partial_path
     from replay.runs.folders import RUN_FILE
 
-    whole, aside = run / RUN_FILE, run / SET_ASIDE
-    found = log_to_go_on_with(run)
-    if found == partial_path(whole) and not checkpoints(run) and not _has_header(found):
+    aside = run / SET_ASIDE
+    found = log_to_resume(run)
+    if found == partial_path(run / RUN_FILE) and not checkpoints(run) and not _has_header(found):
         return None
     refuse_difference(run, found, spec, manifest)
     os.replace(found, aside)
     return aside
-
-
-def log_to_go_on_with(run: Path) -> Path:
-    """The log of a run that was stopped, wherever it is.
-
-    Raises:
-        UsageError: there is no run.
-    """
-    from recorder.log.whole import partial_path
-    from replay.runs.folders import RUN_FILE
-
-    whole = run / RUN_FILE
-    for found in (run / SET_ASIDE, partial_path(whole), whole):
-        if found.is_file():
-            return found
-    raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to go on with")
 
 
 def _has_header(log: Path) -> bool:
@@ -208,40 +221,3 @@ def _has_header(log: Path) -> bool:
     except (LogDamagedError, UsageError):
         return False
     return True
-
-
-def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
-    """Refuse to go on with another configuration, seed or source, naming the first difference.
-
-    Raises:
-        UsageError: something differs.
-    """
-    from replay.runs.log import read_header
-
-    header = read_header(log)
-    before = {
-        "signals": header.schema,
-        **header.manifest,
-        "spec": dataclasses.asdict(header.spec),
-        COMMAND: None,
-    }
-    now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec), COMMAND: None}
-    for key, old, new in differences(_json(before), _json(now)):
-        raise UsageError(
-            f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: go on with "
-            "what it was made with, or choose another folder"
-        )
-
-
-def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Where two JSON values differ: dotted key, the value before, the value now."""
-    if isinstance(before, Mapping) and isinstance(now, Mapping):
-        for name in sorted({*before, *now}):
-            where = f"{key}.{name}" if key else name
-            yield from differences(before.get(name), now.get(name), where)
-    elif before != now:
-        yield key, before, now
-
-
-def _json(value: Any) -> Any:
-    return json.loads(json.dumps(value))

@@ -23,7 +23,8 @@ from typing import Any, BinaryIO
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
-from cdmisfa.experiments.run import learn, module_table, write_json
+from cdmisfa.experiments.manifest import write_json
+from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
 from recorder.log.folder import held
 from recorder.world.scenes import SCENES, open_scene
@@ -35,6 +36,9 @@ REQUEST = "sweep.json"
 """What was asked for last."""
 
 DONE, FAILED = "done", "failed"
+
+UNKEPT = ("schema", "run", "source", "seed", "signals_sha256")
+"""What of a run's result a trial's row has elsewhere, or not at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,7 +310,14 @@ def _compiled_trial(trial: Trial) -> dict[str, Any]:
         max_iterations=trial.max_iterations,
         max_modules=trial.max_modules,
     )
-    return _result(result, streams)
+    return {
+        "iterations": result.iterations,
+        "frames": result.frames,
+        "modules": [module_table(module, streams) for module in result.modules],
+        "final_policy": list(result.final_policy),
+        "epsilon": result.epsilon,
+        "ended": result.ended,
+    }
 
 
 def _logged_trial(trial: Trial) -> dict[str, Any]:
@@ -320,7 +331,7 @@ def _logged_trial(trial: Trial) -> dict[str, Any]:
         unfinished = trial.log.with_name(trial.log.name + ".partial")
         unfinished.parent.mkdir(parents=True, exist_ok=True)
     try:
-        result = learn(
+        result = run(
             source,
             configuration.learner,
             unfinished,
@@ -336,18 +347,8 @@ def _logged_trial(trial: Trial) -> dict[str, Any]:
     if unfinished is not None and trial.log is not None:
         shutil.rmtree(trial.log, ignore_errors=True)
         os.replace(unfinished, trial.log)
-    return _result(result, result.streams)
-
-
-def _result(result: Any, streams: Sequence[str]) -> dict[str, Any]:
-    return {
-        "iterations": result.iterations,
-        "frames": result.frames,
-        "modules": [module_table(module, streams) for module in result.modules],
-        "final_policy": list(result.final_policy),
-        "epsilon": result.epsilon,
-        "ended": result.ended,
-    }
+    told = result.as_json()
+    return {key: value for key, value in told.items() if key not in UNKEPT}
 
 
 def _row(trial: Trial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:

@@ -12,10 +12,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import SeekableSource
+from cdmisfa.core.blocks import Block, SeekableSource
 from cdmisfa.core.errors import NotReproducedError
+from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.run import Progress, RunResult, learn
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.runs import RunResult, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source
 
 SCENE = "icub"
@@ -98,7 +100,7 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Repor
     from replay.export.figures import draw_figures
 
     configuration = configure(SCENE, seed=seed)
-    recording, run = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
+    recording, folder = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
     with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
         record(
             SCENE,
@@ -111,13 +113,26 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Repor
             progress=lambda done: bar.update(done, frames),
         )
     with stage("2/4 learning from the recording", "blocks") as bar:
-        result = _learn([recording], configuration, run, seed, bar, max_modules=MODULES)
+        result = _learn([recording], configuration, folder, seed, bar, max_modules=MODULES)
     with stage("3/4 checking live against recorded", "blocks") as bar:
         _check(recording, configuration, seed, min(CHECKED_ITERATIONS, frames // 40), bar)
     with stage("4/4 drawing figures", "modules") as bar, _opened([recording], seed) as source:
         learned = tuple(_score(module, source) for module in result.modules)
-        figures = tuple(draw_figures(run, None, force=True))
-    return Report(recording, run, figures, result.iterations, True, learned)
+        figures = tuple(draw_figures(folder, None, force=True))
+    return Report(recording, folder, figures, result.iterations, True, learned)
+
+
+class Shown(Sink):
+    """Shows on a bar how far a run is."""
+
+    def __init__(self, bar: Bar, max_iterations: int | None) -> None:
+        self._bar, self._max_iterations = bar, max_iterations
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        if learner.iteration % 10 == 0:
+            note = f"{len(learner.modules)} saved, ε {signals.epsilon:.2f}"
+            self._bar.update(learner.iteration, self._max_iterations, note)
 
 
 def _learn(
@@ -129,20 +144,15 @@ def _learn(
     max_iterations: int | None = None,
     max_modules: int | None = None,
 ) -> RunResult:
-    def shown(progress: Progress) -> None:
-        note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
-        if progress.iteration % 10 == 0:
-            bar.update(progress.iteration, progress.max_iterations, note)
-
     with _opened(words, seed) as source:
-        return learn(
+        return run(
             source,
             configuration.learner,
             out,
             seed=seed,
             sections=configuration.tables(),
             force=True,
-            progress=shown,
+            sinks=(Shown(bar, max_iterations),),
             max_iterations=max_iterations,
             max_modules=max_modules,
         )

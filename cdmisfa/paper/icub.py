@@ -59,7 +59,7 @@ def recording_of(request: Request) -> Path:
     folder = request.folder.parent / "icub-recording"
     finished = folder / "finished.json"
     if not finished.exists():
-        from cdmisfa.experiments.run import write_json
+        from cdmisfa.experiments.manifest import write_json
         from recorder.recording import record
 
         views = record(

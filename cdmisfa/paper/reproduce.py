@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
-from cdmisfa.experiments.run import versions, write_json
+from cdmisfa.experiments.manifest import versions, write_json
 from cdmisfa.experiments.statistics import Summary
 from cdmisfa.experiments.sweep import code
 

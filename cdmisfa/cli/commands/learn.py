@@ -12,9 +12,13 @@ from cdmisfa.cli import options
 from cdmisfa.cli.cameras import camera_options, say_about
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import Bar, bar
+from cdmisfa.core.learning import Sink
 
 if TYPE_CHECKING:
-    from cdmisfa.experiments.run import Progress, RunResult
+    from cdmisfa.core.blocks import Block
+    from cdmisfa.core.learning import Learner
+    from cdmisfa.core.signals import BlockSignals
+    from cdmisfa.experiments.runs import RunResult
     from replay.camera_logs.source import Align
 
 TICK = 0.1
@@ -93,10 +97,10 @@ def learn_command(
     if resume and force:
         raise click.UsageError("--force starts anew and --resume goes on: use one of them")
     if not source:
-        go_on(ctx, out if resume else None)
+        learn_as_begun(ctx, out if resume else None)
         return
-    from cdmisfa.experiments.again import remember
-    from cdmisfa.experiments.run import RunExhaustedError, learn
+    from cdmisfa.experiments.manifest import command_of
+    from cdmisfa.experiments.runs import RunExhaustedError, run
     from cdmisfa.experiments.sources import CameraOptions, open_source
 
     if algorithm is not None:
@@ -116,8 +120,8 @@ def learn_command(
         with bar("learning", "blocks") as shown, stoppable() as stop:
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
-            reporter = Reporter(shown)
-            result = learn(
+            reporter = Reporter(shown, max_iterations)
+            result = run(
                 frames,
                 configuration.learner,
                 out,
@@ -127,39 +131,39 @@ def learn_command(
                 sections=configuration.tables(),
                 force=force,
                 rerun=not no_rerun,
-                progress=reporter,
+                sinks=(reporter,),
                 stop=stop,
                 resume=resume,
                 live=live_view,
                 announce=announce,
-                command=None if out is None else remember(source, ctx.params, out),
+                command=None if out is None else command_of(source, ctx.params, out),
             )
     except RunExhaustedError as error:
         show(error.result, as_json=as_json)
         raise
     finally:
         frames.close()
-    if resume and not reporter.called and not stop():
+    if resume and not reporter.told and not stop():
         click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)
     if stop():
         ctx.exit(stop.exit_code)
 
 
-def go_on(ctx: click.Context, run: Path | None) -> None:
-    """Learn on from the source of a run, as it was begun; options that are given win."""
-    from cdmisfa.experiments.again import recall
+def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
+    """Resume a run with the command that began it; options that are given win."""
+    from cdmisfa.experiments.manifest import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")
         raise click.MissingParameter(ctx=ctx, param=source)
-    words, options_then = recall(run)
+    words, begun = read_command(run)
     given = {
         name
-        for name in options_then
+        for name in begun
         if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
     }
-    kept = {name: value for name, value in options_then.items() if name not in given}
+    kept = {name: value for name, value in begun.items() if name not in given}
     ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
 
 
@@ -173,32 +177,28 @@ def announce(address: str) -> None:
         open_live(address)
 
 
-class Reporter:
+class Reporter(Sink):
     """Shows a run's progress: every module once, the rest a few times a second.
 
     Attributes:
-        called: whether anything was learned.
+        told: whether anything was learned.
     """
 
-    def __init__(self, shown: Bar) -> None:
-        self._shown = shown
-        self.called = False
-        self._modules = 0
+    def __init__(self, shown: Bar, max_iterations: int | None) -> None:
+        self.told = False
+        self._shown, self._max_iterations = shown, max_iterations
         self._next = 0.0
 
-    def __call__(self, progress: Progress) -> None:
-        """Take in where the run stands."""
-        self.called = True
-        if progress.modules > self._modules:
-            self._modules = progress.modules
-            self._shown.say(
-                f"module {progress.modules} saved at iteration {progress.iteration - 1}"
-            )
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        self.told, modules = True, len(learner.modules)
+        if signals.saved:
+            self._shown.say(f"module {modules} saved at iteration {signals.iteration}")
         now = time.monotonic()
         if now >= self._next:
             self._next = now + TICK
-            note = f"{progress.modules} saved, ε {progress.epsilon:.2f}"
-            self._shown.update(progress.iteration, progress.max_iterations, note)
+            note = f"{modules} saved, ε {signals.epsilon:.2f}"
+            self._shown.update(learner.iteration, self._max_iterations, note)
 
 
 def show(result: RunResult, *, as_json: bool) -> None:

@@ -1,0 +1,79 @@
+"""The loop that every run is: watch, learn, tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from cdmisfa.core.blocks import Block, FrameSource
+from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.signals import BlockSignals, SignalsHash
+from cdmisfa.experiments.endings import ENDINGS, ending
+
+
+def learn(
+    source: FrameSource,
+    learner: Learner,
+    sinks: Sequence[Sink] = (),
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    max_iterations: int | None = None,
+    max_modules: int | None = None,
+) -> str:
+    """Let a learner learn from a source until nothing is left to learn.
+
+    Args:
+        source: live or recorded; left open.
+        learner: goes on from where it is.
+        sinks: told of everything, one after the other.
+        stop: asked before every block; true ends the run.
+        max_iterations: end after so many.
+        max_modules: end after so many modules; by default as many as there are streams.
+
+    Returns:
+        Why it ended, a key of `ENDINGS`.
+
+    Raises:
+        LogExhaustedError: a recording ended first; the sinks are finished.
+    """
+    exhausted: LogExhaustedError | None = None
+    modules = len(source.spec.streams) if max_modules is None else max_modules
+    while not (ended := ending(learner, modules, max_iterations) or _asked(stop)):
+        try:
+            block = source.take(learner.stream, learner.tau)
+        except LogExhaustedError as error:
+            if stop():  # while it waited for frames to be recorded
+                continue
+            ended, exhausted = "log_exhausted", error
+            break
+        signals = learner.step(block)
+        for sink in sinks:
+            sink.block(block, signals, learner)
+            if signals.saved:
+                sink.event(block.t, signals.iteration, _saved(source, learner))
+    for sink in sinks:
+        sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
+        sink.finish()
+    if exhausted is not None:
+        raise exhausted
+    return ended
+
+
+class Digest(SignalsHash, Sink):
+    """The hash of a run's signals; see `SignalsHash`."""
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        self.add(signals)
+
+
+def _asked(stop: Callable[[], bool]) -> str:
+    return "interrupted" if stop() else ""
+
+
+def _saved(source: FrameSource, learner: Learner) -> str:
+    module = learner.modules[-1]
+    return (
+        f"module {module.index} saved on stream {source.spec.streams[module.stream]}, "
+        f"policy {module.policy.tolist()}"
+    )

@@ -1,0 +1,324 @@
+"""One run: a source, a learner, and the folder that keeps what happened.
+
+RUN/run.mcap signals, RUN/modules.npz frozen modules, RUN/run.json manifest and result,
+RUN/run.rrd the view, RUN/checkpoint-*.npz to resume from. The loop itself is in `loop`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import platform
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cdmisfa.agents.agent import think
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
+from cdmisfa.core.compiled import needs_compiling
+from cdmisfa.core.config import as_table
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.experiments.checkpoint import (
+    Checkpoints,
+    checkpoints,
+    newest_covered,
+    restore,
+    set_aside,
+)
+from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.manifest import COMMAND, SET_ASIDE, versions, write_json
+from cdmisfa.features.incsfa import strict
+from recorder.log.folder import held
+
+if TYPE_CHECKING:
+    from replay.runs.writer import RunWriter
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """What a run came to; `as_json` is the command line's contract.
+
+    Attributes:
+        run: its folder, if it has one.
+        source: what it learned from, described.
+        streams: their names.
+        seed: of the learner.
+        iterations: in all.
+        frames: in all.
+        signals_sha256: hash of all signals.
+        modules: what was learned, in order.
+        summary: what else the learner says of itself.
+        ended: why, a key of `ENDINGS`.
+        truth: names of what the world knows.
+    """
+
+    run: str | None
+    source: Mapping[str, Any]
+    streams: tuple[str, ...]
+    seed: int
+    iterations: int
+    frames: int
+    signals_sha256: str
+    modules: tuple[Module, ...]
+    summary: Mapping[str, Any]
+    ended: str
+    truth: tuple[str, ...] = field(default=())
+
+    def as_json(self) -> dict[str, Any]:
+        """The result as `learn --json` prints it."""
+        return {
+            "schema": 1,
+            "run": self.run,
+            "source": dict(self.source),
+            "seed": self.seed,
+            "iterations": self.iterations,
+            "frames": self.frames,
+            "signals_sha256": self.signals_sha256,
+            "modules": [module_table(module, self.streams) for module in self.modules],
+            **self.summary,
+            "ended": self.ended,
+        }
+
+
+class RunExhaustedError(LogExhaustedError):
+    """The recording of a run ended before the run did; `result` is what it came to."""
+
+    result: RunResult
+
+
+def module_table(module: Module, streams: Sequence[str]) -> dict[str, Any]:
+    """What a result says about a module, as JSON values."""
+    return {
+        "index": module.index,
+        "stream": streams[module.stream],
+        "stream_index": module.stream,
+        "iteration": module.iteration,
+        "policy": module.policy.tolist(),
+        "eta": module.eta.tolist(),
+    }
+
+
+def run(
+    source: FrameSource,
+    config: Any,
+    folder: Path | None = None,
+    *,
+    seed: int = 0,
+    max_iterations: int | None = None,
+    max_modules: int | None = None,
+    sections: Mapping[str, Any] | None = None,
+    force: bool = False,
+    rerun: bool = True,
+    sinks: Sequence[Sink] = (),
+    stop: Callable[[], bool] = lambda: False,
+    resume: bool = False,
+    checkpoint_every: int = 200,
+    live: bool = False,
+    announce: Callable[[str], None] | None = None,
+    command: Mapping[str, Any] | None = None,
+) -> RunResult:
+    """Learn from a source until nothing is left to learn, and log every signal.
+
+    Args:
+        source: live or recorded; left open.
+        config: of the learner, as its entry in `LEARNERS` says.
+        folder: of the run, or None to log nothing.
+        seed: seed of the policy and of the abstractions' first weights.
+        max_iterations: end after so many.
+        max_modules: end after so many modules; by default as many as there are streams.
+        sections: further configuration tables (`scene`, `record`) for the manifest.
+        force: replace an existing run.
+        rerun: also build the Rerun view.
+        sinks: told of everything, after the log.
+        stop: asked before every iteration; true ends the run cleanly.
+        resume: resume the run in `folder` where it was stopped, in whatever way; its
+            signals become those of a run that was never stopped.
+        checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
+        live: also show the run in Rerun while it learns, to viewers on this machine.
+        announce: called with the address of the live view.
+        command: how the run is begun, kept with it; see `manifest.command_of`.
+
+    Raises:
+        UsageError: `folder` exists and `force` is not set; or `resume` is, and `folder` holds no
+            run or one with another configuration or source, or the source cannot go back.
+        RunExhaustedError: a recording ended first; what was learned is saved.
+    """
+    learner = open_learner(config, source.spec, seed)
+    digest = Digest()
+    tables = {**(sections or {}), "learner": as_table(config)}
+    manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
+    begun = {} if command is None else {COMMAND: dict(command)}
+    told: list[Sink] = [digest]
+    exhausted: LogExhaustedError | None = None
+    if resume and not isinstance(source, SeekableSource):
+        raise UsageError(
+            f"{source.describe()['kind']} cannot go back to where the run was "
+            "stopped: resume from its recording, or begin another run"
+        )
+    with contextlib.ExitStack() as opened:
+        log = shown = None
+        if folder is not None:
+            log = opened.enter_context(
+                _run_log(folder, source.spec, {**manifest, **begun}, force=force, resume=resume)
+            )
+            told += [log, Checkpoints(folder, source, learner, checkpoint_every, log.flush)]
+        elif resume:
+            raise UsageError("which run to resume? name its folder")
+        if live:
+            from replay.viewer.live import LiveView
+
+            shown = LiveView(source.spec, manifest, learner.tau, len(learner.phi))
+            told.append(opened.enter_context(shown))
+            if announce is not None:
+                announce(shown.address)
+        if log is not None and resume:
+            _restore(log, learner, source, digest)
+            if shown is not None:
+                shown.earlier(log.path.parent)
+        _say_if_compiling()
+        try:
+            ended = learn(
+                source,
+                learner,
+                (*told, *sinks),
+                stop=stop,
+                max_iterations=max_iterations,
+                max_modules=max_modules,
+            )
+        except LogExhaustedError as error:
+            ended, exhausted = "log_exhausted", error
+        result = RunResult(
+            run=str(folder) if folder is not None else None,
+            source=source.describe(),
+            streams=source.spec.streams,
+            seed=seed,
+            iterations=learner.iteration,
+            frames=learner.iteration * learner.tau,
+            signals_sha256=digest.hexdigest(),
+            modules=tuple(learner.modules),
+            summary=learner.summary(),
+            ended=ended,
+            truth=source.spec.truth,
+        )
+        if folder is not None:
+            _write_run(folder, result, tables, begun, rerun=rerun)
+    if exhausted is not None:
+        kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {folder}"
+        over = RunExhaustedError(f"{exhausted}{kept if folder is not None else ''}")
+        over.result = result
+        raise over from exhausted
+    return result
+
+
+@contextlib.contextmanager
+def _run_log(
+    out: Path, spec: SourceSpec, manifest: Mapping[str, Any], *, force: bool, resume: bool
+) -> Iterator[RunWriter]:
+    """The run's log, to be finished inside, and its folder held.
+
+    On failure a log that is not finished is left as a readable prefix.
+    """
+    from replay.runs.writer import RunWriter
+
+    if not resume:
+        if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
+            raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _no_folder(out, error) from error
+    with held(out):
+        stale = [out / name for name in ("run.json", "modules.npz", "run.rrd")]
+        if resume:
+            set_aside(out, spec, manifest)
+        else:
+            stale += [out / "run.mcap", out / SET_ASIDE, *checkpoints(out)]
+        try:
+            for path in stale:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise _no_folder(out, error) from error
+        log = RunWriter(out / "run.mcap", spec, manifest, force=force or resume)
+        try:
+            yield log
+        except BaseException:
+            log.abandon()
+            raise
+
+
+def _no_folder(out: Path, error: OSError) -> UsageError:
+    reason = error.strerror or error
+    return UsageError(f"{out} cannot be a run's folder ({reason}): choose another")
+
+
+def _restore(log: Any, learner: Learner, source: Any, digest: Digest) -> None:
+    """Bring log, learner, source and digest to where the run's newest checkpoint stands."""
+    from replay.runs.log import count_iterations
+
+    folder = log.path.parent
+    before = folder / SET_ASIDE
+    if not before.exists():
+        return
+    checkpoint = newest_covered(folder, count_iterations(before))
+    if checkpoint is not None:
+        restore(learner, checkpoint)
+        for signals in log.take_over(before, checkpoint.iteration):
+            digest.add(signals)
+        source.seek(checkpoint.t)
+        last = max(checkpoint.iteration - 1, 0)
+        log.event(source.t, last, f"resumed at iteration {checkpoint.iteration}")
+        changed = [
+            f"{name} is {now}, was {checkpoint.versions.get(name)}"
+            for name, now in versions().items()
+            if checkpoint.versions.get(name) != now
+        ]
+        if changed:
+            log.event(source.t, last, "; ".join(changed), "WARNING")
+        log.flush()
+    before.unlink()
+
+
+def _say_if_compiling() -> None:
+    """Explain the wait to whoever is looking, when numba has nothing on disk yet."""
+    if not sys.stderr.isatty():
+        return
+    functions: list[Callable[..., Any]] = [think, strict.update]
+    if scan := sys.modules.get("replay.recordings.kernels"):  # of a source that reads recordings
+        functions += [scan.scan, scan.gather]
+    if any(needs_compiling(function) for function in functions):
+        print("compiling the learner, this first time only (some 10 to 30 s)", file=sys.stderr)
+
+
+def _write_run(
+    out: Path,
+    result: RunResult,
+    tables: Mapping[str, Any],
+    begun: Mapping[str, Any],
+    *,
+    rerun: bool,
+) -> None:
+    from replay.runs.modules import save_modules
+
+    save_modules(out / "modules.npz", result.modules)
+    document = {
+        "schema": 1,
+        "signals_schema": SCHEMA_VERSION,
+        "config": tables,
+        "seed": result.seed,
+        "source": dict(result.source),
+        "streams": list(result.streams),
+        "versions": versions(),
+        "platform": {"system": platform.system(), "machine": platform.machine()},
+        "result": result.as_json(),
+        **begun,
+    }
+    write_json(out / "run.json", document)
+    if rerun:
+        from replay.view.build import build_view
+
+        build_view(out, out / "run.rrd")

@@ -1,0 +1,147 @@
+"""The loop: what it asks, what it tells whom and when, and every sink there is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from sink_contract import CONFIG, SinkContract
+
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.cli.commands.learn import Reporter
+from cdmisfa.cli.progress import Bar
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.checkpoint import Checkpoints, checkpoints
+from cdmisfa.experiments.endings import ENDINGS
+from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.paper.demo import Shown
+from recorder.world.oscillatory import OscillatorySource
+from replay.runs.writer import RunWriter
+
+
+class Notes(Sink):
+    """Notes what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[object] = []
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        assert (block.t, block.stream) == (signals.t, signals.stream)
+        assert learner.iteration == signals.iteration + 1
+        self.told.append(signals.iteration)
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        self.told.append((t, iteration, text, level))
+
+    def finish(self) -> None:
+        self.told.append("finished")
+
+
+class Least(Sink):
+    """As little as a sink can be."""
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        return
+
+
+class TestNotes(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return Notes()
+
+
+class TestLeast(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return Least()
+
+
+class TestDigest(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return Digest()
+
+
+class TestRunWriter(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return RunWriter(folder / "run.mcap", source.spec, {})
+
+
+class TestCheckpoints(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return Checkpoints(folder, source, learner, 7, lambda: None)
+
+
+class TestLiveView(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        from replay.viewer.live import LiveView
+
+        return LiveView(source.spec, {}, learner.tau, len(learner.phi))
+
+
+class TestReporter(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return Reporter(Bar(), None)
+
+
+class TestShown(SinkContract):
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        return Shown(Bar(), 20)
+
+
+def learner_for(source: OscillatorySource) -> CuriousLearner:
+    return CuriousLearner(CONFIG, source.spec, seed=3)
+
+
+def test_every_sink_is_told_everything_in_order() -> None:
+    source, one, two = OscillatorySource(), Notes(), Notes()
+    assert learn(source, learner_for(source), (one, two), max_modules=1) == "max_modules"
+    saved, ended, finished = one.told[-3:]
+    assert one.told[:-3] == list(range(9))
+    assert saved == (320, 8, "module 1 saved on stream x2, policy [1, 1, 1]", "INFO")
+    assert (ended, finished) == ((360, 8, f"ended: {ENDINGS['max_modules']}", "INFO"), "finished")
+    assert two.told == one.told
+
+
+def test_the_end_of_a_recording_is_an_error_after_the_sinks_are_finished() -> None:
+    source, notes = OscillatorySource(length=130), Notes()
+    with pytest.raises(LogExhaustedError):
+        learn(source, learner_for(source), (notes,))
+    assert notes.told == [
+        0,
+        1,
+        2,
+        (120, 2, f"ended: {ENDINGS['log_exhausted']}", "INFO"),
+        "finished",
+    ]
+
+
+def test_asked_to_stop_while_it_waits_for_frames_it_is_interrupted() -> None:
+    source, asked = OscillatorySource(length=50), iter([False, False, True, True])
+    assert learn(source, learner_for(source), stop=lambda: next(asked)) == "interrupted"
+
+
+def test_a_sink_that_fails_ends_the_run_and_finishes_nothing() -> None:
+    class Full(Least):
+        def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+            raise OSError("the disk is full")
+
+    source, notes = OscillatorySource(), Notes()
+    with pytest.raises(OSError, match="the disk is full"):
+        learn(source, learner_for(source), (notes, Full()))
+    assert notes.told == [0]
+
+
+def test_a_learner_learns_on_from_where_it_is(tmp_path: Path) -> None:
+    source = OscillatorySource()
+    learner, digest = learner_for(source), Digest()
+    keep = Checkpoints(tmp_path, source, learner, 4, lambda: None)
+    for iterations in (3, 11):
+        learn(source, learner, (digest, keep), max_iterations=iterations, max_modules=9)
+    whole, straight = OscillatorySource(), Digest()
+    learn(whole, learner_for(whole), (straight,), max_iterations=11, max_modules=9)
+    assert digest.hexdigest() == straight.hexdigest()
+    assert [path.name for path in checkpoints(tmp_path)] == [
+        "checkpoint-000000000011.npz",
+        "checkpoint-000000000008.npz",
+    ]
