@@ -30,8 +30,7 @@ from replay.runs.outline import read_outline
 from replay.view import layout
 from replay.view import run as run_view
 from replay.view.build import build_view
-from replay.view.columns import tensor_array
-from replay.view.config import ViewConfig
+from replay.view.columns import TensorBatch
 from replay.view.summary import summary_text
 from replay.viewer import window as viewer
 from replay.viewer.program import check_limit, environment, program, run_program
@@ -259,10 +258,11 @@ def test_the_overview_of_the_first_version_shows_its_clustering_error(tmp_path):
     assert "below δ" in names["2.0"]
 
 
-def test_many_streams_show_the_most_watched(tmp_path):
+def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):
+    monkeypatch.setattr("replay.view.build.MOST_STREAMS", 5)
     spec = SourceSpec(tuple(f"s{i}" for i in range(70)), (2,), "float64", (), 50.0, 0)
     records = write_run(tmp_path / "run.mcap", spec, 30)
-    build_view(tmp_path, tmp_path / "run.rrd", config=ViewConfig(streams=5))
+    build_view(tmp_path, tmp_path / "run.rrd")
     rows = rows_of(tmp_path / "run.rrd")
     lanes = {entity for entity in rows if entity.startswith("/policy/")}
     assert len(lanes) == 5
@@ -291,7 +291,7 @@ def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
 def test_tensors_are_encoded_as_rerun_does():
     block = np.arange(24.0).reshape(2, 3, 2, 2)
     names = ("stream", "action", "next stream")
-    found = tensor_array(block, names)
+    found = TensorBatch(block, names).as_arrow_array()
     for row, tensor in zip(found.to_pylist(), block, strict=True):
         batch = rr.Tensor(tensor, dim_names=names).as_component_batches()[0]
         assert row == batch.as_arrow_array().to_pylist()
@@ -414,6 +414,8 @@ def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
         with pytest.raises(UsageError, match="4GB or 75%"):
             viewer.open_window(tmp_path, memory_limit=limit)
     assert [check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
+    with pytest.raises(UsageError, match="at least 1"):
+        build_view(tmp_path, tmp_path / "v.rrd", every=0)
     last = max(s.t + len(s.y) - 1 for s in read_signals(tmp_path))
     with pytest.raises(UsageError, match=f"the last of .* is {last}$"):
         viewer.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)

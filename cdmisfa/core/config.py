@@ -2,7 +2,7 @@
 
 A key that does not exist is an error that names the nearest one that does. Each
 package owns the dataclass of its own section (`learner` here, `scene` and `record`
-in `recorder`, `view` in `replay`); this module fills any of them.
+in `recorder`); this module fills any of them.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "replay.view.build": "build_view",
-        "replay.view.config": "ViewConfig",
         "replay.view.overlay": "build_overlay",
     },
 )

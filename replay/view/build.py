@@ -6,23 +6,21 @@ The view can always be built again: the logs are the archive.
 from __future__ import annotations
 
 import contextlib
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import rerun as rr
 from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import partial_path
+from recorder.log.whole import whole
 from replay.runs.folders import is_run, run_log
 from replay.runs.log import read_header
 from replay.runs.modules import MODULES_FILE, load_modules
 from replay.runs.outline import Tally, read_outline
 from replay.runs.stretches import read_stretches
-from replay.view.config import ViewConfig
 from replay.view.labels import label
-from replay.view.layout import RunLayout
+from replay.view.layout import MOST_STREAMS, RunLayout
 from replay.view.properties import APPLICATION, identity, properties_of, property_chunks
 from replay.view.recording import write_recording, write_unwatched
 from replay.view.run import RunView
@@ -40,7 +38,6 @@ def build_view(
     *,
     every: int = 10,
     force: bool = True,
-    config: ViewConfig | None = None,
     all_views: Path | None = None,
 ) -> None:
     """Write the view of a run or a recording as an .rrd file, whole or not at all.
@@ -50,28 +47,28 @@ def build_view(
         out: the file.
         every: show every so many watched frames, of those that were kept.
         force: replace an existing file.
-        config: everything else; `every` is then taken from it.
         all_views: the recording that the run learned from, to show what was not watched too.
 
     Raises:
-        UsageError: there is no such run or recording, `out` exists and `force` is not set, or
-            the run did not learn from the recording `all_views`.
+        UsageError: there is no such run or recording, `every` is below 1, `out` exists and
+            `force` is not set, or the run did not learn from the recording `all_views`.
         LogDamagedError: it cannot be read.
         CdmisfaError: the view cannot be written.
     """
-    config = config or ViewConfig(every=every)
     out, path = Path(out), Path(path)
+    if every < 1:
+        raise UsageError(f"every {every} frames: it must be at least 1")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     if is_run(path):
         log = run_log(path)
         with recording_to(out, _name(log), log) as recording:
-            _write_run(recording, log, config, all_views)
+            _write_run(recording, log, every, all_views)
     elif all_views is not None:
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path) as recording:
-            write_recording(recording, path, config)
+            write_recording(recording, path, every)
 
 
 @contextlib.contextmanager
@@ -87,36 +84,33 @@ def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStr
         UsageError: its folder is not there.
         CdmisfaError: the file cannot be written.
     """
-    partial = partial_path(out)
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
     recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))
     recording.set_log_time_enabled(False)
-    try:
-        recording.save(partial)
-        if not partial.exists():
-            raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
-        recording.send_recording_name(label(name))
-        yield recording
-        recording.flush(timeout_sec=FLUSH_SECONDS)
-        recording.disconnect()
-        os.replace(partial, out)
-    except (RuntimeError, OSError) as error:
-        raise CdmisfaError(f"{out} cannot be written: {error}") from error
-    finally:
-        recording.disconnect()
-        partial.unlink(missing_ok=True)
+    with whole(out) as partial:
+        try:
+            recording.save(partial)
+            if not partial.exists():
+                raise CdmisfaError(f"{out}: Rerun writes nothing, unset the variable RERUN")
+            recording.send_recording_name(label(name))
+            yield recording
+            recording.flush(timeout_sec=FLUSH_SECONDS)
+        except RuntimeError as error:
+            raise CdmisfaError(f"{out} cannot be written: {error}") from error
+        finally:
+            recording.disconnect()
 
 
 def _write_run(
-    recording: rr.RecordingStream, log: Path, config: ViewConfig, all_views: Path | None
+    recording: rr.RecordingStream, log: Path, every: int, all_views: Path | None
 ) -> None:
     header, folder = read_header(log), log.parent
-    streams: Sequence[int] = range(len(header.spec.streams))
-    if len(streams) > config.streams:  # which are watched most is known at the end only
-        streams = read_outline(log).streams(config.streams)
-    tally, view, ended = Tally(header), RunView(recording, header, streams, config), ""
-    for stretch in read_stretches(log, header, every=config.every):
+    streams = list(range(len(header.spec.streams)))
+    if len(streams) > MOST_STREAMS:  # which are watched most is known at the end only
+        streams = read_outline(log).streams(MOST_STREAMS)
+    tally, view, ended = Tally(header), RunView(recording, header, streams, every), ""
+    for stretch in read_stretches(log, header, every=every):
         for columns in stretch.signals:
             tally.add(columns)
         view.take(stretch)
@@ -127,7 +121,7 @@ def _write_run(
     recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
     text = label(summary_text(outline, _name(log), _sentence(ended)))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
-    head = all_views is not None and write_unwatched(recording, log, all_views, outline, config)
+    head = all_views is not None and write_unwatched(recording, log, all_views, outline, every)
     layout = RunLayout(outline, all_views=all_views is not None, head=head)
     recording.send_blueprint(layout.blueprint())
 

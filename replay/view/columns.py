@@ -1,4 +1,4 @@
-"""Rows of signals on their way into a Rerun recording, many at a time.
+"""Rows of numbers and images on their way into a Rerun recording, many at a time.
 
 Handing rows over one by one costs a hundred times more. Every array is copied: Rerun
 keeps reading what it was given after the call.
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import times_of
+from replay.palette import Rgb, colour, packed_all
+from replay.view.labels import label
 
 FRAME = "frame"
 """Timeline of the global frame counter t."""
@@ -29,60 +31,50 @@ LOG_TIME = "message_log_time"
 TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 """Signals that are not lines but the timelines themselves."""
 
+ROWS = 4000
+"""Rows of a column that are handed over at once."""
+
 MAX_BYTES = 4 * 1024 * 1024
 """Most bytes of a column that wait."""
 
+Frames = NDArray[np.int64]
 
-class Clock:
-    """Where a row stands on each timeline.
 
-    Args:
-        spec: of the source, for the log time of a frame.
-    """
-
-    def __init__(self, spec: SourceSpec) -> None:
-        self._spec = spec
-
-    def columns(
-        self, frames: NDArray[np.int64], iterations: NDArray[np.int64] | None
-    ) -> list[rr.TimeColumn]:
-        """Columns of time for rows at these frames."""
-        times = times_of(frames, self._spec.fps, self._spec.start_ns)
-        found = [
-            rr.TimeColumn(FRAME, sequence=frames.copy()),
-            rr.TimeColumn(LOG_TIME, timestamp=times.astype("datetime64[ns]")),
-        ]
-        if iterations is not None:
-            found.append(rr.TimeColumn(ITERATION, sequence=iterations.copy()))
-        return found
+def time_columns(
+    spec: SourceSpec, frames: Frames, iterations: Frames | None = None
+) -> list[rr.TimeColumn]:
+    """Where rows at these frames stand on each timeline."""
+    times = times_of(frames, spec.fps, spec.start_ns)
+    found = [
+        rr.TimeColumn(FRAME, sequence=frames.copy()),
+        rr.TimeColumn(LOG_TIME, timestamp=times.astype("datetime64[ns]")),
+    ]
+    if iterations is not None:
+        found.append(rr.TimeColumn(ITERATION, sequence=iterations.copy()))
+    return found
 
 
 class Column:
-    """One entity's rows, waiting to be handed over.
+    """One entity's rows of numbers, waiting to be handed over.
 
     Args:
         recording: where they go.
-        clock: how frames become times.
+        spec: of the source, for the log time of a frame.
         path: the entity.
-        rows: hand over when so many rows, or `MAX_BYTES`, wait.
     """
 
-    def __init__(self, recording: rr.RecordingStream, clock: Clock, path: str, rows: int) -> None:
+    def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, path: str) -> None:
         self.path = path
         self._recording = recording
-        self._clock = clock
-        self._rows = rows
-        self._frames: list[NDArray[np.int64]] = []
-        self._iterations: list[NDArray[np.int64]] = []
+        self._spec = spec
+        self._frames: list[Frames] = []
+        self._iterations: list[Frames] = []
         self._values: list[NDArray[Any]] = []
         self._waiting = 0
         self._bytes = 0
 
     def add(
-        self,
-        frames: NDArray[np.int64],
-        iterations: NDArray[np.int64] | int | None,
-        values: NDArray[Any],
+        self, frames: Frames, iterations: NDArray[np.int64] | int | None, values: NDArray[Any]
     ) -> None:
         """Take values of n rows, at n frames of one iteration or of n."""
         self._frames.append(frames)
@@ -91,14 +83,14 @@ class Column:
         self._values.append(values)
         self._waiting += len(frames)
         self._bytes += values.nbytes
-        if self._waiting >= self._rows or self._bytes >= MAX_BYTES:
+        if self._waiting >= ROWS or self._bytes >= MAX_BYTES:
             self.flush()
 
     def flush(self) -> None:
         """Hand over what waits."""
         if self._waiting:
             iterations = _joined(self._iterations) if self._iterations else None
-            times = self._clock.columns(_joined(self._frames), iterations)
+            times = time_columns(self._spec, _joined(self._frames), iterations)
             self.send(times, _joined(self._values))
         self._frames, self._iterations, self._values = [], [], []
         self._waiting = self._bytes = 0
@@ -113,98 +105,113 @@ def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
+def line_column(
+    recording: rr.RecordingStream,
+    spec: SourceSpec,
+    path: str,
+    names: Sequence[str],
+    rgbs: Sequence[Rgb] | None = None,
+    width: float | None = None,
+) -> Column:
+    """A column that is drawn as lines, whose names and colours are said once."""
+    style = rr.SeriesLines(
+        names=[label(name) for name in names],
+        colors=packed_all(rgbs or [colour(i) for i in range(len(names))]),
+        widths=None if width is None else [width] * len(names),
+    )
+    recording.log(path, style, static=True)
+    return Column(recording, spec, path)
+
+
+def frames_column(
+    recording: rr.RecordingStream, spec: SourceSpec, path: str, width: float | None = None
+) -> Column:
+    """A column of a source's frames: images, or lines of values."""
+    if spec.images:
+        return ImageColumn(recording, spec, path)
+    names = [f"x{i + 1}" for i in range(int(np.prod(spec.frame_shape)))]
+    return line_column(recording, spec, path, names, width=width)
+
+
 class ImageColumn(Column):
-    """Images, (n, height, width) grey or (n, height, width, 3) colour."""
+    """Images of a source, (n, height, width) grey."""
+
+    def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, path: str) -> None:
+        super().__init__(recording, spec, path)
+        height, width = spec.frame_shape
+        form = rr.components.ImageFormat(
+            width=width, height=height, color_model="L", channel_datatype="U8"
+        )
+        recording.log(path, rr.Image.from_fields(format=form), static=True)
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand n images over."""
         buffers = np.ascontiguousarray(values).reshape(len(values), -1)
         self._recording.send_columns(self.path, times, rr.Image.columns(buffer=buffers))
 
-    def declare(self, height: int, width: int, *, colours: bool = False) -> None:
-        """Say once what the images are."""
-        form = rr.components.ImageFormat(
-            width=width,
-            height=height,
-            color_model="RGB" if colours else "L",
-            channel_datatype="U8",
-        )
-        self._recording.log(self.path, rr.Image.from_fields(format=form), static=True)
-
 
 class TensorColumn(Column):
     """Tensors of one shape, with a name for each dimension."""
 
     def __init__(
-        self,
-        recording: rr.RecordingStream,
-        clock: Clock,
-        path: str,
-        rows: int,
-        names: Sequence[str],
+        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, names: Sequence[str]
     ) -> None:
-        super().__init__(recording, clock, path, rows)
+        super().__init__(recording, spec, path)
         self._names = names
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand n tensors over."""
-        batch: Any = _TensorBatch(tensor_array(np.asarray(values, dtype=np.float64), self._names))
+        batch: Any = TensorBatch(np.asarray(values, dtype=np.float64), self._names)
         self._recording.send_columns(self.path, times, [batch])
 
 
-class _TensorBatch:
-    """A column of tensors; `rr.Tensor.columns` takes one at a time."""
+class TensorBatch:
+    """(n, *shape) values as n rows of tensors; `rr.Tensor.columns` takes one at a time.
 
-    def __init__(self, array: pa.Array) -> None:
-        self._array = array
+    A test holds this encoding against `rr.Tensor`.
+    """
+
+    def __init__(self, values: NDArray[np.float64], names: Sequence[str]) -> None:
+        self._values = values
+        self._names = names
+        self._one = rr.Tensor(np.zeros((1, 1))).as_component_batches()[0]
 
     def component_descriptor(self) -> Any:
-        return rr.Tensor(np.zeros((1, 1))).as_component_batches()[0].component_descriptor()
+        """What the rows are to Rerun."""
+        return self._one.component_descriptor()
 
     def as_arrow_array(self) -> pa.Array:
-        return self._array
+        """The rows in Rerun's type of a tensor."""
+        kind = self._one.as_arrow_array().type
+        union = kind.field("buffer").type
+        position = next(i for i in range(union.num_fields) if union.field(i).name == "F64")
+        count, shape = len(self._values), np.array(self._values.shape[1:], dtype=np.uint64)
+        children = [
+            pa.nulls(0) if pa.types.is_null(field.type) else pa.array([], field.type)
+            for field in map(union.field, range(union.num_fields))
+        ]
+        numbers = pa.array(self._values.reshape(-1).copy())
+        children[position] = _lists(count, int(np.prod(shape)), numbers, union.field(position))
+        buffer = pa.Array.from_buffers(
+            union,
+            count,
+            [
+                None,
+                pa.py_buffer(np.full(count, union.type_codes[position], dtype=np.int8)),
+                pa.py_buffer(np.arange(count, dtype=np.int32)),
+            ],
+            children=children,
+        )
+        names = pa.array([*self._names] * count, kind.field("names").type.value_type)
+        parts = [
+            _lists(count, len(shape), pa.array(np.tile(shape, count)), kind.field("shape")),
+            _lists(count, len(shape), names, kind.field("names")),
+            buffer,
+        ]
+        return _lists(count, 1, pa.StructArray.from_arrays(parts, fields=list(kind)))
 
 
-def tensor_array(block: NDArray[np.float64], names: Sequence[str]) -> pa.Array:
-    """(n, *shape) values as n rows of Rerun's tensor type.
-
-    The type is Rerun's own; a test holds this encoding against `rr.Tensor`.
-    """
-    kind = rr.encodings.TensorDataBatch._ARROW_DATATYPE
-    union = kind.field("buffer").type
-    position = next(i for i in range(union.num_fields) if union.field(i).name == "F64")
-    count, shape = len(block), np.array(block.shape[1:], dtype=np.uint64)
-    size = int(np.prod(shape))
-    children = [
-        pa.nulls(0) if pa.types.is_null(union.field(i).type) else pa.array([], union.field(i).type)
-        for i in range(union.num_fields)
-    ]
-    children[position] = pa.ListArray.from_arrays(
-        _offsets(count, size),
-        pa.array(np.array(block).reshape(-1)),
-        type=union.field(position).type,
-    )
-    buffer = pa.Array.from_buffers(
-        union,
-        count,
-        [
-            None,
-            pa.py_buffer(np.full(count, union.type_codes[position], dtype=np.int8)),
-            pa.py_buffer(np.arange(count, dtype=np.int32)),
-        ],
-        children=children,
-    )
-    shapes = pa.ListArray.from_arrays(
-        _offsets(count, len(shape)), pa.array(np.tile(shape, count)), type=kind.field("shape").type
-    )
-    labels = pa.ListArray.from_arrays(
-        _offsets(count, len(shape)),
-        pa.array(list(names) * count, type=kind.field("names").type.value_type),
-        type=kind.field("names").type,
-    )
-    rows = pa.StructArray.from_arrays([shapes, labels, buffer], fields=list(kind))
-    return pa.ListArray.from_arrays(_offsets(count), rows)
-
-
-def _offsets(count: int, width: int = 1) -> pa.Array:
-    return pa.array(np.arange(count + 1, dtype=np.int32) * width)
+def _lists(count: int, width: int, values: pa.Array, field: pa.Field | None = None) -> pa.Array:
+    """Values as lists of so many each."""
+    offsets = pa.array(np.arange(count + 1, dtype=np.int32) * width)
+    return pa.ListArray.from_arrays(offsets, values, type=field.type if field else None)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
-import rerun_bindings
+from replay.view.bindings import escape_entity_path_part
 
 _DRAWN = (
     (0x20, 0x7E),  # ASCII
@@ -30,7 +30,7 @@ def label(text: str) -> str:
 
 def part(names: Sequence[str], index: int) -> str:
     """A stream's part of an entity's path: its number from 1, so that order holds, and its name."""
-    return str(rerun_bindings.escape_entity_path_part(f"{index + 1}_{label(names[index])}"))
+    return str(escape_entity_path_part(f"{index + 1}_{label(names[index])}"))
 
 
 def _is_drawn(code: int) -> bool:

@@ -9,63 +9,59 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from replay.palette import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    Rgb,
-    colour,
-    packed_all,
-)
+from cdmisfa.core.blocks import SourceSpec
+from replay import palette
+from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
-from replay.view.columns import Clock
+from replay.view.columns import time_columns
 from replay.view.labels import label, part
+
+NameOf = Callable[[int], tuple[str, Rgb]]
+"""The state that a code stands for, and its colour."""
 
 STAY, SWITCH = "stay", "switch"
 
+_NOVEL = -1
+
 
 class Lanes:
-    """Collects changes of state; a lane is a row of the view.
+    """All lanes of a run.
 
     Args:
         recording: where they go.
-        clock: how frames become times.
-        names: of all streams.
+        spec: of the source.
         shown: the streams whose policy gets a lane.
     """
 
     def __init__(
-        self,
-        recording: rr.RecordingStream,
-        clock: Clock,
-        names: Sequence[str],
-        shown: Sequence[int],
+        self, recording: rr.RecordingStream, spec: SourceSpec, shown: Sequence[int]
     ) -> None:
-        self._recording = recording
-        self._clock = clock
-        self._names = names
-        self._policies = {s: f"policy/{part(names, s)}" for s in shown}
-        self._changes: dict[str, list[tuple[int, int, str]]] = {}
-        self._colours: dict[str, dict[str, Rgb]] = {}
-        self._sent: dict[str, int] = {}
-        self._declared: dict[str, int] = {}
+        names: dict[str, NameOf] = {
+            "lanes/1_stream": lambda stream: (label(spec.streams[stream]), colour(stream)),
+            "lanes/2_learning": lambda module: (f"module {module}", colour(module - 1)),
+            "lanes/3_gate": _verdict,
+            "lanes/4_action": _action,
+            "lanes/5_chosen_by": _chosen,
+        }
+        self._policies = {s: f"policy/{part(spec.streams, s)}" for s in shown}
+        names |= {path: partial(_planned, stream=s) for s, path in self._policies.items()}
+        self._lanes = {p: Lane(recording, spec, p, name) for p, name in names.items()}
         self._iteration = 0
 
     def add(self, columns: SignalColumns) -> None:
         """Take the states of consecutive iterations in."""
         self._iteration = int(columns.iterations[-1])
-        self._put(columns, "lanes/1_stream", columns["stream"], self._stream)
-        self._put(columns, "lanes/2_learning", columns["module"], _learning)
         verdicts = np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0))
-        self._put(columns, "lanes/3_gate", verdicts, _verdict)
-        self._put(columns, "lanes/4_action", columns["action"], _action)
-        self._put(columns, "lanes/5_chosen_by", columns["explored"], _chosen)
-        for s, path in self._policies.items():
-            self._put(columns, path, columns["policy"][:, s], partial(_planned, stream=s))
+        codes = {
+            "lanes/1_stream": columns["stream"],
+            "lanes/2_learning": columns["module"],
+            "lanes/3_gate": verdicts,
+            "lanes/4_action": columns["action"],
+            "lanes/5_chosen_by": columns["explored"],
+        }
+        codes |= {path: columns["policy"][:, s] for s, path in self._policies.items()}
+        for path, lane in self._lanes.items():
+            lane.add(columns, codes[path])
 
     def end(self, frames: int) -> None:
         """Write what is left; all lanes end with the run.
@@ -73,82 +69,83 @@ class Lanes:
         Args:
             frames: where the run ended.
         """
-        for changes in self._changes.values():
-            changes.append((frames, self._iteration, ""))
+        for lane in self._lanes.values():
+            lane.end(frames, self._iteration)
         self.flush()
 
     def flush(self) -> None:
         """Hand over the changes since the last time."""
-        for path, changes in self._changes.items():
-            rows = changes[self._sent.get(path, 0) :]
-            if not rows:
-                continue
-            self._declare(path)
-            self._sent[path] = len(changes)
-            times = self._clock.columns(
-                np.array([t for t, _, _ in rows]), np.array([k for _, k, _ in rows])
-            )
-            states = rr.StateChange.columns(state=[state for _, _, state in rows])
-            self._recording.send_columns(path, times, states)
+        for lane in self._lanes.values():
+            lane.flush()
 
-    def _declare(self, path: str) -> None:
-        """Say which states there are, where there are new ones."""
-        chosen = self._colours[path]
-        if self._declared.get(path) == len(chosen):
-            return
-        self._declared[path] = len(chosen)
-        self._recording.log(
-            path,
-            rr.StateConfiguration(
-                values=list(chosen),
-                labels=list(chosen),
-                colors=packed_all(list(chosen.values())),
-            ),
-            static=True,
-        )
 
-    def _put(
-        self,
-        columns: SignalColumns,
-        path: str,
-        codes: NDArray[np.int64],
-        name: Callable[[int], tuple[str, Rgb]],
+class Lane:
+    """A row of the view: changes of state, waiting to be handed over.
+
+    Args:
+        recording: where they go.
+        spec: of the source.
+        path: the entity.
+        name: what the codes stand for.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, name: NameOf
     ) -> None:
+        self._recording = recording
+        self._spec = spec
+        self._path = path
+        self._name = name
+        self._state: str | None = None
+        self._changes: list[tuple[int, int, str]] = []
+        self._colours: dict[str, Rgb] = {}
+        self._declared = 0
+
+    def add(self, columns: SignalColumns, codes: NDArray[np.int64]) -> None:
         """Keep the places where what the codes stand for changes."""
-        changes = self._changes.setdefault(path, [])
-        colours = self._colours.setdefault(path, {})
         begins = np.flatnonzero(np.diff(codes.astype(np.int64), prepend=int(codes[0]) + 1))
         rows = zip(codes[begins], columns.frames[begins], columns.iterations[begins], strict=True)
         for code, t, iteration in rows:
-            state, rgb = name(int(code))
-            colours.setdefault(state, rgb)
-            if not changes or changes[-1][2] != state:
-                changes.append((int(t), int(iteration), state))
+            state, rgb = self._name(int(code))
+            self._colours.setdefault(state, rgb)
+            if state != self._state:
+                self._state = state
+                self._changes.append((int(t), int(iteration), state))
 
-    def _stream(self, stream: int) -> tuple[str, Rgb]:
-        return label(self._names[stream]), colour(stream)
+    def end(self, frames: int, iteration: int) -> None:
+        """Nothing is the case any longer."""
+        if self._state is not None:
+            self._changes.append((frames, iteration, ""))
 
-
-_NOVEL = -1
-
-
-def _learning(module: int) -> tuple[str, Rgb]:
-    return f"module {module}", colour(module - 1)
+    def flush(self) -> None:
+        """Hand over what waits, and say which states there are, where there are new ones."""
+        if not self._changes:
+            return
+        if self._declared < len(self._colours):
+            self._declared = len(self._colours)
+            states, colours = list(self._colours), packed_all(list(self._colours.values()))
+            known = rr.StateConfiguration(values=states, labels=states, colors=colours)
+            self._recording.log(self._path, known, static=True)
+        frames, iterations = (np.array([row[i] for row in self._changes]) for i in (0, 1))
+        changes = rr.StateChange.columns(state=[state for _, _, state in self._changes])
+        times = time_columns(self._spec, frames, iterations)
+        self._recording.send_columns(self._path, times, changes)
+        self._changes = []
 
 
 def _verdict(code: int) -> tuple[str, Rgb]:
     if code == _NOVEL:
-        return "novel", GREEN
-    return (f"known by {code}", colour(code - 1)) if code else ("constant", PURPLE)
+        return "novel", palette.GREEN
+    return (f"known by {code}", colour(code - 1)) if code else ("constant", palette.PURPLE)
 
 
 def _action(action: int) -> tuple[str, Rgb]:
-    return (STAY, SKY) if action == 0 else (SWITCH, VERMILLION)
+    return (STAY, palette.SKY) if action == 0 else (SWITCH, palette.VERMILLION)
 
 
 def _chosen(explored: int) -> tuple[str, Rgb]:
-    return ("explored", ORANGE) if explored else ("greedy", BLUE)
+    return ("explored", palette.ORANGE) if explored else ("greedy", palette.BLUE)
 
 
 def _planned(action: int, stream: int) -> tuple[str, Rgb]:
-    return (SWITCH, GREY) if action else (STAY, colour(stream))
+    return (SWITCH, palette.GREY) if action else (STAY, colour(stream))

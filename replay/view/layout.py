@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.outline import Outline
 from replay.view.columns import FRAME, TIMELINE_SIGNALS
+from replay.view.heads import gaze
 from replay.view.labels import label, part
 
 MOST_MODULES = 6
@@ -18,6 +19,9 @@ MOST_MODULES = 6
 LEGEND = rrb.PlotLegend(visible=True, corner=rrb.Corner2D.RightTop)
 HEAT = rrb.TensorScalarMapping(colormap="viridis")
 FIT = rrb.components.ViewFit.Fill
+
+MOST_STREAMS = 16
+"""Streams with lines and lanes of their own: the most watched ones."""
 
 MANY = 6
 """With more streams than this the share of each is small, and drawn larger."""
@@ -46,12 +50,12 @@ def blueprint(*tabs: rrb.Container | rrb.View, name: str, timeline: str = FRAME)
     )
 
 
-def whole(frames: int) -> rrb.archetypes.TimeAxis:
-    """A time axis that shows frames 0 to `frames`."""
+def time_axis(end: int) -> rrb.archetypes.TimeAxis:
+    """A time axis that shows [0, end]."""
     return rrb.archetypes.TimeAxis(
         view_range=rr.TimeRange(
             start=rr.TimeRangeBoundary.absolute(seq=0),
-            end=rr.TimeRangeBoundary.absolute(seq=max(frames, 1)),
+            end=rr.TimeRangeBoundary.absolute(seq=max(end, 1)),
         )
     )
 
@@ -70,18 +74,6 @@ def lines(
     )
 
 
-def gaze(name: str) -> rrb.Spatial3DView:
-    """The head's poses, in the robot's root frame, seen from above and behind."""
-    return rrb.Spatial3DView(
-        origin="/head/poses",
-        name=name,
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(
-            position=(0.45, 0.0, 0.75), look_target=(-0.12, 0.0, 0.24), eye_up=(0.0, 0.0, 1.0)
-        ),
-    )
-
-
 class RunLayout:
     """The layout of a run; it adapts to its streams and modules.
 
@@ -96,8 +88,8 @@ class RunLayout:
         self._all_views = all_views
         self._head = head
         self._spec = outline.header.spec
-        self._axis = whole(outline.frames) if outline.frames else None
-        self._images = len(self._spec.frame_shape) == 2
+        self._axis = time_axis(outline.frames) if outline.frames else None
+        self._images = self._spec.images
 
     def blueprint(self) -> rrb.Blueprint:
         """The layout, ready to be sent."""

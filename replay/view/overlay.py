@@ -11,15 +11,15 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.signals import SIGNALS, BlockSignals
-from replay.palette import colour, packed
+from replay.palette import colour
+from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
-from replay.runs.log import read_signals
+from replay.runs.folders import run_log
+from replay.runs.stretches import read_columns
 from replay.view.build import recording_to
-from replay.view.columns import ITERATION, Clock, Column
-from replay.view.config import ViewConfig
+from replay.view.columns import ITERATION, Column, line_column
 from replay.view.labels import label, part
-from replay.view.layout import blueprint, lines, whole
+from replay.view.layout import MOST_STREAMS, blueprint, lines, time_axis
 
 CURVES = {
     "eta_dot": "Change of slowness η̇: a module is saved when it falls below δ",
@@ -37,12 +37,7 @@ R_STAY = "R_stay"
 
 
 def build_overlay(
-    runs: Sequence[Path],
-    rows: Sequence[Row],
-    out: Path,
-    *,
-    force: bool = False,
-    config: ViewConfig | None = None,
+    runs: Sequence[Path], rows: Sequence[Row], out: Path, *, force: bool = False
 ) -> None:
     """Write the curves of several runs, one colour a run, into one .rrd file.
 
@@ -53,7 +48,6 @@ def build_overlay(
         rows: what `survey` says of them.
         out: the file.
         force: replace an existing file.
-        config: how many rows are handed over at once, and how many streams are shown.
 
     Raises:
         UsageError: `out` exists and `force` is not set.
@@ -62,14 +56,13 @@ def build_overlay(
     """
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
-    config = config or ViewConfig()
     names = [row.name for row in rows]
     with recording_to(out, out.stem, out) as recording:
         text = rr.TextDocument(label(table_text(rows)), media_type=rr.MediaType.MARKDOWN)
         recording.log("summary", text, static=True)
         for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
-            _write(recording, run, row, f"compare/{part(names, i)}", i, config)
-        recording.send_blueprint(_layout(rows, config))
+            _write(recording, run, row, f"compare/{part(names, i)}", i)
+        recording.send_blueprint(_layout(rows))
 
 
 def table_text(rows: Sequence[Row]) -> str:
@@ -88,40 +81,35 @@ def _shortly(difference: Difference | None) -> str:
     return f"differs from iteration {difference.iteration}, first in {difference.signal}"
 
 
-def _write(
-    recording: rr.RecordingStream, run: Path, row: Row, root: str, number: int, config: ViewConfig
-) -> None:
-    spec = row.outline.header.spec
-    clock = Clock(spec)
-    columns: dict[str, Column] = {}
-    shown = row.outline.streams(config.streams)
-    for signals in read_signals(run):
-        at = np.array([signals.t])
-        for entity, values in _curves(signals, spec.streams, shown):
-            path = f"{root}/{entity}"
-            if path not in columns:
-                names = [label(row.name)] * values.size
-                colours = [packed(colour(number))] * values.size
-                recording.log(path, rr.SeriesLines(names=names, colors=colours), static=True)
-                columns[path] = Column(recording, clock, path, config.rows)
-            columns[path].add(at, signals.iteration, values.reshape(1, -1))
-    for column in columns.values():
-        column.flush()
+def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number: int) -> None:
+    header = row.outline.header
+    shown = row.outline.streams(MOST_STREAMS)
+    lines: dict[str, Column] = {}
+    for columns in read_columns(run_log(run), header):
+        for entity, values in _curves(columns, header.spec.streams, shown):
+            path, rows = f"{root}/{entity}", values.reshape(len(columns), -1)
+            if path not in lines:
+                width = rows.shape[1]
+                names, rgbs = [row.name] * width, [colour(number)] * width
+                lines[path] = line_column(recording, header.spec, path, names, rgbs)
+            lines[path].add(*columns.times(), rows)
+    for line in lines.values():
+        line.flush()
 
 
 def _curves(
-    signals: BlockSignals, names: Sequence[str], shown: Sequence[int]
+    columns: SignalColumns, names: Sequence[str], shown: Sequence[int]
 ) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Entity and value of every curve in one iteration."""
+    """Entity and values of every curve in some iterations."""
     for name in CURVES:
-        yield name, np.asarray(getattr(signals, SIGNALS[name].name), dtype=np.float64)
-    if signals.R.size:
+        yield name, columns[name].astype(np.float64)
+    if columns["R"].size:
         for s in shown:
-            yield f"{R_STAY}/{part(names, s)}", signals.R[s, 0, s]
+            yield f"{R_STAY}/{part(names, s)}", columns["R"][:, s, 0, s]
 
 
-def _layout(rows: Sequence[Row], config: ViewConfig) -> rrb.Blueprint:
-    axis = whole(max(row.outline.iterations for row in rows))
+def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
+    axis = time_axis(max(row.outline.iterations for row in rows))
     outline, names = rows[0].outline, [row.name for row in rows]
     roots = [f"/compare/{part(names, i)}" for i in range(len(names))]
 
@@ -131,7 +119,7 @@ def _layout(rows: Sequence[Row], config: ViewConfig) -> rrb.Blueprint:
     streams = outline.names()
     rewards = [
         panel(f"R for staying on {label(streams[s])}", f"{R_STAY}/{part(streams, s)}")
-        for s in outline.streams(config.streams)
+        for s in outline.streams(MOST_STREAMS)
     ]
     first = [panel(CURVES[name], name) for name in FIRST_TAB]
     table = rrb.TextDocumentView(origin="/summary", name="Runs")

@@ -1,10 +1,11 @@
 """What a run was and came to: the columns that the viewer's tables of runs show.
 
-Rows are written with the bindings below Rerun's package, which takes half a second to import.
+Rows are written without Rerun's package, which takes half a second to import.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
-from rerun_bindings import ChunkInternal, ChunkStoreInternal, ComponentDescriptor
 
 from cdmisfa.core.errors import CdmisfaError
 from replay.runs.folders import run_log
+from replay.view.bindings import Chunk, ChunkStore, ComponentDescriptor
 from replay.view.labels import label
 
 if TYPE_CHECKING:
@@ -26,6 +27,9 @@ APPLICATION = "cdmisfa"
 
 Sections = dict[str, dict[str, Any]]
 """Values by section of the configuration; those of `result` are what the run came to."""
+
+Cells = dict[tuple[str, str, Any], pa.Array]
+"""Single values as Rerun stores them, by section, name, type and value."""
 
 
 def identity(name: str, source: Path) -> str:
@@ -56,16 +60,9 @@ def properties_of(outline: Outline, folder: Path) -> Sections:
         outline: the run in short.
         folder: of the run, whose manifest says why it ended.
     """
-    manifest = outline.header.manifest
-    result: dict[str, Any] = {
-        "seed": manifest.get("seed", 0),
-        "iterations": outline.iterations,
-        "frames": outline.frames,
-        "modules": len(outline.saved),
-        "learned": ", ".join(label(outline.names()[s.stream]) for s in outline.saved),
-        **_ending(_manifest(folder)),
-    }
-    return {**_configuration(manifest), "result": result}
+    began, learned = outline.header.manifest, [outline.names()[s.stream] for s in outline.saved]
+    counts = began.get("seed", 0), outline.iterations, outline.frames
+    return {**_configuration(began), "result": _result(counts, learned, _manifest(folder))}
 
 
 def read_properties(run: Path) -> Sections:
@@ -80,20 +77,13 @@ def read_properties(run: Path) -> Sections:
     manifest = _manifest(run)
     try:
         found = manifest["result"]
-        modules = [label(str(module["stream"])) for module in found["modules"]]
-        result: dict[str, Any] = {
-            "seed": int(manifest["seed"]),
-            "iterations": int(found["iterations"]),
-            "frames": int(found["frames"]),
-            "modules": len(modules),
-            "learned": ", ".join(modules),
-            **_ending(manifest),
-        }
+        learned = [str(module["stream"]) for module in found["modules"]]
+        counts = int(manifest["seed"]), int(found["iterations"]), int(found["frames"])
     except (KeyError, TypeError, ValueError):
         from replay.runs.outline import read_outline  # only where there is no result
 
         return properties_of(read_outline(run), run)
-    return {**_configuration(manifest), "result": result}
+    return {**_configuration(manifest), "result": _result(counts, learned, manifest)}
 
 
 def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
@@ -117,16 +107,12 @@ def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
             for name, value in values.items():
                 types.setdefault((section, name), set()).add(type(value))
     columns = {column: _joint(found) for column, found in types.items()}
-    cells: dict[tuple[str, str, Any], pa.Array] = {}  # runs of a sweep share most
+    cells: Cells = {}
     files = []
     for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
         out = folder / f"{i:05d}.rrd"
         try:
-            chunks = [
-                ChunkInternal.from_property(section, _components(section, values, columns, cells))
-                for section, values in row.items()
-            ]
-            stream = ChunkStoreInternal.from_chunks(chunks).stream()
+            stream = ChunkStore.from_chunks(property_chunks(row, columns, cells)).stream()
             stream.write_rrd(str(out), APPLICATION, run_identity(run))
         except (RuntimeError, OSError, OverflowError, ValueError) as error:
             raise CdmisfaError(f"{out} cannot be written: {error}") from error
@@ -134,12 +120,30 @@ def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
     return files
 
 
-def property_chunks(sections: Sections) -> list[ChunkInternal]:
-    """The properties of one run as Rerun's chunks."""
+def property_chunks(
+    sections: Sections,
+    columns: Mapping[tuple[str, str], type] | None = None,
+    cells: Cells | None = None,
+) -> list[Chunk]:
+    """The properties of one run as Rerun's chunks.
+
+    Args:
+        sections: the properties.
+        columns: the type of each column, where the run is a row of a table.
+        cells: those that were made already: runs of a sweep share most.
+    """
+    made = {} if cells is None else cells
+
+    def cell(section: str, name: str, value: Any) -> pa.Array:
+        key = section, name, (type(value), value)
+        if key not in made:
+            made[key] = pa.array([columns[section, name](value) if columns else value])
+        return made[key]
+
     return [
-        ChunkInternal.from_property(
+        Chunk.from_property(
             section,
-            {ComponentDescriptor(name): pa.array([value]) for name, value in values.items()},
+            {ComponentDescriptor(name): cell(section, name, v) for name, v in values.items()},
         )
         for section, values in sections.items()
     ]
@@ -151,22 +155,6 @@ def _joint(types: Iterable[type]) -> type:
     if len(found) == 1:
         return found.pop()
     return float if found == {int, float} else str
-
-
-def _components(
-    section: str,
-    values: Mapping[str, Any],
-    columns: Mapping[tuple[str, str], type],
-    cells: dict[tuple[str, str, Any], pa.Array],
-) -> dict[ComponentDescriptor, pa.Array]:
-    """A section's values as Rerun stores them, in the types of their columns."""
-    components = {}
-    for name, value in values.items():
-        key = section, name, (type(value), value)
-        if key not in cells:
-            cells[key] = pa.array([columns[section, name](value)])
-        components[ComponentDescriptor(name)] = cells[key]
-    return components
 
 
 def _configuration(manifest: Mapping[str, Any]) -> Sections:
@@ -185,12 +173,16 @@ def _manifest(folder: Path) -> Mapping[str, Any]:
     return document if isinstance(document, Mapping) else {}
 
 
-def _ending(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """Why the run ended, where its manifest says it."""
-    try:
-        return {name: str(manifest["result"][name]) for name in ("ended", "signals_sha256")}
-    except (KeyError, TypeError):
-        return {}
+def _result(
+    counts: tuple[Any, int, int], learned: Sequence[str], manifest: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What a run came to, and why it ended, where its manifest says it."""
+    found = dict(zip(("seed", "iterations", "frames"), counts, strict=True))
+    found |= {"modules": len(learned), "learned": label(", ".join(learned))}
+    with contextlib.suppress(KeyError, TypeError):
+        ending = manifest["result"]
+        found |= {name: str(ending[name]) for name in ("ended", "signals_sha256")}
+    return found
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -14,15 +14,24 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, Signal
-from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, packed_all, shade
+from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, shade
 from replay.runs.columns import SignalColumns
 from replay.runs.log import RunHeader
 from replay.runs.outline import Outline, delta_of
 from replay.runs.stretches import Stretch
-from replay.view.columns import TIMELINE_SIGNALS, Clock, Column, ImageColumn, TensorColumn
-from replay.view.config import ViewConfig
+from replay.view.columns import (
+    FRAME,
+    ITERATION,
+    LOG_TIME,
+    TIMELINE_SIGNALS,
+    Column,
+    TensorColumn,
+    frames_column,
+    line_column,
+)
 from replay.view.labels import label, part
 from replay.view.lanes import Lanes
 
@@ -41,8 +50,10 @@ RECENT = 50
 SPARSE = 10
 """With more streams than are shown one by one, tensors are kept every so many iterations."""
 
+WIDTH = 1.5
+"""Of lines."""
+
 Frames = TypeVar("Frames", int, NDArray[np.int64])
-AnyColumn = TypeVar("AnyColumn", bound=Column)
 
 
 class RunView:
@@ -52,10 +63,7 @@ class RunView:
         recording: the recording.
         header: what stands at the beginning of the run's log.
         streams: those that get lines and lanes of their own.
-        config: how the run is shown.
-
-    Attributes:
-        spec: what the learner's source delivered.
+        every: show images of every this many frames.
     """
 
     def __init__(
@@ -63,18 +71,17 @@ class RunView:
         recording: rr.RecordingStream,
         header: RunHeader,
         streams: Sequence[int],
-        config: ViewConfig,
+        every: int,
     ) -> None:
         self._recording = recording
         self._delta = delta_of(header)
-        self._config = config
-        self.spec = header.spec
-        self._clock = Clock(self.spec)
+        self._every = every
+        self._spec = header.spec
         self._columns: dict[str, Column] = {}
         self._streams = streams
         self._tau = 1
         self._recent = np.zeros((0, len(streams)), dtype=bool)
-        self._lanes = Lanes(recording, self._clock, self.spec.streams, self._streams)
+        self._lanes = Lanes(recording, self._spec, streams)
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
@@ -117,22 +124,18 @@ class RunView:
 
     def watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
         """Take (n, *frame_shape) of what the learner saw at n frames."""
-        shape, path = self.spec.frame_shape, "world/watched"
-        if len(shape) == 2:
-            kept = at % self._config.every == 0
-            if not kept.all():
-                at, frames = at[kept], frames[kept]
-            if len(at):
-                self._column(path, self._screen).add(at, self._iteration(at), frames)
-        else:
-            names = [f"x{i + 1}" for i in range(int(np.prod(shape)))]
-            line = self._line(path, names, 0)
-            line.add(at, self._iteration(at), frames.reshape(len(frames), -1))
+        if self._spec.images:
+            kept = at % self._every == 0
+            at, frames = at[kept], frames[kept]
+        if len(at):
+            column = self._column("world/watched", frames_column, WIDTH)
+            column.add(at, self._iteration(at), frames)
 
     def truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Take (n, D) of what the world knows at n frames, and the learner does not."""
-        line = self._line("world/truth", list(self.spec.truth), 0)
-        line.add(at, self._iteration(at), values)
+        if self._spec.truth:
+            line = self._line("world/truth", self._spec.truth)
+            line.add(at, self._iteration(at), values)
 
     def weights(self, path: str, t: int, phi: NDArray[np.float64]) -> None:
         """Show (J, I) weights at an entity."""
@@ -148,7 +151,7 @@ class RunView:
     def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
         """Draw the line that eta-dot must fall below, through these frames."""
         if self._delta is not None:
-            line = self._line("abstraction/delta", ["δ threshold"], 0, rgb=GREY)
+            line = self._line("abstraction/delta", ["δ threshold"], rgbs=[GREY])
             line.add(frames, iterations, np.full((len(frames), 1), self._delta))
 
     def flush(self) -> None:
@@ -164,37 +167,32 @@ class RunView:
             if signal.name in TIMELINE_SIGNALS:
                 continue
             value, path = columns[signal.name], f"signals/{signal.name}"
+            frames, iterations = columns.times("T" in signal.dims)
             if signal.show == "heat":
                 self._tensor(signal, path, columns, value)
                 if signal.name == "Q":  # what stream and action change is small beside the mean
                     beside = value - value.mean(axis=(1, 2), keepdims=True)
                     self._tensor(signal, "decision/Q_beside_mean", columns, beside)
+            elif signal.dims == "S":
+                self._column(path, Column).add(frames, iterations, value)
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
-                    labels = _labels(signal, i + 1, outputs)
-                    line = self._line(f"{path}/{i + 1}", labels, i + 1)
-                    frames, iterations = columns.times("T" in signal.dims)
+                    line = self._line(f"{path}/{i + 1}", _labels(signal, i + 1, outputs), i + 1)
                     line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
             else:
-                labels = _labels(signal, 0, outputs)
-                number = BESIDE.get(signal.name, 0)
-                line = self._line(path, labels if signal.dims != "S" else None, number)
-                frames, iterations = columns.times(signal.dims.startswith("T"))
+                line = self._line(path, _labels(signal, 0, outputs), BESIDE.get(signal.name, 0))
                 line.add(frames, iterations, value.reshape(len(frames), -1))
 
     def _tensor(
         self, signal: Signal, path: str, columns: SignalColumns, value: NDArray[Any]
     ) -> None:
-        crowded = len(self.spec.streams) > self._config.streams
+        crowded = len(self._spec.streams) > len(self._streams)
         kept = columns.iterations % SPARSE == 0 if crowded else np.ones(len(value), dtype=bool)
         if value.size and kept.any():
             names = [AXES[d] for d in signal.dims]
             if names.count("stream") > 1:
                 names[-1] = "next stream"
-            column = self._column(
-                path,
-                lambda: TensorColumn(self._recording, self._clock, path, self._config.rows, names),
-            )
+            column = self._column(path, TensorColumn, names)
             column.add(columns.frames[kept], columns.iterations[kept], value[kept])
 
     def _attention(self, columns: SignalColumns) -> None:
@@ -206,16 +204,16 @@ class RunView:
         before = end - RECENT
         shares = sums[end] - np.where(before[:, None] < 0, 0, sums[np.maximum(before, 0)])
         self._recent = all_of_them[-RECENT:]
-        names = [self.spec.streams[s] for s in self._streams]
-        line = self._line("decision/attention", names, 0, rgbs=[colour(s) for s in self._streams])
+        names = [self._spec.streams[s] for s in self._streams]
+        line = self._line("decision/attention", names, rgbs=[colour(s) for s in self._streams])
         line.add(*columns.times(), shares / np.minimum(end + 1, RECENT)[:, None])
 
     def _decision(self, columns: SignalColumns) -> None:
         """Reward and value of each shown stream, as lines in the streams' colours."""
         reward, value = columns["R"], columns["Q"]
         for s in self._streams:
-            name = self.spec.streams[s]
-            place = part(self.spec.streams, s)
+            name = self._spec.streams[s]
+            place = part(self._spec.streams, s)
             if reward.size:
                 line = self._line(f"decision/R_stay/{place}", [f"R stay {name}"], s)
                 line.add(*columns.times(), reward[:, s, 0, s])
@@ -236,31 +234,14 @@ class RunView:
         """Where eta-dot stood when a module was saved."""
         saved = columns["saved"]
         if saved.any():
-            marks = self._column("abstraction/saved", self._marks)
+            marks = self._column("abstraction/saved", _marks)
             eta_dot = columns["eta_dot"][saved, :1]
             marks.add(columns.frames[saved], columns.iterations[saved], eta_dot)
 
-    def _marks(self) -> Column:
-        path = "abstraction/saved"
-        style = rr.SeriesPoints(
-            colors=[packed(VERMILLION)],
-            markers="diamond",
-            marker_sizes=[7.0],
-            names=["module saved"],
-        )
-        self._recording.log(path, style, static=True)
-        return Column(self._recording, self._clock, path, self._config.rows)
-
-    def _screen(self) -> Column:
-        path = "world/watched"
-        column = ImageColumn(self._recording, self._clock, path, self._config.rows)
-        column.declare(*self.spec.frame_shape)
-        return column
-
     def _picture(self, phi: NDArray[np.float64]) -> Any:
         """(J, I) weights as images below one another, as bars, or as a tensor."""
-        shape = self.spec.frame_shape
-        if len(shape) == 2 and phi.shape[1] == shape[0] * shape[1]:
+        shape = self._spec.frame_shape
+        if self._spec.images and phi.shape[1] == shape[0] * shape[1]:
             return rr.Image(shade(phi.reshape(-1, shape[1])))
         if phi.size <= 256:
             return rr.BarChart(phi.reshape(-1).copy(), color=packed(SKY))
@@ -270,42 +251,38 @@ class RunView:
         return t // self._tau
 
     def _set_time(self, t: int, iteration: int) -> None:
-        self._recording.set_time("frame", sequence=t)
-        self._recording.set_time("iteration", sequence=max(iteration, 0))
-        time = np.datetime64(self.spec.time_ns(t), "ns")
-        self._recording.set_time("message_log_time", timestamp=time)
+        self._recording.set_time(FRAME, sequence=t)
+        self._recording.set_time(ITERATION, sequence=max(iteration, 0))
+        self._recording.set_time(LOG_TIME, timestamp=np.datetime64(self._spec.time_ns(t), "ns"))
 
     def _line(
         self,
         path: str,
-        labels: Sequence[str] | None,
-        number: int,
+        labels: Sequence[str],
+        number: int = 0,
         *,
-        rgb: Rgb | None = None,
         rgbs: Sequence[Rgb] | None = None,
-        width: float = 1.5,
+        width: float = WIDTH,
     ) -> Column:
-        """The column of a line, its names and colours said once."""
+        """The column of a line or several, in the colours from `number` on."""
+        one = len(set(labels)) == 1
+        rgbs = rgbs or [colour(number + (0 if one else i)) for i in range(len(labels))]
+        return self._column(path, line_column, labels, rgbs, width)
 
-        def declare() -> Column:
-            if labels is not None:
-                shades = rgbs or [rgb or colour(number + i) for i in range(len(labels))]
-                if len(set(labels)) == 1:
-                    shades = [shades[0]] * len(labels)
-                style = rr.SeriesLines(
-                    names=[label(text) for text in labels],
-                    colors=packed_all(shades),
-                    widths=[width] * len(labels),
-                )
-                self._recording.log(path, style, static=True)
-            return Column(self._recording, self._clock, path, self._config.rows)
-
-        return self._column(path, declare)
-
-    def _column(self, path: str, make: Callable[[], AnyColumn]) -> Column:
+    def _column(self, path: str, make: Callable[..., Column], *how: Any) -> Column:
+        """The column of an entity, made when it is first needed."""
         if path not in self._columns:
-            self._columns[path] = make()
+            self._columns[path] = make(self._recording, self._spec, path, *how)
         return self._columns[path]
+
+
+def _marks(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column:
+    """A column that is drawn as marks where a module was saved."""
+    style = rr.SeriesPoints(
+        colors=[packed(VERMILLION)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
+    )
+    recording.log(path, style, static=True)
+    return Column(recording, spec, path)
 
 
 def _labels(signal: Signal, module: int, outputs: int) -> list[str]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from replay.runs.outline import Outline
-
-ACTIONS = ("stay", "switch")
+from replay.view.layout import MOST_STREAMS
 
 NAMED = 4
 """Most streams whose names are given together."""
@@ -36,7 +35,7 @@ def summary_text(outline: Outline, name: str, ended: str = "") -> str:
     for text in (_unfinished(outline), ended):
         lines += [text, ""] if text else []
     lines += ["| stream | watched |", "|---|---|"]
-    for s in outline.streams(16):
+    for s in outline.streams(MOST_STREAMS):
         share = outline.visits[s] / max(outline.frames, 1)
         lines.append(f"| {spec.streams[s]} | {outline.visits[s]} frames, {share:.0%} |")
     settings = [("seed", header.manifest.get("seed"))]

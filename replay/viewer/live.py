@@ -28,8 +28,7 @@ from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header
 from replay.runs.outline import LINES, Outline
 from replay.runs.stretches import read_stretches
-from replay.view.config import ViewConfig
-from replay.view.layout import MOST_MODULES, RunLayout
+from replay.view.layout import MOST_MODULES, MOST_STREAMS, RunLayout
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
 from replay.viewer.program import environment, free_port, program
@@ -86,12 +85,11 @@ class LiveView(Sink):
         self._recording.send_recording_name("live")
         self._recording.send_blueprint(RunLayout(outline).blueprint())
         # No image is left out here: of each block only the first is taken.
-        config = ViewConfig(every=1)
         self._view = RunView(
-            self._recording, outline.header, outline.streams(config.streams), config
+            self._recording, outline.header, outline.streams(MOST_STREAMS), every=1
         )
         self._tau = tau
-        self._images = len(spec.frame_shape) == 2
+        self._images = spec.images
         self._records: list[BlockSignals] = []
         self._watched: list[NDArray[Any]] = []
         self._truth: list[NDArray[np.float64]] = []
@@ -145,8 +143,7 @@ class LiveView(Sink):
             for columns in columns_of_records(self._records):
                 self._view.add(columns)
             self._view.watched(starts if self._images else every, np.concatenate(self._watched))
-            if self._view.spec.truth:
-                self._view.truth(every, np.concatenate(self._truth))
+            self._view.truth(every, np.concatenate(self._truth))
             self._view.threshold(np.array([last.t]), np.array([last.iteration]))
             self._view.weights("abstraction/phi", last.t, self._phi)
             self._records, self._watched, self._truth = [], [], []

@@ -1,0 +1,94 @@
+"""The head's poses in 3D: where it looks for each view, and where it looked in a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from cdmisfa.core.blocks import HeadPose
+from replay.palette import colour, packed_all
+from replay.recordings.poses import yaw_of
+from replay.runs.outline import Outline
+from replay.runs.stretches import read_columns
+from replay.view.columns import Column, time_columns
+from replay.view.labels import label, part
+
+POSES = "head/poses"
+WATCHING = "head/poses/watching"
+YAW = "head/yaw"
+
+REACH = 0.25
+"""Length of the arrow along a gaze, in metres."""
+
+
+def write_heads(
+    recording: rr.RecordingStream, names: Sequence[str], poses: Mapping[str, HeadPose]
+) -> bool:
+    """Show in 3D where the head looks for each view: an arrow along its gaze.
+
+    Poses are in the robot's root frame: x to the back, y to the right, z up.
+
+    Returns:
+        Whether there is a pose for every view; otherwise nothing is shown.
+    """
+    if not set(poses) >= set(names):
+        return False
+    recording.log(POSES, rr.ViewCoordinates.BRU, static=True)
+    for s, name in enumerate(names):
+        place, pose = f"{POSES}/{part(names, s)}", poses[name]
+        turn = rr.Quaternion(xyzw=pose.quaternion)
+        recording.log(
+            place, rr.Transform3D(translation=pose.position, quaternion=turn), static=True
+        )
+        arrow = rr.Arrows3D(
+            vectors=[[-REACH, 0, 0]],
+            radii=[0.005],
+            colors=packed_all([colour(s)]),
+            labels=[label(name)],
+        )
+        recording.log(place, arrow, static=True)
+    return True
+
+
+def write_gaze(
+    recording: rr.RecordingStream, log: Path, outline: Outline, poses: Mapping[str, HeadPose]
+) -> None:
+    """Show where a run turned the head: `/head/yaw` in degrees, and an arrow in 3D."""
+    spec, watching = outline.header.spec, -1
+    watched = [poses[name] for name in spec.streams]
+    yaws = np.array([yaw_of(pose) for pose in watched])
+    column = Column(recording, spec, YAW)
+    name = rr.SeriesLines(names=["head turned to the left [degrees]"])
+    recording.log(YAW, name, static=True)
+    for columns in read_columns(log, outline.header):
+        streams = columns["stream"].astype(np.int64)
+        column.add(*columns.times(), yaws[streams][:, None])
+        turns = np.flatnonzero(np.diff(streams, prepend=watching))
+        watching = int(streams[-1])
+        if len(turns):
+            turned = rr.Transform3D.columns(
+                translation=[watched[s].position for s in streams[turns]],
+                quaternion=[watched[s].quaternion for s in streams[turns]],
+            )
+            times = time_columns(spec, columns.frames[turns], columns.iterations[turns])
+            recording.send_columns(WATCHING, times, turned)
+    column.flush()
+    white = packed_all([(255, 255, 255)])
+    arrow = rr.Arrows3D(vectors=[[-1.4 * REACH, 0, 0]], radii=[0.003], colors=white)
+    recording.log(WATCHING, arrow, static=True)
+
+
+def gaze(name: str) -> rrb.Spatial3DView:
+    """The head's poses, in the robot's root frame, seen from above and behind."""
+    return rrb.Spatial3DView(
+        origin=f"/{POSES}",
+        name=name,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            position=(0.45, 0.0, 0.75), look_target=(-0.12, 0.0, 0.24), eye_up=(0.0, 0.0, 1.0)
+        ),
+    )
