@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.signals import BlockSignals
+from replay.runs.stretches import read_stretches
 from replay.runs.writer import RunWriter
 
 START_NS = 1_451_606_400_000_000_000
@@ -134,3 +135,13 @@ def write_run(
     writer.event(iterations * tau, iterations - 1, "stopped: the test is over")
     writer.finish()
     return records
+
+
+def parts_of(run: Path, kind: str) -> list[Any]:
+    """What a run's log holds of one kind: "watched", "truth", "phi" or "events"."""
+    return [part for stretch in read_stretches(run) for part in getattr(stretch, kind)]
+
+
+def rows_of(run: Path, kind: str) -> NDArray[Any]:
+    """Everything of one kind that belongs to frames, (frames, ...)."""
+    return np.concatenate([values for _, values in parts_of(run, kind)])

@@ -16,7 +16,7 @@ from recorder.config import SceneConfig
 from recorder.recording import record
 from replay.recordings.poses import head_poses, yaw_of
 from replay.recordings.source import RecordedSource
-from replay.runs.log import read_signals
+from replay.runs.stretches import read_signals
 from replay.view.build import build_view
 
 

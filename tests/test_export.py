@@ -13,13 +13,13 @@ from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
-from replay.export import recordings as module
 from replay.export.recordings import export
+from replay.runs import stretches
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "BATCH", 7)
+    monkeypatch.setattr(stretches, "ITERATIONS", 7)
     return tmp_path, write_run(tmp_path / "run.mcap", VECTOR, 20)
 
 

@@ -13,7 +13,6 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
 from recorder.log.viewlog import Identity, ViewLog
-from replay.export import folder as folder_export
 from replay.export import images as frames
 from replay.export import videos as film
 from replay.export.recordings import export
@@ -304,8 +303,11 @@ def test_only_exports_are_replaced(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "a.py").write_text("mine")
-    with pytest.raises(UsageError, match="holds other files"), folder_export.whole_folder(out):
-        pytest.fail("the folder is not written")
+    record_images(tmp_path / "r")
+    for form in ("images", "lerobot"):
+        with pytest.raises(UsageError, match="holds other files"):
+            export(tmp_path / "r", out, form, force=True)
+    assert [p.name for p in out.iterdir()] == ["a.py"]
 
 
 def test_the_command_says_what_is_lost(cdmisfa, tmp_path):

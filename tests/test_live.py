@@ -18,7 +18,7 @@ from cdmisfa.experiments import runs
 from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings import kernels as scan
-from replay.runs.log import read_signals
+from replay.runs.stretches import read_signals
 from replay.viewer import live
 from replay.viewer import window as viewer
 from replay.viewer.live import LiveView

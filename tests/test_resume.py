@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from run_data import parts_of
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
@@ -35,7 +36,7 @@ from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
-from replay.runs.log import read_events, read_signals
+from replay.runs.stretches import read_signals
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
@@ -95,7 +96,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped:
 def test_a_run_says_that_it_was_resumed(tmp_path: Path) -> None:
     go(OscillatorySource(), tmp_path / "run", 30)
     go(OscillatorySource(), tmp_path / "run", 40, resume=True)
-    texts = [event.text for event in read_events(tmp_path / "run")]
+    texts = [event.text for event in parts_of(tmp_path / "run", "events")]
     assert "resumed at iteration 30" in texts
 
 
@@ -201,7 +202,7 @@ def test_a_log_that_lost_its_end_goes_on_from_the_older_checkpoint(
     shutil.copy(short / "run.mcap", out / "run.mcap")
     go(OscillatorySource(), out, LENGTH, resume=True)
     assert first_difference(whole, out) is None
-    assert "resumed at iteration 40" in [event.text for event in read_events(out)]
+    assert "resumed at iteration 40" in [event.text for event in parts_of(out, "events")]
 
 
 @pytest.mark.parametrize("damaged", [1, 2])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from run_data import parts_of
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
@@ -20,8 +21,8 @@ from cdmisfa.experiments.manifest import write_json
 from cdmisfa.experiments.runs import RunResult
 from cdmisfa.experiments.runs import run as run_it
 from recorder.world.oscillatory import OscillatorySource
-from replay.runs.log import read_events, read_signals
 from replay.runs.modules import load_modules
+from replay.runs.stretches import read_signals
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
 
@@ -52,7 +53,7 @@ def test_it_ends_when_every_stream_is_learned(tmp_path: Path) -> None:
     assert result.iterations == result.modules[-1].iteration + 1
     assert result.summary["epsilon"] == 1.2
     assert logged(tmp_path / "run").hexdigest() == result.signals_sha256
-    texts = [event.text for event in read_events(tmp_path / "run")]
+    texts = [event.text for event in parts_of(tmp_path / "run", "events")]
     assert texts == [
         "module 1 saved on stream x1, policy [0, 1, 1]",
         "module 2 saved on stream x2, policy [1, 0, 1]",

@@ -16,23 +16,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from run_data import IMAGE, VECTOR, run_of, signals_of, write_run
+from run_data import IMAGE, VECTOR, parts_of, rows_of, run_of, signals_of, write_run
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
 from replay.runs.folders import is_run
-from replay.runs.log import (
-    read_events,
-    read_header,
-    read_phi,
-    read_signals,
-    read_truth,
-    read_watched,
-)
+from replay.runs.log import read_header
 from replay.runs.messages import decode_matrix, decode_signals, encode_signals
 from replay.runs.modules import load_modules, save_modules
+from replay.runs.stretches import read_signals
 from replay.runs.writer import RunWriter
 
 
@@ -91,17 +85,17 @@ def test_a_run_reads_back_as_written(spec, tmp_path):
     assert header.manifest["seed"] == 0
     blocks = [block for _, block in run_of(spec, 30)]
     frames = np.concatenate([b.frames for b in blocks])
-    watched = list(read_watched(path))
-    if spec.dtype == "uint8":
-        assert [t for t, _ in watched] == list(range(0, 1200, 7))
-        assert all((image[0] == frames[t]).all() for t, image in watched)
-    else:
-        assert np.concatenate([w for _, w in watched]).tobytes() == frames.tobytes()
-    truth = list(read_truth(path))
-    assert [t for t, _ in truth] == [b.t for b in blocks]
-    assert all(v.tobytes() == b.truth.tobytes() for (_, v), b in zip(truth, blocks, strict=True))
-    assert [(t, phi[0, 0]) for t, phi in read_phi(path)] == [(0, 0.0), (400, 10.0), (800, 20.0)]
-    (event,) = read_events(path)
+    if spec.images:
+        frames = frames[::7]
+        watched = np.concatenate([at for at, _ in parts_of(path, "watched")])
+        assert watched.tolist() == list(range(0, 1200, 7))
+    assert rows_of(path, "watched").tobytes() == frames.tobytes()
+    truth = np.concatenate([at for at, _ in parts_of(path, "truth")])
+    assert truth.tolist() == list(range(1200))
+    assert rows_of(path, "truth").tobytes() == b"".join(b.truth.tobytes() for b in blocks)
+    phi = [(t, weights[0, 0]) for t, weights in parts_of(path, "phi")]
+    assert phi == [(0, 0.0), (400, 10.0), (800, 20.0)]
+    (event,) = parts_of(path, "events")
     assert (event.t, event.iteration, event.level) == (1200, 29, "INFO")
     assert event.text == "stopped: the test is over"
 

@@ -13,16 +13,17 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from run_data import VECTOR, having, write_run
+from run_data import VECTOR, having, parts_of, rows_of, write_run
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
 from cdmisfa.experiments.manifest import refuse_difference
 from replay.runs.compare import first_difference
-from replay.runs.log import read_header, read_phi, read_signals, read_truth, read_watched
+from replay.runs.log import read_header
 from replay.runs.messages import decode_signals, encode_signals
 from replay.runs.outline import read_outline
+from replay.runs.stretches import read_signals
 from replay.runs.writer import RunWriter
 from replay.view import layout
 
@@ -77,9 +78,9 @@ def test_it_can_be_shown_exported_and_drawn(cdmisfa, tmp_path) -> None:
 def written(folder: Path, records: list[BlockSignals]) -> Path:
     """The same run, as this version writes it."""
     header = read_header(OLD)
-    watched = [frames for _, frames in read_watched(OLD)]
-    truth = [values for _, values in read_truth(OLD)]
-    phi = next(values for _, values in read_phi(OLD))
+    watched = np.split(rows_of(OLD, "watched"), len(records))
+    truth = np.split(rows_of(OLD, "truth"), len(records))
+    _, phi = parts_of(OLD, "phi")[0]
     folder.mkdir()
     with RunWriter(folder / "run.mcap", header.spec, header.manifest) as writer:
         for signals, x, world in zip(records, watched, truth, strict=True):

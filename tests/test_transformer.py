@@ -7,14 +7,15 @@ import sys
 
 import numpy as np
 import pytest
+from run_data import rows_of
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments import runs
 from recorder.world.oscillatory import OscillatorySource
-from replay.runs.log import read_signals, read_watched
 from replay.runs.modules import save_modules
+from replay.runs.stretches import read_signals
 from replay.runs.transformer import SlowFeatures
 
 
@@ -29,8 +30,9 @@ def run(tmp_path_factory):
 def test_outputs_are_those_the_run_recorded(run):
     features = SlowFeatures.load(run)
     assert len(features) >= 1
-    recorded = [s.y_frozen[0] for s in read_signals(run) if len(s.y_frozen)]
-    frames = [block for _, block in read_watched(run)][-len(recorded) :]
+    records = list(read_signals(run))
+    recorded = [s.y_frozen[0] for s in records if len(s.y_frozen)]
+    frames = np.split(rows_of(run, "watched"), len(records))[-len(recorded) :]
     assert len(recorded) > 5
     for y, block in zip(recorded, frames, strict=True):
         np.testing.assert_allclose(features[0].transform(block), y, rtol=1e-9, atol=1e-9)

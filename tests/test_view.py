@@ -24,9 +24,9 @@ from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
 from recorder.config import SceneConfig
 from recorder.recording import record
-from replay.runs.log import read_signals
 from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
+from replay.runs.stretches import read_signals
 from replay.view import layout
 from replay.view import run as run_view
 from replay.view.build import build_view

@@ -14,7 +14,7 @@ from replay.mcap.records import MalformedRecord
 from replay.runs import messages as codec
 from replay.runs import stretches as stretch
 from replay.runs.columns import columns_of_messages, columns_of_records
-from replay.runs.log import read_events, read_header, read_phi, read_truth, read_watched
+from replay.runs.log import read_header
 from replay.runs.messages import decode_signals, encode_matrix, encode_signals
 from replay.runs.outline import read_outline
 from replay.runs.stretches import read_stretches
@@ -90,21 +90,26 @@ def test_a_message_is_walked_over_and_damage_is_seen():
 
 
 @pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
-def test_one_pass_reads_what_reading_each_topic_gives(tmp_path, monkeypatch, spec):
+def test_one_pass_reads_what_was_written(tmp_path, monkeypatch, spec):
     monkeypatch.setattr(stretch, "ITERATIONS", 7)
     log = tmp_path / "run.mcap"
     written = write_run(log, spec, ITERATIONS, phi_every=10)
     found = list(read_stretches(log, read_header(log)))
     assert [sum(map(len, s.signals)) for s in found] == [7, 7, 7, 7, 2]
     same((columns for s in found for columns in s.signals), written)
-    for topic, read in (("watched", read_watched), ("truth", read_truth)):
-        rows = [pair for s in found for pair in getattr(s, topic)]
-        frames = np.concatenate([t + np.arange(len(v)) for t, v in read(log)])
-        np.testing.assert_array_equal(np.concatenate([t for t, _ in rows]), frames)
-        values = np.concatenate([v for _, v in read(log)])
-        np.testing.assert_array_equal(np.concatenate([v for _, v in rows]), values)
-    assert [t for s in found for t, _ in s.phi] == [t for t, _ in read_phi(log)]
-    assert [e for s in found for e in s.events] == list(read_events(log))
+    blocks = [block for _, block in run_of(spec, ITERATIONS)]
+    frames = np.concatenate([b.frames for b in blocks])
+    every = 10 if spec.images else 1
+    for kind, step, expected in (
+        ("watched", every, frames[::every]),
+        ("truth", 1, np.concatenate([b.truth for b in blocks])),
+    ):
+        rows = [pair for s in found for pair in getattr(s, kind)]
+        times = np.concatenate([t for t, _ in rows])
+        np.testing.assert_array_equal(times, np.arange(0, len(frames), step))
+        np.testing.assert_array_equal(np.concatenate([v for _, v in rows]), expected)
+    assert [t for s in found for t, _ in s.phi] == [0, 400, 800]
+    assert [e.iteration for s in found for e in s.events] == [ITERATIONS - 1]
     some = read_stretches(log, read_header(log), every=30)
     times = [t for s in some for frames, _ in s.watched for t in frames.tolist()]
     assert times == list(range(0, ITERATIONS * 40, 30 if spec is IMAGE else 1))

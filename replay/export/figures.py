@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import partial_path
+from cdmisfa.core.errors import UsageError
+from recorder.log.whole import whole
 from replay.export.history import History, read_history
 from replay.palette import GREY, VERMILLION, Rgb, colour
 from replay.runs.folders import run_log
@@ -62,7 +61,7 @@ def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) ->
     Raises:
         UsageError: there is no such run, or a figure exists and `force` is not set.
         LogDamagedError: the run cannot be read.
-        CdmisfaError: a figure cannot be written.
+        LogWriteError: a figure cannot be written.
     """
     log = run_log(path)
     folder = Path(out) if out is not None else log.parent / FOLDER
@@ -239,18 +238,12 @@ def _css(rgb: Rgb) -> tuple[float, float, float]:
 
 def _write(figure: Figure, target: Path) -> None:
     """Write one file, whole or not at all, the same bytes every time."""
-    partial = partial_path(target)
     is_svg = target.suffix == ".svg"
     canvas: Any = FigureCanvasSVG(figure) if is_svg else FigureCanvasAgg(figure)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+    with whole(target) as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
         if is_svg:
             canvas.print_svg(partial, metadata={"Date": None})
         else:
             figure.set_dpi(150)
             canvas.print_png(partial)
-        os.replace(partial, target)
-    except OSError as error:
-        raise CdmisfaError(f"{target} cannot be written: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.signals import BlockSignals
-from replay.runs.log import read_signals, read_truth, read_watched
+from replay.runs.columns import SignalColumns, joined
+from replay.runs.log import TRUTH_TOPIC, WATCHED_TOPIC, RunHeader
 from replay.runs.outline import Saved, read_outline
+from replay.runs.stretches import Frames, read_columns, read_stretches
 
 Float = NDArray[np.float64]
 
@@ -21,6 +22,9 @@ KEPT = 20_000
 
 STRIP = 8
 """Pictures of each module."""
+
+LAST_BLOCKS = 40
+"""Blocks before the save whose output is shown with what the frozen module says later."""
 
 SHOWN = 6
 """Streams and modules that are drawn: the most watched, the first learned."""
@@ -112,93 +116,93 @@ def read_history(path: Path) -> History:
         LogDamagedError: it cannot be read.
     """
     outline = read_outline(path)
-    shown, n, width = outline.streams(SHOWN), outline.iterations, max(outline.outputs, 1)
-    stream, policy = np.zeros(n, dtype=np.int64), np.zeros((n, len(shown)), dtype=np.int64)
-    eta, eta_dot = np.zeros((n, width)), np.zeros((n, width))
-    stay, epsilon = np.full((n, len(shown)), np.nan), np.zeros(n)
-    said: dict[int, list[tuple[int, Float]]] = {}
-    learned = {s.module: s.stream for s in outline.saved[:SHOWN]}
-    for k, signals in enumerate(read_signals(path)):
-        stream[k], epsilon[k] = signals.stream, signals.epsilon
-        eta[k], eta_dot[k], policy[k] = signals.eta, signals.eta_dot, signals.policy[shown]
-        if signals.R.size:
-            stay[k] = signals.R[shown, 0, shown]
-        _listen(signals, learned, said)
-    truth = dict(read_truth(path)) if outline.header.spec.truth else {}
-    outputs = tuple(
-        _output(module, learned[module], parts, truth) for module, parts in said.items()
-    )
+    header, n, shown = outline.header, outline.iterations, outline.streams(SHOWN)
+    policy = np.zeros((n, len(shown)), dtype=np.int64)
+    stay = np.full((n, len(shown)), np.nan)
+    heard = [_Heard(save.module, save.stream) for save in outline.saved[:SHOWN]]
+    at = 0
+    for columns in read_columns(path, header):
+        rows = slice(at, at := at + len(columns))
+        policy[rows] = columns["policy"][:, shown]
+        if columns["R"].size:
+            stay[rows] = columns["R"][:, shown, 0, shown]
+        for module in heard:
+            module.add(columns)
+    truth = _truth(path, header) if header.spec.truth else None
+    outputs = tuple(module.output(truth) for module in heard if module.blocks)
+    lines = joined(read_columns(path, header), ("stream", "eta", "eta_dot", "epsilon"))
     return History(
         streams=outline.names(),
-        truth=outline.header.spec.truth,
+        truth=header.spec.truth,
         delta=outline.delta,
         saved=outline.saved,
         shown=tuple(shown),
         iterations=n,
-        stream=stream,
-        eta=eta,
-        eta_dot=eta_dot,
         stay_reward=stay,
         policy=policy,
-        epsilon=epsilon,
         outputs=outputs,
-        pictures=_pictures(path, outputs) if len(outline.header.spec.frame_shape) == 2 else (),
+        pictures=_pictures(path, header, outputs) if header.spec.images else (),
+        **lines,
     )
 
 
-def _listen(
-    signals: BlockSignals, learned: dict[int, int], said: dict[int, list[tuple[int, Float]]]
-) -> None:
-    """Keep what each module says when its own stream is watched; at its save, what it last said."""
-    for module, stream in learned.items():
-        if signals.stream != stream:
-            continue
-        if len(signals.y_frozen) >= module:
-            said.setdefault(module, []).append((signals.t, signals.y_frozen[module - 1, :, 0]))
-        elif signals.module == module and np.isfinite(signals.y).all():
-            # Before it is frozen the abstraction still changes: only its last blocks count.
-            parts = said.setdefault(module, [])
-            parts.append((signals.t, signals.y[:, 0]))
-            if not signals.saved:
-                del parts[:-LAST_BLOCKS]
+class _Heard:
+    """What a module says whenever its own stream is watched; at its save, what it last said."""
+
+    def __init__(self, module: int, stream: int) -> None:
+        self._module, self._stream = module, stream
+        self.blocks: list[tuple[int, Float]] = []
+
+    def add(self, columns: SignalColumns) -> None:
+        own, frozen = columns["stream"] == self._stream, columns["y_frozen"]
+        if frozen.shape[1] >= self._module:
+            said = frozen[own, self._module - 1, :, 0]
+            self.blocks += zip(columns.frames[own].tolist(), said, strict=True)
+            return
+        # Before it is frozen the abstraction still changes: only its last blocks count.
+        own &= (columns["module"] == self._module) & np.isfinite(columns["y"]).all(axis=(1, 2))
+        self.blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
+        del self.blocks[: -LAST_BLOCKS - int(columns["saved"][own].any())]
+
+    def output(self, truth: Frames | None) -> Output:
+        """What was heard last, with what the world knew then."""
+        blocks = self.blocks[-max(KEPT // max(len(self.blocks[0][1]), 1), 1) :]
+        t = np.concatenate([start + np.arange(len(y)) for start, y in blocks])
+        known = np.empty((len(t), 0))
+        if truth is not None:
+            frames, values = truth
+            at = np.searchsorted(frames, t)
+            if at.max() < len(frames) and (frames[at] == t).all():
+                known = values[at]
+        y = np.concatenate([y for _, y in blocks])
+        return Output(module=self._module, stream=self._stream, t=t, y=y, truth=known)
 
 
-LAST_BLOCKS = 40
-"""Blocks before the save whose output is shown with what the frozen module says later."""
+def _truth(path: Path, header: RunHeader) -> Frames | None:
+    """What the world knew at each frame that was watched."""
+    stretches = read_stretches(path, header, topics=(TRUTH_TOPIC,))
+    pieces = [piece for stretch in stretches for piece in stretch.truth]
+    if not pieces:
+        return None
+    frames, values = zip(*pieces, strict=True)
+    return np.concatenate(frames), np.concatenate(values)
 
 
-def _output(
-    module: int,
-    stream: int,
-    parts: Sequence[tuple[int, Float]],
-    truth: dict[int, Float],
-) -> Output:
-    parts = parts[-max(KEPT // max(len(parts[0][1]), 1), 1) :]
-    known = [truth[t] for t, _ in parts if t in truth]
-    whole = len(known) == len(parts)
-    t = np.concatenate([start + np.arange(len(y)) for start, y in parts])
-    return Output(
-        module=module,
-        stream=stream,
-        t=t,
-        y=np.concatenate([y for _, y in parts]),
-        truth=np.concatenate(known) if whole else np.empty((len(t), 0)),
-    )
-
-
-def _pictures(path: Path, outputs: Sequence[Output]) -> tuple[Strip, ...]:
+def _pictures(path: Path, header: RunHeader, outputs: Sequence[Output]) -> tuple[Strip, ...]:
     """Images spread over the range of each module's output."""
     wanted = {o.module: dict(zip(o.t.tolist(), o.y.tolist(), strict=True)) for o in outputs}
     found: dict[int, list[tuple[int, NDArray[Any], float]]] = {o.module: [] for o in outputs}
-    for t, images in read_watched(path):
-        for module, values in wanted.items():
-            if t in values:
-                found[module].append((t, images[0], values[t]))
+    for stretch in read_stretches(path, header, topics=(WATCHED_TOPIC,)):
+        for frames, images in stretch.watched:
+            for t, image in zip(frames.tolist(), images, strict=True):
+                for module, values in wanted.items():
+                    if t in values:
+                        found[module].append((t, image.copy(), values[t]))
     strips = []
     for output in outputs:
-        frames = sorted(found[output.module], key=lambda frame: frame[2])
-        if frames:
-            chosen = np.linspace(0, len(frames) - 1, min(STRIP, len(frames))).astype(int)
-            picked = tuple(frames[i] for i in chosen)
+        shown = sorted(found[output.module], key=lambda frame: frame[2])
+        if shown:
+            chosen = np.linspace(0, len(shown) - 1, min(STRIP, len(shown))).astype(int)
+            picked = tuple(shown[i] for i in chosen)
             strips.append(Strip(output.module, output.stream, picked))
     return tuple(strips)

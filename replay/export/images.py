@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from cdmisfa.core.errors import UsageError
 from replay.recordings.source import RecordedSource
 
 PIECE = 1000
@@ -24,21 +25,6 @@ PIECE_BYTES = 64 * 2**20
 _UNSAFE = re.compile(r"[^\w.-]|^\.")
 
 
-def has_images(spec: SourceSpec) -> bool:
-    """Whether frames are gray images, and not values."""
-    return spec.dtype == "uint8" and len(spec.frame_shape) == 2
-
-
-def check_images(source: RecordedSource, path: Path) -> None:
-    """Refuse a recording of values.
-
-    Raises:
-        UsageError: it is one.
-    """
-    if not has_images(source.spec):
-        raise UsageError(f"{path} holds no images: its frames are values")
-
-
 def pieces(source: RecordedSource, stream: int) -> Iterator[Block]:
     """Every frame of one view, in order.
 
@@ -46,8 +32,8 @@ def pieces(source: RecordedSource, stream: int) -> Iterator[Block]:
         source: a recording; its clock is moved.
         stream: the view.
     """
-    shape = source.spec.frame_shape
-    size = max(1, min(PIECE, PIECE_BYTES // max(1, _bytes(shape, source.spec.dtype))))
+    frame = math.prod(source.spec.frame_shape) * np.dtype(source.spec.dtype).itemsize
+    size = max(1, min(PIECE, PIECE_BYTES // max(1, frame)))
     first, end = source.first_frame, source.first_frame + source.frames
     for t in range(first, end, size):
         source.seek(t)
@@ -82,10 +68,3 @@ def write_images(source: RecordedSource, folder: Path) -> int:
 
 def _save(frame: NDArray[Any], file: Path) -> None:
     Image.fromarray(frame).save(file)
-
-
-def _bytes(shape: tuple[int, ...], dtype: str) -> int:
-    count = 1 if dtype == "uint8" else 8
-    for size in shape:
-        count *= size
-    return count

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.export.images import has_images, pieces, view_names
+from replay.export.images import pieces, view_names
 from replay.export.videos import write_film
 from replay.recordings.source import RecordedSource
 
@@ -79,7 +79,7 @@ def write_lerobot(
         )
     columns, features = _columns(source, fps)
     stats = {key: _number_stats(column) for key, column in columns.items()}
-    if has_images(source.spec):
+    if source.spec.images:
         for stream, view in enumerate(view_names(source.spec)):
             key = f"observation.images.{view}"
             file = _place(folder / "videos" / key, "mp4")
@@ -115,7 +115,7 @@ def _columns(
     if spec.truth:
         truth = np.concatenate([block.truth for block in pieces(source, 0)])
         add(STATE, truth.astype(np.float32), list(spec.truth))
-    if not has_images(spec):
+    if not spec.images:
         for stream, view in enumerate(view_names(spec)):
             frames = np.concatenate([block.frames for block in pieces(source, stream)])
             names = [f"x{i + 1}" for i in range(frames.shape[1])]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.signals import SIGNALS, BlockSignals
+from cdmisfa.core.signals import SIGNALS, BlockSignals, Signal
 from replay.mcap.records import MalformedRecord
 from replay.runs.messages import NUMBERS
 from replay.runs.wire import Span, alike, column, spans
@@ -49,12 +49,39 @@ class SignalColumns:
         """Frames of a block."""
         return int(self.values["y"].shape[1])
 
+    def rows(self, start: int, stop: int) -> SignalColumns:
+        """The records [start, stop) of these."""
+        return SignalColumns({name: value[start:stop] for name, value in self.values.items()})
+
+    def records(self) -> Iterator[BlockSignals]:
+        """The records one by one."""
+        values = (self.values[name] for name in SIGNALS)
+        yield from map(BlockSignals, *(v.tolist() if v.ndim == 1 else v for v in values))
+
     def times(self, per_frame: bool = False) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Frames and iterations of the rows: one a record, or one a frame of it."""
         if not per_frame:
             return self.frames, self.iterations
         every = (self.frames[:, None] + np.arange(self.tau)).reshape(-1)
         return every, np.repeat(self.iterations, self.tau)
+
+
+def joined(pieces: Iterable[SignalColumns], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Some signals of all records, (n, *dims) each; NaN for modules that were not there yet."""
+    found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    for piece in pieces:
+        for name, parts in found.items():
+            parts.append(piece[name])
+    return {name: _concatenated(SIGNALS[name], found.pop(name)) for name in names}
+
+
+def padded(signal: Signal, values: NDArray[Any], modules: int) -> NDArray[Any]:
+    """(n, *dims) values with NaN for modules that were not there yet."""
+    if not signal.dims.startswith("M") or values.shape[1] == modules:
+        return values
+    whole = np.full((len(values), modules, *values.shape[2:]), np.nan)
+    whole[:, : values.shape[1]] = values
+    return whole
 
 
 def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumns]:
@@ -113,6 +140,13 @@ def _at_once(messages: Sequence[bytes], first: BlockSignals) -> SignalColumns | 
             found = found.astype(bool)
         values[signal.name] = found.reshape(shape)
     return SignalColumns(values)
+
+
+def _concatenated(signal: Signal, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    if not parts:
+        return np.empty((0,) * (1 + len(signal.dims)), dtype=signal.dtype)
+    most = max(part.shape[1] for part in parts) if signal.dims else 0
+    return np.concatenate([padded(signal, part, most) for part in parts])
 
 
 def _shapes(signals: BlockSignals) -> tuple[tuple[int, ...], ...]:

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.signals import BlockSignals, canonical_bytes, values
+from cdmisfa.core.signals import SIGNALS
+from replay.runs.columns import SignalColumns
 from replay.runs.folders import run_log
-from replay.runs.log import RunHeader, read_header, read_signals
+from replay.runs.log import RunHeader, read_header
 from replay.runs.outline import Outline, read_outline
+from replay.runs.stretches import read_columns
 
-Pair = tuple[BlockSignals | None, BlockSignals | None]
+Pair = tuple[SignalColumns | None, SignalColumns | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,47 +86,72 @@ def first_difference(
     """
     a, b = headers or (read_header(first), read_header(second))
     versions = a.schema, b.schema
-    pairs = zip_longest(read_signals(first, a), read_signals(second, b))
-    found = _first_of(pairs, min(versions))
+    pieces = _together(read_columns(first, a), read_columns(second, b))
+    found = next(_differences(pieces, min(versions)), None)
     if versions[0] == versions[1]:
         return found
     found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
     return replace(found, versions=versions)
 
 
-def _first_of(pairs: Iterable[Pair], version: int) -> Difference | None:
-    """The first difference among the signals of a version of the record."""
-    for iteration, (a, b) in enumerate(pairs):
+def _together(first: Iterator[SignalColumns], second: Iterator[SignalColumns]) -> Iterator[Pair]:
+    """The records of two runs in pieces of one length; None where one has ended."""
+    a = b = None
+    while True:
+        a, b = a or next(first, None), b or next(second, None)
         if a is None or b is None:
+            yield a, b
+            return
+        n = min(len(a), len(b))
+        yield a.rows(0, n), b.rows(0, n)
+        a, b = a.rows(n, len(a)), b.rows(n, len(b))
+
+
+def _differences(pieces: Iterable[Pair], version: int) -> Iterator[Difference]:
+    """The first difference in each pair among the signals of a version of the record."""
+    iteration = 0
+    for a, b in pieces:
+        if a is not None and b is not None:
+            if (found := _difference(iteration, a, b, version)) is not None:
+                yield found
+            iteration += len(a)
+        elif a is not None or b is not None:
             ended, more = f"ended after {iteration} iterations", "goes on"
-            return Difference(
+            yield Difference(
                 iteration, "", (), ended if a is None else more, ended if b is None else more
             )
-        if canonical_bytes(a, version) != canonical_bytes(b, version):
-            return _difference(iteration, a, b, version)
-    return None
 
 
-def _difference(iteration: int, a: BlockSignals, b: BlockSignals, version: int) -> Difference:
-    for (signal, x), (_, y) in zip(values(a, version), values(b, version), strict=True):
-        if x.shape != y.shape:
-            return Difference(
-                iteration, signal.name, (), f"of shape {x.shape}", f"of shape {y.shape}"
-            )
-        differs = np.flatnonzero(_differ(x, y))
-        if len(differs):
-            place = tuple(int(i) for i in np.unravel_index(differs[0], x.shape))
-            return Difference(iteration, signal.name, place, _text(x[place]), _text(y[place]))
-    raise AssertionError("records with different bytes have the same values")
+def _difference(
+    iteration: int, a: SignalColumns, b: SignalColumns, version: int
+) -> Difference | None:
+    """The first difference between as many records of each run, from an iteration on."""
+    rows = {s.name: _row(a[s.name], b[s.name]) for s in SIGNALS.values() if s.since <= version}
+    name = min(rows, key=rows.__getitem__)
+    if rows[name] == len(a):
+        return None
+    at = iteration + rows[name]
+    x, y = a[name][rows[name]], b[name][rows[name]]
+    if x.shape != y.shape:
+        return Difference(at, name, (), f"of shape {x.shape}", f"of shape {y.shape}")
+    place = tuple(int(i) for i in np.argwhere(_differ(x, y))[0])
+    return Difference(at, name, place, _text(x[place]), _text(y[place]))
+
+
+def _row(x: NDArray[Any], y: NDArray[Any]) -> int:
+    """The first row in which two columns differ, their length where there is none."""
+    if x.shape != y.shape:
+        return 0
+    differ = _differ(x, y)
+    return int(np.argmax(differ.reshape(len(x), -1).any(axis=1))) if differ.any() else len(x)
 
 
 def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where two arrays differ in a bit, (size,); one NaN is as good as another."""
-    both_nan = np.ravel(np.isnan(x) & np.isnan(y))
+    """Where two arrays of one shape differ in a bit; one NaN is as good as another."""
     width = np.dtype(f"u{x.dtype.itemsize}")
-    bits = [np.ascontiguousarray(value).view(width).reshape(-1) for value in (x, y)]
-    differ: NDArray[np.bool_] = (bits[0] != bits[1]) & ~both_nan
-    return differ
+    first, second = (np.ascontiguousarray(value).view(width) for value in (x, y))
+    differ: NDArray[np.bool_] = (first != second).reshape(x.shape)
+    return differ & ~(np.isnan(x) & np.isnan(y)) if differ.any() else differ
 
 
 def _text(value: Any) -> str:

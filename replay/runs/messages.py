@@ -174,6 +174,15 @@ def decode_signals(
     return BlockSignals(**fields)
 
 
+def iteration_of(data: bytes, where: str = "record") -> int:
+    """The iteration of the record in the bytes of a message.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message.
+    """
+    return int(_parsed(_SIGNALS, data, where).iteration)
+
+
 def _parsed(kind: Any, data: bytes, where: str) -> Any:
     try:
         return kind.FromString(data)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay.runs.columns import SignalColumns
-from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header
 from replay.runs.stretches import read_columns
 
@@ -182,9 +181,8 @@ def read_outline(path: Path) -> Outline:
         UsageError: there is no such run.
         LogDamagedError: it cannot be read.
     """
-    log = run_log(path)
-    tally = Tally(read_header(log))
-    for columns in read_columns(log, tally.header):
+    tally = Tally(read_header(path))
+    for columns in read_columns(path, tally.header):
         tally.add(columns)
     return tally.outline()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -9,13 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.signals import BlockSignals
 from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
 from replay.runs.columns import SignalColumns, columns_of_messages
+from replay.runs.folders import run_log
 from replay.runs.log import (
     EVENT_TOPIC,
     PHI_TOPIC,
@@ -24,9 +29,7 @@ from replay.runs.log import (
     WATCHED_TOPIC,
     Event,
     RunHeader,
-    decode_event,
-    decode_image,
-    reshaped,
+    read_header,
 )
 from replay.runs.messages import decode_matrix, decode_signals
 from replay.runs.wire import alike, column, spans
@@ -43,6 +46,7 @@ Frames = tuple[NDArray[np.int64], NDArray[Any]]
 """(n,) frames and (n, ...) what belongs to them."""
 
 _T, _VALUES = 1, 3  # fields of a matrix message
+_ITERATION = re.compile(r"iteration (\d{1,18})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,60 +69,70 @@ class Stretch:
 
 
 def read_stretches(
-    log: Path, header: RunHeader, *, every: int = 1, topics: Sequence[str] = TOPICS
+    path: Path,
+    header: RunHeader | None = None,
+    *,
+    every: int = 1,
+    topics: Sequence[str] = TOPICS,
 ) -> Iterator[Stretch]:
     """Read a run's log from the beginning to the end, once.
 
     Args:
-        log: the file.
-        header: what stands at its beginning.
+        path: the run's folder, or its log.
+        header: what stands at the beginning of its log, where that was read already.
         every: decode images of every this many frames only.
         topics: what is wanted of it.
 
     Raises:
+        UsageError: there is no such run, or it is of a later version of this software.
         LogDamagedError: a message is damaged, or a finished file is cut short.
     """
-    kept = _Kept(log, header, every)
+    log = run_log(path)
+    waiting = _Waiting(log, header or read_header(log))
+    spec = waiting.header.spec
     with LogReader(log) as reader:
         wanted = {number: c.topic for number, c in reader.channels.items() if c.topic in topics}
         for _, table in reader.tables(ordered=False):
             data = memoryview(table.data.data)
-            for number, log_time, at, size in zip(
+            for number, t, at, size in zip(
                 table.channel.tolist(),
-                table.log_time.tolist(),
+                spec.frames_at(table.log_time).tolist(),
                 table.at.tolist(),
                 table.size.tolist(),
                 strict=True,
             ):
                 topic = wanted.get(number)
-                if topic is None:
+                if topic is None or (topic == WATCHED_TOPIC and spec.images and t % every):
                     continue
-                if kept.full(topic):
-                    yield kept.stretch()
-                kept.add(topic, log_time, data[at : at + size])
-        yield kept.stretch()
+                if waiting.full(topic):
+                    yield waiting.stretch()
+                waiting.add(topic, t, bytes(data[at : at + size]))
+        yield waiting.stretch()
         if not reader.complete and not log.name.endswith(PARTIAL):
             raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")
 
 
-def read_columns(log: Path, header: RunHeader) -> Iterator[SignalColumns]:
-    """Every record of a run, in order, as arrays.
-
-    Raises:
-        LogDamagedError: a record is damaged, or a finished file is cut short.
-    """
-    for stretch in read_stretches(log, header, topics=(SIGNALS_TOPIC,)):
+def read_columns(path: Path, header: RunHeader | None = None) -> Iterator[SignalColumns]:
+    """Every record of a run, in order, as arrays; see `read_stretches`."""
+    for stretch in read_stretches(path, header, topics=(SIGNALS_TOPIC,)):
         yield from stretch.signals
 
 
-class _Kept:
+def read_signals(path: Path, header: RunHeader | None = None) -> Iterator[BlockSignals]:
+    """Every record of a run, in order, one by one; see `read_stretches`."""
+    for columns in read_columns(path, header):
+        yield from columns.records()
+
+
+class _Waiting:
     """Messages that wait to be decoded together."""
 
-    def __init__(self, log: Path, header: RunHeader, every: int) -> None:
+    def __init__(self, log: Path, header: RunHeader) -> None:
+        self.header = header
         self._log = log
-        self._header = header
-        self._every = every
-        self._images = header.spec.images
+        self._empty()
+
+    def _empty(self) -> None:
         self._data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self._frames: dict[str, list[int]] = {topic: [] for topic in TOPICS}
         self._bytes = 0
@@ -129,62 +143,53 @@ class _Kept:
             return self._bytes >= 4 * MAX_BYTES
         return self._bytes >= MAX_BYTES or len(self._data[topic]) >= ITERATIONS
 
-    def add(self, topic: str, log_time: int, data: memoryview) -> None:
-        if topic == EVENT_TOPIC or (topic == WATCHED_TOPIC and self._images):
-            t = self._header.frame_at(log_time)
-            if topic == WATCHED_TOPIC and t % self._every:
-                return
-            self._frames[topic].append(t)
-        self._data[topic].append(bytes(data))
+    def add(self, topic: str, t: int, data: bytes) -> None:
+        self._data[topic].append(data)
+        self._frames[topic].append(t)
         self._bytes += len(data)
 
     def stretch(self) -> Stretch:
         """What waits, decoded; nothing waits any longer."""
-        data, frames, log = self._data, self._frames, self._log
-        self._data = {topic: [] for topic in TOPICS}
-        self._frames = {topic: [] for topic in TOPICS}
-        self._bytes = 0
-        spec = self._header.spec
-        if self._images:
-            watched = self._pictures(frames[WATCHED_TOPIC], data[WATCHED_TOPIC])
-        else:
-            watched = self._matrices(WATCHED_TOPIC, data, spec.frame_shape)
-        events = zip(data[EVENT_TOPIC], frames[EVENT_TOPIC], strict=True)
-        return Stretch(
-            signals=self._records(data[SIGNALS_TOPIC]),
+        log, spec, data = self._log, self.header.spec, self._data
+        watched = self._pictures() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
+        events = zip(data[EVENT_TOPIC], self._frames[EVENT_TOPIC], strict=True)
+        stretch = Stretch(
+            signals=self._records(),
             watched=watched,
-            truth=self._matrices(TRUTH_TOPIC, data, (len(spec.truth),)),
+            truth=self._rows(TRUTH_TOPIC, (len(spec.truth),)),
             phi=tuple(decode_matrix(d, f"{log} {PHI_TOPIC}") for d in data[PHI_TOPIC]),
-            events=tuple(decode_event(d, t, log) for d, t in events),
+            events=tuple(_event(d, t, log) for d, t in events),
         )
+        self._empty()
+        return stretch
 
-    def _records(self, data: list[bytes]) -> tuple[SignalColumns, ...]:
-        where = f"{self._log} {SIGNALS_TOPIC}"
-        version = self._header.schema
-        found = columns_of_messages(data, lambda d: decode_signals(d, where, version))
-        streams = len(self._header.spec.streams)
+    def _records(self) -> tuple[SignalColumns, ...]:
+        where, version = f"{self._log} {SIGNALS_TOPIC}", self.header.schema
+        found = columns_of_messages(
+            self._data[SIGNALS_TOPIC], lambda d: decode_signals(d, where, version)
+        )
+        streams = len(self.header.spec.streams)
         return tuple(_checked(columns, streams, where) for columns in found)
 
-    def _pictures(self, frames: list[int], data: list[bytes]) -> tuple[Frames, ...]:
+    def _pictures(self) -> tuple[Frames, ...]:
+        data = self._data[WATCHED_TOPIC]
         if not data:
             return ()
-        shape = self._header.spec.frame_shape
+        shape = self.header.spec.frame_shape
         pixels = np.empty((len(data), *shape), dtype=np.uint8)
         for place, entry in zip(pixels, data, strict=True):
-            place[:] = decode_image(entry, shape, self._log)
-        return ((np.array(frames, dtype=np.int64), pixels),)
+            place[:] = _image(entry, shape, self._log)
+        return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), pixels),)
 
-    def _matrices(
-        self, topic: str, data: dict[str, list[bytes]], shape: tuple[int, ...]
-    ) -> tuple[Frames, ...]:
+    def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
         """Rows of matrix messages with a frame each, all of one size together."""
 
         def decode(entry: bytes) -> tuple[int, NDArray[np.float64]]:
             return decode_matrix(entry, f"{self._log} {topic}")
 
         return tuple(
-            (frames, reshaped(values, (-1, *shape), self._log))
-            for _, group in groupby(data[topic], key=len)
+            (frames, _reshaped(values, (-1, *shape), self._log))
+            for _, group in groupby(self._data[topic], key=len)
             for frames, values in _rows(list(group), decode)
         )
 
@@ -223,6 +228,47 @@ def _rows(
         values = column(table, known[1], "<f8").reshape(-1, *first.shape)
         yield (begins + np.arange(len(first))).reshape(-1), values.reshape(-1, first.shape[1])
         return
-    for message in messages:
-        t, rows = decode(message)
+    for data in messages:
+        t, rows = decode(data)
         yield t + np.arange(len(rows)), rows
+
+
+def _event(data: bytes, t: int, log: Path) -> Event:
+    """What happened at frame t, in the bytes of its message.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message.
+    """
+    try:
+        entry = Log_pb2.Log.FromString(data)
+    except DecodeError as error:
+        raise LogDamagedError(f"{log} {EVENT_TOPIC}: not a foxglove.Log message") from error
+    match = _ITERATION.fullmatch(entry.name)
+    level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
+    return Event(t, int(match[1]) if match else -1, entry.message, level)
+
+
+def _image(data: bytes, shape: tuple[int, ...], log: Path) -> NDArray[np.uint8]:
+    """The watched (height, width) image in the bytes of its message.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message, or of another size.
+    """
+    try:
+        pixels = RawImage_pb2.RawImage.FromString(data).data
+    except DecodeError as error:
+        raise LogDamagedError(f"{log} {WATCHED_TOPIC}: not a foxglove.RawImage") from error
+    image: NDArray[np.uint8] = _reshaped(np.frombuffer(pixels, np.uint8), shape, log)
+    return image
+
+
+def _reshaped(values: NDArray[Any], shape: tuple[int, ...], log: Path) -> NDArray[Any]:
+    """Values in another shape.
+
+    Raises:
+        LogDamagedError: they do not fill it.
+    """
+    try:
+        return values.reshape(shape)
+    except ValueError as error:
+        raise LogDamagedError(f"{log}: {values.size} values do not fill {shape}") from error

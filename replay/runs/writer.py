@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +18,7 @@ from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
 from replay.mcap.reader import LogReader
+from replay.runs.columns import columns_of_messages
 from replay.runs.folders import METADATA
 from replay.runs.log import EVENT_TOPIC, PHI_TOPIC, SIGNALS_TOPIC, TRUTH_TOPIC, WATCHED_TOPIC
 from replay.runs.messages import (
@@ -27,6 +28,7 @@ from replay.runs.messages import (
     decode_signals,
     encode_matrix,
     encode_signals,
+    iteration_of,
 )
 
 NEVER_NS = 2**62
@@ -34,6 +36,9 @@ NEVER_NS = 2**62
 
 CHUNK_BYTES = 1024 * 1024
 """Size at which a chunk of the log is closed."""
+
+TOGETHER = 500
+"""Records that are decoded at once."""
 
 FLUSH_SECONDS = 1.0
 """Longest time for which something that was written waits for the operating system."""
@@ -140,7 +145,7 @@ class RunWriter(Sink):
     def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
         """Copy what another log of the same run holds of its first iterations.
 
-        Messages are copied as they are, so a run that goes on keeps its past bit for bit.
+        Messages are copied as they are, so a run that is resumed keeps its past bit for bit.
 
         Args:
             log: the log to copy from.
@@ -149,16 +154,19 @@ class RunWriter(Sink):
         Yields:
             The signals that were copied, in order.
         """
+        where, taken = f"{log} {SIGNALS_TOPIC}", list[bytes]()
         with LogReader(log) as reader:
             for entry in reader.messages(self._channels, ordered=False):
-                topic, signals = entry.channel.topic, None
+                topic = entry.channel.topic
                 if topic == SIGNALS_TOPIC:
-                    signals = decode_signals(entry.data, f"{log} {topic}")
-                    if signals.iteration >= iterations:
-                        return
+                    if iteration_of(entry.data, where) >= iterations:
+                        break
+                    taken.append(entry.data)
                 self._log.write(self._channels[topic], entry.log_time, entry.data, entry.sequence)
-                if signals is not None:
-                    yield signals
+                if len(taken) >= TOGETHER:
+                    yield from _records(taken, where)
+                    taken = []
+        yield from _records(taken, where)
 
     def flush(self) -> None:
         """Hand everything written so far to the operating system."""
@@ -190,3 +198,8 @@ class RunWriter(Sink):
 
     def _write(self, topic: str, at: int, iteration: int, data: bytes) -> None:
         self._log.write(self._channels[topic], at, data, iteration & 0xFFFFFFFF)
+
+
+def _records(messages: Sequence[bytes], where: str) -> Iterator[BlockSignals]:
+    for columns in columns_of_messages(messages, lambda data: decode_signals(data, where)):
+        yield from columns.records()

@@ -17,7 +17,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import partial_path
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import is_run
-from replay.runs.log import read_signals
+from replay.runs.stretches import read_signals
 from replay.view.build import build_view
 from replay.view.columns import FRAME
 from replay.viewer.program import (

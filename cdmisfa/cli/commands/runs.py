@@ -99,7 +99,8 @@ def export_command(
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0.
     """
-    from replay.export.recordings import CSV_LEAVES_OUT, RECORDINGS, export
+    from replay.export.recordings import RECORDINGS, export
+    from replay.export.tables import CSV_LEAVES_OUT
 
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")

@@ -1,0 +1,191 @@
+"""A run's signals as a table that other tools read: a row an iteration, a column a signal.
+
+Every table is made from the one table of signals. Parquet and Arrow carry each signal's
+symbol, equation, unit and dimensions as the column's metadata, and the run's configuration as
+the table's; npz has both as JSON in the arrays `_signals` and `_run`, CSV in a file beside it as
+the W3C's "CSV on the Web" has it.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.signals import SIGNALS, Signal
+from recorder.log.whole import whole
+from replay.runs.columns import joined, padded
+from replay.runs.log import RunHeader, read_header
+from replay.runs.stretches import read_columns
+
+CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
+"""Signals of every frame, for which a row an iteration has no room."""
+
+_ARROW = {"float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_()}
+_CSV = {"float64": "double", "int64": "integer", "bool": "boolean"}
+
+
+def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> int:
+    """Write a run's signals to a file.
+
+    Args:
+        run: the run.
+        out: the file.
+        form: one of `TABLES`. CSV leaves out the outputs frame by frame; npz fills arrays
+            that grow with the modules up with NaN.
+        force: replace an existing file of notes beside a CSV file.
+
+    Returns:
+        The number of iterations.
+
+    Raises:
+        UsageError: no such run, or the notes exist and `force` is not set.
+        LogDamagedError: the run cannot be read.
+        LogWriteError: the file cannot be written.
+    """
+    header, notes = read_header(run), csv_notes(out)
+    if form == "csv" and notes.exists() and not force:
+        raise UsageError(f"{notes} exists: choose another name or overwrite with --force")
+    with whole(out) as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        if form != "csv":
+            return _WRITERS[form](run, header, partial)
+        with whole(notes) as about:
+            columns, rows = _write_csv(run, header, partial)
+            about.write_text(json.dumps(_notes(out, header, columns), indent=1), "utf-8")
+        return rows
+
+
+def csv_notes(out: Path) -> Path:
+    """The file that says what a CSV file's columns are."""
+    return out.with_name(f"{out.name}-metadata.json")
+
+
+def arrow_schema(header: RunHeader) -> pa.Schema:
+    """The table's columns, nested one list a dimension, with what each signal is."""
+    fields = []
+    for signal in SIGNALS.values():
+        kind = _ARROW[signal.dtype]
+        for _ in signal.dims:
+            kind = pa.list_(kind)
+        fields.append(pa.field(signal.name, kind, nullable=False, metadata=_about(signal)))
+    about = {f"cdmisfa.{name}": value for name, value in _run(header).items()}
+    return pa.schema(fields, metadata=about)
+
+
+def _about(signal: Signal) -> dict[str, str]:
+    """What a signal is, without how a viewer shows it."""
+    return {name: str(value) for name, value in asdict(signal).items() if name != "show"}
+
+
+def _run(header: RunHeader) -> dict[str, str]:
+    """What run it is, as JSON."""
+    return {
+        "schema": str(header.schema),
+        "spec": json.dumps(asdict(header.spec)),
+        "manifest": json.dumps(header.manifest),
+    }
+
+
+def _nested(values: NDArray[Any]) -> pa.Array:
+    """(n, ...) values as n rows of nested lists."""
+    array: pa.Array = pa.array(values.reshape(-1))
+    for dim in range(values.ndim - 1, 0, -1):
+        lists = math.prod(values.shape[:dim])
+        offsets = np.arange(lists + 1, dtype=np.int32) * values.shape[dim]
+        array = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), array)
+    return array
+
+
+def _write_parquet(run: Path, header: RunHeader, out: Path) -> int:
+    schema = arrow_schema(header)
+    with pq.ParquetWriter(out, schema, compression="zstd") as writer:
+        return _write_batches(run, header, schema, writer)
+
+
+def _write_arrow(run: Path, header: RunHeader, out: Path) -> int:
+    schema = arrow_schema(header)
+    with pa.OSFile(str(out), "wb") as file, pa.ipc.new_file(file, schema) as writer:
+        return _write_batches(run, header, schema, writer)
+
+
+def _write_batches(run: Path, header: RunHeader, schema: pa.Schema, writer: Any) -> int:
+    rows = 0
+    for piece in read_columns(run, header):
+        arrays = [_nested(piece[name]) for name in SIGNALS]
+        writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
+        rows += len(piece)
+    return rows
+
+
+def _write_npz(run: Path, header: RunHeader, out: Path) -> int:
+    arrays = joined(read_columns(run, header), tuple(SIGNALS))
+    about = {name: _about(signal) for name, signal in SIGNALS.items()}
+    notes = {"_signals": np.array(json.dumps(about)), "_run": np.array(json.dumps(_run(header)))}
+    with open(out, "wb") as file:
+        np.savez_compressed(file, **arrays, **notes)  # type: ignore[arg-type]
+    return len(arrays["iteration"])
+
+
+_WRITERS = {"parquet": _write_parquet, "npz": _write_npz, "arrow": _write_arrow}
+
+TABLES = ("csv", *_WRITERS)
+"""What a run's signals can be written as."""
+
+
+def _write_csv(run: Path, header: RunHeader, out: Path) -> tuple[list[tuple[str, Signal]], int]:
+    """Write the table; its columns with their signals, and how many rows."""
+    signals = [s for s in SIGNALS.values() if s.name not in CSV_LEAVES_OUT]
+    modules = max((piece["band_sd"].shape[1] for piece in read_columns(run, header)), default=0)
+    columns: list[tuple[str, Signal]] = []
+    rows = 0
+    with open(out, "w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        for piece in read_columns(run, header):
+            cells = [padded(signal, piece[signal.name], modules) for signal in signals]
+            if not rows:
+                for signal, values in zip(signals, cells, strict=True):
+                    places = np.ndindex(values.shape[1:])
+                    columns += [(signal.name + _place(place), signal) for place in places]
+                writer.writerow(title for title, _ in columns)
+            lists = (values.reshape(len(piece), -1).tolist() for values in cells)
+            writer.writerows(map(chain.from_iterable, zip(*lists, strict=True)))
+            rows += len(piece)
+    return columns, rows
+
+
+def _notes(out: Path, header: RunHeader, columns: list[tuple[str, Signal]]) -> dict[str, Any]:
+    """What the columns of a CSV file are, and of what run, for "CSV on the Web"."""
+    described = [
+        {
+            "titles": title,
+            "datatype": _CSV[signal.dtype],
+            "dc:description": signal.about,
+            "schema:alternateName": signal.symbol,
+            "schema:unitText": signal.unit,
+        }
+        for title, signal in columns
+    ]
+    return {
+        "@context": "http://www.w3.org/ns/csvw",
+        "url": out.name,
+        "tableSchema": {"columns": described},
+        "notes": [
+            {"signals": {signal.name: _about(signal) for _, signal in columns}},
+            {"run": _run(header)},
+        ],
+    }
+
+
+def _place(index: tuple[int, ...]) -> str:
+    return f"[{','.join(map(str, index))}]" if index else ""

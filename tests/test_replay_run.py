@@ -1,0 +1,67 @@
+"""`replay.Run` gives what a run left behind, and reads no more than it is asked for."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from run_data import VECTOR, write_run
+
+import replay
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.signals import SIGNALS
+from replay.runs import run as module
+
+ITERATIONS = 20
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path, write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS, saves=True)
+
+
+def test_signals_are_columns_over_all_iterations(folder):
+    path, records = folder
+    run = replay.Run(path)
+    assert run.streams == VECTOR.streams
+    assert set(run.signals) == set(SIGNALS)
+    for name, signal in SIGNALS.items():
+        column = run.signals[name]
+        assert (column.dtype, len(column)) == (np.dtype(signal.dtype), ITERATIONS)
+        for k, record in enumerate(records):
+            expected = np.asarray(getattr(record, name))
+            inner = tuple(slice(size) for size in expected.shape)
+            np.testing.assert_array_equal(column[k][inner], expected)
+            if signal.dims.startswith("M"):
+                assert np.isnan(column[k][len(expected) :]).all()
+
+
+def test_nothing_is_read_before_it_is_asked_for(folder, monkeypatch):
+    passes = []
+    read = module.read_columns
+    monkeypatch.setattr(module, "read_columns", lambda *a: passes.append(a) or read(*a))
+    run = replay.Run(folder[0])
+    assert passes == []
+    assert run.signals["eta"] is run.signals["eta"]
+    assert len(passes) == 1
+    assert "etta" not in run.signals
+
+
+def test_a_run_without_iterations_has_empty_columns(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 0)
+    assert replay.Run(tmp_path).signals["y_frozen"].shape == (0, 0, 0, 0)
+
+
+def test_the_result_is_there_once_the_run_has_ended(folder):
+    path, _ = folder
+    assert replay.Run(path).result is None
+    (path / "run.json").write_text(json.dumps({"result": {"iterations": ITERATIONS}}))
+    assert replay.Run(path / "run.mcap").result == {"iterations": ITERATIONS}
+    (path / "run.json").write_text("{")
+    assert replay.Run(path).result is None
+
+
+def test_what_is_no_run_is_refused_at_once(tmp_path):
+    with pytest.raises(UsageError, match="holds no run"):
+        replay.Run(tmp_path)
