@@ -39,6 +39,42 @@ def test_export_writes_no_file_named_dash(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("learn", "oscillatory", "--max-iterations", 3, "-o"),
+        ("record", "oscillatory", "--frames", 20, "-o"),
+        ("record", "icub", "--scene-picture"),
+        ("convert", "no.mcap", "-o"),
+        ("sweep", "oscillatory", "--seeds", 0, "--max-iterations", 3, "-o"),
+        ("export", "RUN", "--to", "csv", "-o"),
+        ("recover", "RUN/run.mcap", "-o"),
+        ("plot", "RUN", "-o"),
+        ("reproduce", "stability", "--trials", 1, "-o"),
+        ("reproduce", "--page"),
+        ("demo", "--frames", 400, "-o"),
+        ("view", "RUN", "--save"),
+        ("view", "RUN", "--screenshot"),
+        ("compare", "RUN", "RUN", "--save"),
+    ],
+    ids=lambda words: f"{words[0]} {words[-1]}",
+)
+@pytest.mark.parametrize("url", ["s3://bucket/there", "https://there.org/x"])
+def test_what_is_written_goes_nowhere_but_to_this_machine(
+    cdmisfa: Cdmisfa,
+    oscillatory_run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    url: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = cdmisfa(*(str(word).replace("RUN", str(oscillatory_run)) for word in words), url)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert f"{url} is a URL: name a path on this machine" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", ["y.csv", "y.parquet"])
 def test_export_makes_its_folders(
     cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, name: str

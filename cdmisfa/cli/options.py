@@ -23,6 +23,20 @@ SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
 
 
+class WrittenPath(click.Path):
+    """A path to write at, which is on this machine: a URL would become a folder `s3:`."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        if "://" in str(value):
+            self.fail(f"{value} is a URL: name a path on this machine", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+OUT = WrittenPath(path_type=Path)
+"""Type of every option that says where something is written."""
+
+
 def as_json(command: Command) -> Command:
     """`--json`: one JSON document on stdout instead of words."""
     return click.option(
@@ -68,9 +82,7 @@ def force(command: Command) -> Command:
 
 def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:
     """`-o`: where the result goes."""
-    return click.option(
-        "-o", "--out", type=click.Path(path_type=Path), required=required, help=meaning
-    )
+    return click.option("-o", "--out", type=OUT, required=required, help=meaning)
 
 
 def jobs(command: Command) -> Command:

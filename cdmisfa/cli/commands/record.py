@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @options.settings
 @click.option(
     "--scene-picture",
-    type=click.Path(path_type=Path),
+    type=options.OUT,
     metavar="F.png",
     help="Draw the scene from outside instead of recording it.",
 )

@@ -28,9 +28,7 @@ from cdmisfa.cli.progress import Bar, bar
 @click.option("--scheduler", metavar="ADDRESS", help="Of the dask scheduler or ray cluster.")
 @click.option("--recording", type=click.Path(path_type=Path), help="Recording of the iCub scene.")
 @click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
-@click.option(
-    "--page", type=click.Path(path_type=Path), help="Write this Markdown page of all results."
-)
+@click.option("--page", type=options.OUT, help="Write this Markdown page of all results.")
 @click.option("--force", is_flag=True, help="Replace results of more or other trials.")
 @options.as_json
 def reproduce_command(

@@ -14,7 +14,7 @@ from cdmisfa.core.errors import NotReproducedError
 @click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--save",
-    type=click.Path(path_type=Path),
+    type=options.OUT,
     metavar="F.rrd",
     help="Also write their curves, one over the other, as a view.",
 )

@@ -10,14 +10,14 @@ from cdmisfa.cli import options
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
-FILE = click.Path(path_type=Path)
-
 
 @click.command("view")
 @options.fetched_argument("run")
-@click.option("--save", type=FILE, metavar="F.rrd", help="Write the view to a file and end.")
+@click.option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file and end.")
 @click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
-@click.option("--screenshot", type=FILE, metavar="F.png", help="Draw the view without a screen.")
+@click.option(
+    "--screenshot", type=options.OUT, metavar="F.png", help="Draw the view without a screen."
+)
 @click.option("--at", type=click.IntRange(0), metavar="FRAME", help="Frame of the screenshot.")
 @click.option(
     "--every",
@@ -28,7 +28,7 @@ FILE = click.Path(path_type=Path)
 )
 @click.option(
     "--all-views",
-    type=FILE,
+    type=click.Path(path_type=Path),
     metavar="RECORDING",
     help="Also show what was not watched, from the recording that the run learned from.",
 )
