@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.learning import Learner
 from cdmisfa.core.registry import Registry
+
+if TYPE_CHECKING:  # the command line names the learners without numpy
+    from cdmisfa.core.blocks import SourceSpec
+    from cdmisfa.core.learning import Learner
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ completion never wait for numpy, numba, PyBullet or Rerun.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib
 import io
 import os
@@ -19,6 +18,7 @@ import click
 
 from cdmisfa.cli.interrupts import interruptible
 from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.names import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene shows, one MCAP file per view."),
@@ -70,9 +70,7 @@ class LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the command, or name the nearest one."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            close = difflib.get_close_matches(args[0], COMMANDS, n=1)
-            hint = f": did you mean {close[0]}?" if close else ""
-            ctx.fail(f"no command {args[0]!r}{hint}")
+            ctx.fail(f"no command {args[0]!r}: {did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -8,7 +8,6 @@ in `recorder`); this module fills any of them.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import tomllib
 import types
@@ -19,6 +18,7 @@ from importlib import resources
 from typing import Any, Literal, TypeVar
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import did_you_mean
 
 Section = TypeVar("Section")
 
@@ -140,7 +140,7 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
                 document = tomllib.load(file)
         else:
             if name not in presets():
-                raise UsageError(f"no preset {name!r}{_nearest(name, presets())}")
+                raise UsageError(f"no preset {name!r}: {did_you_mean(name, presets())}")
             text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
             document = tomllib.loads(text)
     except OSError as error:
@@ -188,7 +188,8 @@ def build(
         for key, value in layer.items():
             name, dot, rest = key.partition(".")
             if name not in fields:
-                raise UsageError(f"unknown key {prefix}.{key}{_nearest(name, fields, prefix)}")
+                hint = did_you_mean(name, fields, f"{prefix}.")
+                raise UsageError(f"unknown key {prefix}.{key}: {hint}")
             if dataclasses.is_dataclass(hints[name]):
                 if not dot and not isinstance(value, Mapping):
                     raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
@@ -286,12 +287,3 @@ def _default(field: Any) -> Any:
     if field.default is not dataclasses.MISSING:
         return field.default
     return field.default_factory() if field.default_factory is not dataclasses.MISSING else None
-
-
-def _nearest(name: str, known: Iterable[str], prefix: str = "") -> str:
-    dotted = f"{prefix}." if prefix else ""
-    known = list(known)
-    match = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    if match:
-        return f": did you mean {dotted}{match[0]}?"
-    return f": there are {', '.join(known)}"

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.names import did_you_mean
 from recorder.config import SCENE_KEYS, RecordConfig, SceneConfig, scene_table
 
 if TYPE_CHECKING:
@@ -33,12 +34,12 @@ class Configuration:
     """Everything a run or a recording was told.
 
     Attributes:
-        learner: keys `learner.*`.
+        learner: keys `learner.*`, of the class that the learner's entry in `LEARNERS` names.
         scene: keys `scene.*`; its seed is never None.
         record: keys `record.*`.
     """
 
-    learner: LearnerConfig
+    learner: Any
     scene: SceneConfig
     record: RecordConfig
 
@@ -71,21 +72,22 @@ def configure(
     """Fill the configuration for a kind of scene.
 
     Args:
-        kind: the scene, which also names the preset where none is given.
+        kind: the scene, which also names the preset where none is given and the learner that
+            `settings` choose has none of its own.
         preset: name of a preset or a .toml file.
         settings: `section.key=value` words; they win over the preset.
         seed: becomes `scene.seed` where that is not set.
 
     Raises:
-        UsageError: an unknown preset, section or key, or a value that does not fit.
+        UsageError: an unknown preset, learner, section or key, or a value that does not fit.
     """
-    tables = load_preset(preset or kind)
     words = parse_settings(settings)
+    algorithm = words.get("learner", {}).get("algorithm")
+    own = LEARNERS[algorithm].preset if algorithm is not None else None
+    tables = load_preset(preset or own or kind)
     for section in (*tables, *words):
         if section not in SECTIONS:
-            close = difflib.get_close_matches(section, SECTIONS, n=1, cutoff=0.4)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(SECTIONS)}"
-            raise UsageError(f"unknown section {section}: {hint}")
+            raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
 
     def layers(section: str) -> tuple[Mapping[str, Any], ...]:
         return tables.get(section, {}), words.get(section, {})
@@ -105,9 +107,11 @@ def configure(
                 f"scene.{key} means nothing to the scene {kind}, which has "
                 f"{', '.join(f'scene.{own}' for own in SCENE_KEYS[kind])}"
             )
+    if algorithm is None:
+        algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
     scene = build(SceneConfig, "scene", *layers("scene"), {"kind": kind})
     return Configuration(
-        learner=build(LearnerConfig, "learner", *layers("learner")),
+        learner=build(LEARNERS[algorithm].configuration, "learner", *layers("learner")),
         scene=scene if scene.seed is not None else replace(scene, seed=seed),
         record=build(RecordConfig, "record", *layers("record")),
     )
@@ -124,9 +128,7 @@ def configure_scene(
     from recorder.world.scenes import SCENES
 
     if name not in SCENES:
-        close = difflib.get_close_matches(name, SCENES, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(SCENES)}"
-        raise UsageError(f"no scene {name!r}: {hint}")
+        raise UsageError(f"no scene {name!r}: {did_you_mean(name, SCENES)}")
     return configure(name, preset, settings, seed)
 
 

@@ -20,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import LearnerConfig, as_table
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.manifest import write_json
@@ -289,7 +289,8 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     if trial.code != code():
         return {"error": f"the worker has cdmisfa {code()}, not {trial.code}: install the same"}
     try:
-        if trial.source == ("oscillatory",) and trial.log is None:
+        known = isinstance(trial.configuration.learner, LearnerConfig)
+        if trial.source == ("oscillatory",) and trial.log is None and known:
             return _compiled_trial(trial)
         return _logged_trial(trial)
     except CdmisfaError as error:

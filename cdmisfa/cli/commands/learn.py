@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
 from cdmisfa.cli.cameras import camera_options, say_about
 from cdmisfa.cli.interrupts import stoppable
@@ -33,8 +34,8 @@ TICK = 0.1
 @options.settings
 @click.option(
     "--algorithm",
-    type=click.Choice(["1.0", "2.0"]),
-    help="CD-MISFA version, short for --set learner.algorithm=.",
+    metavar="NAME",
+    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}.",
 )
 @click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
 @click.option(
