@@ -186,10 +186,12 @@ def _chunk_parts(content: bytes) -> tuple[bytes, int, str, bytes]:
 
 
 def _inner(content: bytes) -> list[Record]:
-    from replay.mcap.records import decompress
+    from replay.mcap.compression import Decompressor
 
     _, size, name, stored = _chunk_parts(content)
-    return _records(decompress(stored, name, size), 0, size)
+    records = np.empty(size, np.uint8)
+    Decompressor().decompress(memoryview(stored), name, records)
+    return _records(records.tobytes(), 0, size)
 
 
 def mutated(number: int) -> Case:

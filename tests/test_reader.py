@@ -199,4 +199,4 @@ def test_a_long_file_is_read_in_little_memory(tmp_path: Path) -> None:
         writer.finish()
     with LogReader(path) as reader:
         assert sum(len(m.data) for m in reader.messages()) == 200_000_000
-        assert reader._cached <= 32 * 1024 * 1024
+        assert reader._chunks._cached <= 32 * 1024 * 1024

@@ -261,7 +261,7 @@ def test_memory_does_not_grow_with_the_length(pictures: Path) -> None:
     source = RecordedSource(pictures, loop=True)
     source.take(0, 40)
     reader = source._views[0][0].reader
-    held = reader._cached
+    held = reader._chunks._cached
     for _ in range(30):
         source.take(0, 40)
-    assert reader._cached <= max(held, 1024 * 1024)
+    assert reader._chunks._cached <= max(held, 1024 * 1024)

@@ -8,21 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz_oracle import tabled_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.errors import LogDamagedError
 from recorder.config import RecordConfig
 from recorder.log.viewlog import Identity, ViewLog
 from recorder.recording import record
 from replay.mcap.reader import LogReader
-from replay.mcap.records import MalformedRecord, decompress
 from replay.mcap.tables import indexed_table
 from replay.recordings.kernels import scan
 from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
 
 FRAMES = 200
+NOTHING = np.empty(0, np.uint8)
 PICTURES = SourceSpec(("left",), (6, 8), "uint8", ("x", "y"), 50.0, 10**18)
 
 
@@ -46,8 +48,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def plain(view: ViewFile, start: int, n: int) -> tuple[np.ndarray, np.ndarray]:
     frames = np.empty((n, *view.facts.frame_shape), view.facts.dtype)
     truth = np.empty((n, len(view.facts.truth)))
-    view.frames(start, frames)
-    view.truth(start, truth)
+    tabled_rows(view, start, frames, truth)
     return frames, truth
 
 
@@ -78,8 +79,8 @@ def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
 
 def test_the_compiled_way_is_the_one_taken(pictures: dict[str, Path]) -> None:
     view = ViewFile(pictures["zstd"])
-    scanner = ChunkScanner(view.reader, view._layouts())
-    taken = [scanner.chunk(segment) is not None for segment in view.reader.segments]
+    scanner = ChunkScanner(view.reader, view._layouts)
+    taken = [scanner.scanned(s, NOTHING) is not None for s in view.reader.segments]
     # The first chunk also defines the channels, and is left to the tables.
     assert taken == [False, True, True, True]
     view.close()
@@ -89,13 +90,14 @@ def test_the_compiled_way_is_the_one_taken(pictures: dict[str, Path]) -> None:
 def chunk(pictures: dict[str, Path]) -> tuple[ViewFile, bytes, bytes]:
     view = ViewFile(pictures["zstd"])
     segment = view.reader.segments[1]
-    stored, index = view.reader.stored(segment)
-    return view, decompress(bytes(stored), segment.compression, segment.size), bytes(index)
+    records = np.empty(segment.size, np.uint8)
+    index = view.reader.unpack(segment, records)
+    return view, records.tobytes(), bytes(index)
 
 
 def scanned(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
     """The places that `scan` finds, or None where it refuses."""
-    scanner = ChunkScanner(view.reader, view._layouts())
+    scanner = ChunkScanner(view.reader, view._layouts)
     segment = view.reader.segments[1]
     counts = segment.channel_counts()
     assert counts is not None
@@ -131,16 +133,14 @@ def tabled(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
             pairs_at = np.frombuffer(index, "<u8", 2 * count, at + 15).reshape(-1, 2)
             parts.append((int.from_bytes(index[at + 9 : at + 11], "little"), pairs_at))
             at += 15 + pairs
-        table, _ = indexed_table(data, parts)
+        table, _ = indexed_table(np.frombuffer(data, np.uint8), parts)
         if not (segment.start <= table.log_time.min() <= table.log_time.max() <= segment.end):
             return None
-        for rows, check in ((view._frames, view._pixels), (view._truth, view._truths)):
-            assert rows is not None
-            own = table.select(np.flatnonzero(table.channel == rows.channel.id))
-            check(own)
-            found.append(own.at + own.size)
+        for layout in view._layouts:
+            own = table.select(np.flatnonzero(table.channel == layout.channel.id))
+            found.append(layout.checked_ends(view.path, segment, own))
         return np.array(found)
-    except MalformedRecord:
+    except LogDamagedError:
         return None
 
 
@@ -185,9 +185,11 @@ def test_a_flipped_bit_is_found(pictures: dict[str, Path], tmp_path: Path) -> No
     path = tmp_path / "left.mcap"
     path.write_bytes(broken)
     view = ViewFile(path, salvage=True)
-    scanner = ChunkScanner(view.reader, view._layouts())
-    assert scanner.chunk(view.reader.segments[2]) is None
-    assert scanner.chunk(view.reader.segments[1]) is not None
+    scanner = ChunkScanner(view.reader, view._layouts)
+    assert scanner.scanned(view.reader.segments[2], NOTHING) is None
+    with pytest.raises(LogDamagedError, match="is damaged"):
+        scanner.chunk(view.reader.segments[2])
+    assert scanner.scanned(view.reader.segments[1], NOTHING) is not None
     view.close()
 
 

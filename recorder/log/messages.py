@@ -82,20 +82,8 @@ def vector_payload(length: int) -> Payload:
     return Payload(0, size, b"\x12" + varint(size) if size else b"")
 
 
-def truth_layout(names: Sequence[str]) -> np.dtype[Any]:
-    """The last bytes of a `cdmisfa.GroundTruth`: for each name its tag, then its float64.
-
-    Field `names[i]` of the structured type is the value, `tag_i` the bytes before it,
-    which must equal `truth_tags(names)[i]`.
-    """
-    fields: list[tuple[str, str]] = []
-    for i, (name, tag) in enumerate(zip(names, truth_tags(names), strict=True)):
-        fields += [(f"tag_{i}", f"V{len(tag)}"), (name, "<f8")]
-    return np.dtype(fields)
-
-
 def truth_tags(names: Sequence[str]) -> list[bytes]:
-    """The tag bytes of each ground truth field (wire type 1, 64 bits)."""
+    """What stands before each of the float64 that end a `cdmisfa.GroundTruth`: its tag."""
     return [varint((_FIRST_TRUTH_FIELD + i) << 3 | 1) for i in range(len(names))]
 
 

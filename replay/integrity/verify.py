@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from typing import Any, Final
-
-import numpy as np
+from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.integrity.info import crc_state, kind_of, survey
@@ -16,8 +14,6 @@ from replay.recordings.view_file import ViewFile
 from replay.storage.copied import fetched
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
-
-_BLOCK: Final = 256
 
 
 def verify(path: str | Location) -> dict[str, Any]:
@@ -87,7 +83,7 @@ def _check_views(paths: list[Location], problems: list[dict[str, str]], *, alone
                 for (_, end), (start, _) in itertools.pairwise(edges):
                     if start > end:
                         _note(problems, path, f"frames {end} to {start - 1} are missing")
-                _decode(view)
+                view.check()
         except LogDamagedError as error:
             sound = False
             _note(problems, path, _without(path, error))
@@ -107,15 +103,6 @@ def _check_views(paths: list[Location], problems: list[dict[str, str]], *, alone
             if end > shortest:
                 what = f"the view {name!r} ends before frame {end}, another before {shortest}"
                 _note(problems, paths[0].parent, what)
-
-
-def _decode(view: ViewFile) -> None:
-    shape = view.facts.frame_shape
-    for start, stop in view.ranges:
-        for at in range(start, stop, _BLOCK):
-            n = min(_BLOCK, stop - at)
-            view.frames(at, np.empty((n, *shape), view.facts.dtype))
-            view.truth(at, np.empty((n, len(view.facts.truth))))
 
 
 def _note(problems: list[dict[str, str]], path: Location, what: str, where: str = "") -> None:

@@ -7,38 +7,23 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 from __future__ import annotations
 
 import hashlib
-from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap.ordering import overlapping, within
-from replay.mcap.records import (
-    INDEX_HEADER,
-    MAX_CHUNK,
-    Channel,
-    MalformedRecord,
-    Schema,
-    Statistics,
-    decompress,
-    decompress_prefix,
-)
+from replay.mcap.chunks import Chunks
+from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema, Statistics
 from replay.mcap.segments import Attachment, Metadata, Segment
-from replay.mcap.summary import confirm
-from replay.mcap.tables import MessageTable, indexed_table, walked_table
+from replay.mcap.tables import MessageTable, merged, overlapping, within
 from replay.mcap.walk import Structure
-from replay.storage.checksum import crc32
 from replay.storage.location import Location, Url, location
 from replay.storage.store import RandomFile
-
-CACHE_BYTES: Final = 32 * 1024 * 1024
-"""Decoded chunks that are kept, unless told otherwise; one is always."""
 
 Crc = Literal["ok", "absent", "bad", "unchecked"]
 
@@ -98,22 +83,21 @@ class LogReader:
         self.salvage = salvage
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
-        self._cache: OrderedDict[int, MessageTable] = OrderedDict()
-        self._cached = 0
-        self._cache_bytes = CACHE_BYTES if cache_bytes is None else cache_bytes
         self._defined = 0
         self._searched = False
         self._file = RandomFile(self.path)
         try:
             by_index = isinstance(self.path, Url)
             self._structure = Structure(self._file, self._refuse, by_index=by_index)
+            definitions = self._structure.definitions
+            self._chunks = Chunks(self._file, definitions, self._note, cache_bytes)
             self._time_tail()
             self._check_data_crc()
         except MalformedRecord as error:
-            self.close()
+            self._file.close()
             raise LogDamagedError(f"{self.path}: {error}") from None
         except BaseException:
-            self.close()
+            self._file.close()
             raise
 
     # What the file holds
@@ -159,7 +143,8 @@ class LogReader:
     @property
     def statistics(self) -> Statistics | None:
         """What the summary says the file holds."""
-        return self._structure.statistics
+        summary = self._structure.summary
+        return summary.statistics if summary else None
 
     @property
     def segments(self) -> list[Segment]:
@@ -324,58 +309,22 @@ class LogReader:
         Raises:
             LogDamagedError: it is damaged, without `salvage`.
         """
-        key = segment.offset
-        if key in self._cache:
-            self._cache.move_to_end(key)
-            return self._cache[key]
-        if key in self._failed:
+        if segment.offset in self._failed:
             return None
-        if segment.size <= MAX_CHUNK:
-            self._make_room(segment.size)
         try:
-            table = self._decode(segment)
+            return self._chunks.table(segment)
         except MalformedRecord as error:
-            self._failed.add(key)
+            self._failed.add(segment.offset)
             self._refuse(segment.name, str(error))
             return None
-        self._cache[key] = table
-        self._cached += len(table.data)
-        return table
 
     def index(self, segment: Segment) -> list[tuple[int, NDArray[np.uint64]]]:
-        """Read a chunk's message indexes: channel, and (n, 2) of log time and offset.
+        """Read a chunk's message indexes; see `Chunks.index`."""
+        return self._chunks.index(segment)
 
-        Raises:
-            MalformedRecord: they are larger than any chunk.
-        """
-        if not segment.indexes:
-            return []
-        first, last = segment.indexes[0].offset, segment.indexes[-1]
-        size = last.offset + 16 * last.count - first
-        if size > MAX_CHUNK:
-            raise MalformedRecord("its message index is larger than any chunk")
-        raw = self._file.read(first, size)
-        return [
-            (
-                part.channel,
-                np.frombuffer(raw, "<u8", 2 * part.count, part.offset - first).reshape(-1, 2),
-            )
-            for part in segment.indexes
-        ]
-
-    def stored(self, segment: Segment) -> tuple[memoryview, memoryview]:
-        """Read a chunk's records as they stand in the file, and its message index records.
-
-        Raises:
-            MalformedRecord: together they are larger than any chunk.
-        """
-        if segment.stated:
-            confirm(self._file, segment)
-        first, stop = segment.indexes[0].offset - INDEX_HEADER, segment.stop
-        if stop - segment.data_offset > 2 * MAX_CHUNK:
-            raise MalformedRecord("its message index is larger than any chunk")
-        raw = memoryview(self._file.read(segment.data_offset, stop - segment.data_offset))
-        return raw[: segment.stored], raw[first - segment.data_offset :]
+    def unpack(self, segment: Segment, out: Bytes) -> memoryview:
+        """Decompress the records of a chunk with message indexes; see `Chunks.unpack`."""
+        return self._chunks.unpack(segment, out)
 
     def check(self) -> None:
         """Decode every chunk, so that every checksum and length is checked."""
@@ -398,7 +347,7 @@ class LogReader:
         if self.complete or not self._file.grow():
             return False
         try:
-            kept = self._structure.go_on()
+            kept = self._structure.resume()
         except MalformedRecord as error:
             raise LogDamagedError(f"{self.path}: {error}") from None
         self._forget({segment.offset for segment in self._structure.segments[:kept]})
@@ -427,8 +376,7 @@ class LogReader:
 
     def _forget(self, but: Collection[int] = ()) -> None:
         """Let go of the chunks that were decoded, but those at some places of the file."""
-        for key in self._cache.keys() - set(but):
-            self._cached -= len(self._cache.pop(key).data)
+        self._chunks.forget(but)
         self._failed &= set(but)
         self._defined = self._defined if but else 0
         self._searched = False
@@ -439,6 +387,9 @@ class LogReader:
                 f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
                 "recording, cdmisfa learn --salvage learns without it)"
             )
+        self._note(where, what)
+
+    def _note(self, where: str, what: str) -> None:
         problem = Problem(where, what)
         if problem not in self.problems:
             self.problems.append(problem)
@@ -460,49 +411,6 @@ class LogReader:
         if not self.salvage:
             self.check()
         self._refuse("data section", "its CRC does not match: damaged")
-
-    def _make_room(self, size: int) -> None:
-        while self._cache and self._cached + size > self._cache_bytes:
-            _, old = self._cache.popitem(last=False)
-            self._cached -= len(old.data)
-
-    def _decode(self, segment: Segment) -> MessageTable:
-        if segment.stated:
-            confirm(self._file, segment)
-        stored = self._file.read(segment.data_offset, segment.stored)
-        if segment.cut:
-            raw = decompress_prefix(stored, segment.compression, min(segment.size, MAX_CHUNK))
-            table, definitions = walked_table(raw, cut=True)
-        else:
-            raw = decompress(stored, segment.compression, segment.size)
-            if segment.crc and crc32(raw) != segment.crc:
-                raise MalformedRecord("its CRC does not match: damaged")
-            table, definitions = self._table_of(segment, raw)
-            self._check_times(segment, table)
-        del stored
-        for opcode, start, stop in definitions:
-            self._structure.definitions.add(opcode, raw[start:stop], segment.name)
-        return table
-
-    def _table_of(
-        self, segment: Segment, raw: bytes
-    ) -> tuple[MessageTable, list[tuple[int, int, int]]]:
-        if segment.indexes:
-            try:
-                return indexed_table(raw, self.index(segment))
-            except MalformedRecord as error:
-                found = walked_table(raw)
-                problem = Problem(segment.name, f"{error} (the index is not used)")
-                if problem not in self.problems:
-                    self.problems.append(problem)
-                return found
-        return walked_table(raw)
-
-    def _check_times(self, segment: Segment, table: MessageTable) -> None:
-        if len(table) and not (
-            segment.start <= int(table.log_time.min()) and int(table.log_time.max()) <= segment.end
-        ):
-            raise MalformedRecord("it holds messages outside the time range it states")
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
         definitions = self._structure.definitions
@@ -548,26 +456,10 @@ class LogReader:
     def _merged(
         self, group: list[tuple[int, Segment]], low: int, high: int
     ) -> Iterator[tuple[Segment, MessageTable]]:
-        times: list[NDArray[np.uint64]] = []
-        members: list[NDArray[np.int64]] = []
-        rows: list[NDArray[np.int64]] = []
-        for member, (_, segment) in enumerate(group):
+        tables = (self.table(segment) for _, segment in group)
+        none = np.empty(0, np.uint64)
+        for member, rows in merged([none if t is None else t.log_time for t in tables]):
+            segment = group[member][1]
             table = self.table(segment)
             if table is not None:
-                times.append(table.log_time)
-                members.append(np.full(len(table), member))
-                rows.append(np.arange(len(table)))
-        if not times:
-            return
-        order = np.argsort(np.concatenate(times), kind="stable")
-        member_of, row_of = np.concatenate(members)[order], np.concatenate(rows)[order]
-        changes = np.flatnonzero(np.diff(member_of)) + 1
-        for piece_members, piece_rows in zip(
-            np.split(member_of, changes), np.split(row_of, changes), strict=True
-        ):
-            if not len(piece_members):
-                continue
-            segment = group[int(piece_members[0])][1]
-            table = self.table(segment)
-            if table is not None:
-                yield segment, within(table.select(piece_rows), low, high)
+                yield segment, within(table.select(rows), low, high)

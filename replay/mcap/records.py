@@ -11,9 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-import lz4.frame
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
@@ -182,106 +180,9 @@ def statistics(content: bytes | memoryview) -> Statistics:
     )
 
 
-def message_index(content: bytes | memoryview) -> tuple[int, NDArray[np.uint64]]:
-    """Parse a MessageIndex record.
-
-    Returns:
-        The channel, and (n, 2) of log time and place in the decompressed chunk.
-    """
-    fields = Fields(content, "a message index")
-    number = fields.integer(2)
-    raw = fields.take(fields.integer(4))
-    if len(raw) % 16:
-        raise MalformedRecord("a message index is not made of pairs")
-    return number, np.frombuffer(raw, "<u8").reshape(-1, 2)
-
-
-def decompress(stored: bytes, compression: str, size: int) -> bytes:
-    """Give the records of a chunk.
-
-    Raises:
-        MalformedRecord: an unknown compression, more than `MAX_CHUNK` bytes, broken data,
-            or another number of bytes than the `size` the chunk states.
-    """
-    check_size(compression, size)
-    if compression == "":
-        data = stored
-    elif compression == "zstd":
-        data = _decompress_zstd(stored, size)
-    else:
-        data = _decompress_lz4(stored, size)
-    if len(data) != size:
-        raise MalformedRecord(f"it states {size} bytes decompressed and holds {len(data)}")
-    return data
-
-
-def check_size(compression: str, size: int) -> None:
-    """Refuse a chunk that cannot or must not be decompressed."""
-    if compression not in ("", "zstd", "lz4"):
-        raise MalformedRecord(f"its compression {compression[:40]!r} is unknown")
-    if size > MAX_CHUNK:
-        raise MalformedRecord(
-            f"it states {size} bytes decompressed, above the limit of {MAX_CHUNK} bytes"
-        )
-
-
-def decompress_prefix(stored: bytes, compression: str, size: int) -> bytes:
-    """Give what can be decompressed of a chunk that was cut short."""
-    check_size(compression, size)
-    if compression == "":
-        return stored[:size]
-    try:
-        if compression == "lz4":
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size))
-        parts: list[bytes] = []
-        held = 0
-        reader = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2).stream_reader(stored)
-        try:
-            while held < size and (part := reader.read(min(size - held, 1 << 17))):
-                parts.append(part)
-                held += len(part)
-        except zstandard.ZstdError:
-            if not parts:
-                raise
-        return b"".join(parts)
-    except (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError) as error:
-        raise MalformedRecord(f"its {compression} data is broken ({error})") from None
-
-
-def _decompress_zstd(stored: bytes, size: int) -> bytes:
-    try:
-        stated = zstandard.frame_content_size(stored)
-        if stated in (-1, size):
-            data: bytes = zstandard.ZstdDecompressor().decompress(
-                stored, max_output_size=max(size, 1), allow_extra_data=True
-            )
-            if len(data) == size:
-                return data
-        elif stated > size:
-            raise MalformedRecord(f"it states {size} bytes decompressed, its data {stated}")
-        reader = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK // 2).stream_reader(
-            stored, read_across_frames=True
-        )
-        return reader.read(size + 1)
-    except (zstandard.ZstdError, ValueError, MemoryError) as error:
-        raise MalformedRecord(f"its zstd data is broken ({error})") from None
-
-
-def _decompress_lz4(stored: bytes, size: int) -> bytes:
-    try:
-        stated = lz4.frame.get_frame_info(stored)["content_size"]
-        if stated not in (0, size):
-            raise MalformedRecord(f"it states {size} bytes decompressed, its data {stated}")
-        decompressor = lz4.frame.LZ4FrameDecompressor()
-        data = bytes(decompressor.decompress(stored, max_length=size + 1))
-    except (RuntimeError, ValueError, MemoryError, EOFError) as error:
-        raise MalformedRecord(f"its lz4 data is broken ({error})") from None
-    if not decompressor.eof and len(data) <= size:
-        raise MalformedRecord("its lz4 data is cut short")
-    return data
-
-
-def walk(data: bytes, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, int, int]]:
+def walk(
+    data: memoryview, start: int = 0, stop: int | None = None
+) -> Iterator[tuple[int, int, int]]:
     """Each record within a chunk as (opcode, place of its first byte, place after its last).
 
     Raises:

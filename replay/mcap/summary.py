@@ -1,13 +1,15 @@
-"""Where the chunks of a log are, by its summary: for logs of which not every byte is read.
+"""The summary at a log's end: what it counts, and where it says that everything is.
 
-The summary is believed only where it accounts for every message it counts; every chunk is
-compared with it when it is read.
+It is believed only where it accounts for every message it counts, and only for logs of which
+not every byte is read; every chunk is compared with it when it is read.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+import struct
+from dataclasses import dataclass, field
+from typing import Final
 
 from mcap.opcode import Opcode
 
@@ -15,117 +17,173 @@ from replay.mcap.records import (
     INDEX_HEADER,
     MAGIC,
     MAX_CHUNK,
+    MAX_DEFINITION,
     RECORD_HEADER,
     Fields,
     MalformedRecord,
     Statistics,
-    chunk_header,
+    statistics,
 )
-from replay.mcap.segments import IndexPart, Segment
+from replay.mcap.segments import Definitions, IndexPart, Refuse, Segment
 from replay.storage.store import RandomFile
 
 _FIXED = RECORD_HEADER.size + 40
 """Bytes of a chunk before its records, without the name of its compression."""
+_FOOTER_BYTES: Final = RECORD_HEADER.size + 20
+_INDEXES: Final = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
 
-@dataclass(frozen=True, slots=True)
-class Spans:
-    """Places in the file, from and up to before, of records that the summary names."""
+@dataclass(slots=True)
+class Summary:
+    """What stands between the data and the end of a log.
 
-    metadata: list[tuple[int, int]]
-    attachments: list[tuple[int, int]]
+    Attributes:
+        begin: place in the file where the data ends.
+        read: it is there, and was read to its end.
+        statistics: what it counts, or None.
+        chunks: places that it names for chunks, in order.
+        indexes: place and bytes of each of its chunk, attachment and metadata indexes.
+    """
+
+    begin: int
+    read: bool = False
+    statistics: Statistics | None = None
+    chunks: list[int] = field(default_factory=list)
+    indexes: dict[int, list[tuple[int, int]]] = field(
+        default_factory=lambda: {opcode: [] for opcode in _INDEXES}
+    )
 
 
-def indexed_segments(
-    file: RandomFile, begin: int, stop: int, statistics: Statistics | None, known: set[int]
-) -> tuple[list[Segment], Spans] | None:
-    """Find the chunks by their indexes.
+def read_summary(file: RandomFile, definitions: Definitions, refuse: Refuse) -> Summary | None:
+    """Read the footer and the summary of a log.
 
     Args:
         file: the log.
-        begin: where its summary begins.
-        stop: where its footer begins.
-        statistics: what the summary counts.
+        definitions: take in what the summary defines.
+        refuse: told of damage.
+
+    Returns:
+        The summary as far as it can be read, or None where the file has no end.
+    """
+    footer_at = file.size - len(MAGIC) - _FOOTER_BYTES
+    if footer_at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
+        return None
+    footer = file.read(footer_at, _FOOTER_BYTES)
+    opcode, length = RECORD_HEADER.unpack_from(footer)
+    if opcode != Opcode.FOOTER or length != 20:
+        refuse("footer", "it is no footer record")
+        return None
+    start, offsets, crc = struct.unpack_from("<QQI", footer, RECORD_HEADER.size)
+    begin = start or offsets or footer_at
+    if not len(MAGIC) <= begin <= footer_at or (offsets and not begin <= offsets <= footer_at):
+        refuse("footer", "it points outside the file")
+        return None
+    summary = Summary(begin)
+    if crc and file.crc(begin, footer_at + _FOOTER_BYTES - 4) != crc:
+        refuse("summary", "its CRC does not match: damaged")
+        return summary
+    try:
+        _take_records(file, summary, footer_at, definitions)
+        summary.read = start == begin
+    except MalformedRecord as error:
+        refuse("summary", str(error))
+    summary.chunks.sort()
+    return summary
+
+
+def _take_records(file: RandomFile, summary: Summary, stop: int, definitions: Definitions) -> None:
+    at = summary.begin
+    while at < stop:
+        head = file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+        opcode, length = RECORD_HEADER.unpack(head)
+        content, end = at + RECORD_HEADER.size, at + RECORD_HEADER.size + length
+        if opcode == 0 or end > stop:
+            raise MalformedRecord(f"no record at byte {at}")
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            definitions.add(opcode, definition(file, content, length), "summary")
+        elif opcode == Opcode.STATISTICS:
+            summary.statistics = statistics(definition(file, content, length))
+        elif opcode in _INDEXES:
+            summary.indexes[opcode].append((content, length))
+            if opcode == Opcode.CHUNK_INDEX:
+                fields = Fields(file.peek(content, min(length, 24)), "a chunk index")
+                fields.take(16)
+                summary.chunks.append(fields.integer(8))
+        elif opcode <= Opcode.DATA_END and opcode != Opcode.SUMMARY_OFFSET:
+            raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
+        at = end
+
+
+def definition(file: RandomFile, content: int, length: int) -> bytes:
+    """Read a record that is kept in memory.
+
+    Raises:
+        MalformedRecord: it is larger than is read at once.
+    """
+    if length > MAX_DEFINITION:
+        raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
+    return file.read(content, length)
+
+
+def stated_segments(file: RandomFile, summary: Summary, known: set[int]) -> list[Segment] | None:
+    """The chunks that a summary names, in file order.
+
+    Args:
+        file: the log.
+        summary: its summary.
         known: the channels that the summary defines.
 
     Returns:
-        The chunks in file order and where other records are, or None where the summary does
-        not account for every message.
+        None where the summary does not account for every message.
 
     Raises:
         MalformedRecord: a broken index.
     """
-    if statistics is None:
+    stated = summary.statistics
+    if stated is None or not summary.read:
         return None
     segments: list[Segment] = []
-    spans = Spans([], [])
-    at = begin
-    while at < stop:
-        opcode, length = RECORD_HEADER.unpack(file.peek(at, RECORD_HEADER.size))
-        content, at = at + RECORD_HEADER.size, at + RECORD_HEADER.size + length
-        if opcode == Opcode.CHUNK_INDEX:
-            segment = _segment(Fields(_content(file, content, length), "a chunk index"))
-            if segment is None:
-                return None
-            segments.append(segment)
-        elif opcode in (Opcode.METADATA_INDEX, Opcode.ATTACHMENT_INDEX):
-            fields = Fields(_content(file, content, length), "an index")
-            start, size = fields.integer(8), fields.integer(8)
-            if size < RECORD_HEADER.size or start + size > begin:
-                raise MalformedRecord("an index points outside the data")
-            place = spans.metadata if opcode == Opcode.METADATA_INDEX else spans.attachments
-            place.append((start, start + size))
+    for content, length in summary.indexes[Opcode.CHUNK_INDEX]:
+        segment = _segment(_index(file, content, length))
+        if segment is None:
+            return None
+        segments.append(segment)
     segments.sort(key=lambda segment: segment.offset)
+    begin = summary.begin
     edges = [(len(MAGIC), len(MAGIC)), *((s.offset, s.stop) for s in segments), (begin, begin)]
     if any(stop > start for (_, stop), (start, _) in itertools.pairwise(edges)):
         raise MalformedRecord("its chunk index names chunks that overlap")
     counts = [segment.channel_counts() or {} for segment in segments]
     accounted = (
-        len(segments) == statistics.chunks
-        and len(spans.metadata) == statistics.metadata
-        and len(spans.attachments) == statistics.attachments
-        and sum(sum(c.values()) for c in counts) == statistics.messages
+        len(segments) == stated.chunks
+        and len(summary.indexes[Opcode.METADATA_INDEX]) == stated.metadata
+        and len(summary.indexes[Opcode.ATTACHMENT_INDEX]) == stated.attachments
+        and sum(sum(c.values()) for c in counts) == stated.messages
         and all(c.keys() <= known for c in counts)
     )
-    return (segments, spans) if accounted else None
+    return segments if accounted else None
 
 
-def confirm(file: RandomFile, segment: Segment) -> None:
-    """Compare a chunk, and its message indexes, with what the summary says of it.
+def stated_spans(file: RandomFile, summary: Summary, opcode: int) -> list[tuple[int, int]]:
+    """Where a summary says that attachments or metadata are, as spans [start, stop) of the file.
 
     Raises:
-        MalformedRecord: they differ.
+        MalformedRecord: a broken index.
     """
-    head = file.read(segment.offset, segment.data_offset - segment.offset)
-    opcode, length = RECORD_HEADER.unpack_from(head)
-    if opcode != Opcode.CHUNK:
-        raise MalformedRecord("the summary points to something that is no chunk")
-    header = chunk_header(head[RECORD_HEADER.size :])
-    data = segment.offset + RECORD_HEADER.size + header.length
-    stated = (data, header.stored, header.size, header.compression, header.start, header.end)
-    if length != header.length + header.stored or stated != (
-        segment.data_offset,
-        segment.stored,
-        segment.size,
-        segment.compression,
-        segment.start,
-        segment.end,
-    ):
-        raise MalformedRecord("it is not the chunk that the summary names")
-    for part in segment.indexes:
-        raw = Fields(file.read(part.offset - INDEX_HEADER, INDEX_HEADER), "a message index")
-        fields = [raw.integer(width) for width in (1, 8, 2, 4)]
-        size = 16 * part.count
-        if fields != [Opcode.MESSAGE_INDEX, size + 6, part.channel, size]:
-            raise MalformedRecord("its message index is not the one that the summary names")
-    segment.crc = header.crc
-    segment.stated = False
+    spans = []
+    for content, length in summary.indexes[opcode]:
+        fields = _index(file, content, length)
+        start, size = fields.integer(8), fields.integer(8)
+        if size < RECORD_HEADER.size or start + size > summary.begin:
+            raise MalformedRecord("an index points outside the data")
+        spans.append((start, start + size))
+    return spans
 
 
-def _content(file: RandomFile, content: int, length: int) -> bytes:
+def _index(file: RandomFile, content: int, length: int) -> Fields:
     if length > MAX_CHUNK:
         raise MalformedRecord("an index is larger than any chunk")
-    return file.read(content, length)
+    return Fields(file.read(content, length), "an index")
 
 
 def _segment(fields: Fields) -> Segment | None:

@@ -1,7 +1,9 @@
-"""The messages of a chunk as columns: found by its message index or a walk, checked either way."""
+"""The messages of chunks as columns: found by their message index or a walk, checked either way."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +18,7 @@ from replay.mcap.records import (
     MalformedRecord,
     walk,
 )
+from replay.mcap.segments import Segment
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +102,7 @@ def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
 
 
 def walked_table(
-    raw: bytes, *, cut: bool = False
+    raw: Bytes, *, cut: bool = False
 ) -> tuple[MessageTable, list[tuple[int, int, int]]]:
     """Build the table of a chunk by walking over its records.
 
@@ -116,7 +119,7 @@ def walked_table(
     offsets: list[int] = []
     definitions: list[tuple[int, int, int]] = []
     try:
-        for opcode, at, end in walk(raw):
+        for opcode, at, end in walk(raw.data):
             if opcode == Opcode.MESSAGE:
                 if end - at < MESSAGE_HEADER.itemsize:
                     raise MalformedRecord("a message is shorter than its own header")
@@ -128,11 +131,11 @@ def walked_table(
     except MalformedRecord:
         if not cut:
             raise
-    return table_at(np.frombuffer(raw, np.uint8), np.array(offsets, np.int64)), definitions
+    return table_at(raw, np.array(offsets, np.int64)), definitions
 
 
 def indexed_table(
-    raw: bytes, indexes: list[tuple[int, NDArray[np.uint64]]]
+    data: Bytes, indexes: list[tuple[int, NDArray[np.uint64]]]
 ) -> tuple[MessageTable, list[tuple[int, int, int]]]:
     """Build the table of a chunk from its message indexes, without touching each message.
 
@@ -142,7 +145,6 @@ def indexed_table(
     Raises:
         MalformedRecord: index and chunk contradict each other.
     """
-    data = np.frombuffer(raw, np.uint8)
     pairs = np.concatenate([pairs for _, pairs in indexes])
     channels = np.repeat(
         np.array([c for c, _ in indexes], np.uint16), [len(pairs) for _, pairs in indexes]
@@ -163,9 +165,54 @@ def indexed_table(
     for low, high in edges[edges[:, 0] != edges[:, 1]].tolist():
         if low > high:
             raise MalformedRecord("its message index names overlapping messages")
-        for opcode, at, end in walk(raw, low, high):
+        for opcode, at, end in walk(data.data, low, high):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.append((opcode, at + RECORD_HEADER.size, end))
             elif opcode <= max(Opcode):
                 raise MalformedRecord("its message index leaves messages out")
     return table, definitions
+
+
+def within(table: MessageTable, low: int, high: int) -> MessageTable:
+    """Give the messages with log times in [low, high)."""
+    times = table.log_time
+    if not len(times) or (low <= int(times.min()) and int(times.max()) < high):
+        return table
+    keep = times >= np.uint64(min(low, 2**64 - 1))
+    if high < 2**64:
+        keep &= times < np.uint64(max(high, 0))
+    return table.select(keep)
+
+
+def overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[tuple[int, Segment]]]:
+    """Group segments so that sorting within each group sorts all."""
+    ordered = sorted(segments, key=lambda pair: (pair[1].start, pair[0]))
+    group: list[tuple[int, Segment]] = []
+    end, last = -1, -1
+    for number, segment in ordered:
+        if group and (segment.start > end or (segment.start == end and number > last)):
+            yield sorted(group, key=lambda pair: pair[0])
+            group, end, last = [], -1, -1
+        group.append((number, segment))
+        end, last = max(end, segment.end), max(last, number)
+    if group:
+        yield sorted(group, key=lambda pair: pair[0])
+
+
+def merged(times: Sequence[NDArray[np.uint64]]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    """Merge the messages of several chunks by log time, ties in file order.
+
+    Args:
+        times: log times of each chunk, in file order.
+
+    Yields:
+        Which of the chunks comes next, and with which rows.
+    """
+    order = np.argsort(np.concatenate(times), kind="stable")
+    counts = [len(each) for each in times]
+    chunk_of = np.repeat(np.arange(len(times)), counts)[order]
+    row_of = np.concatenate([np.arange(count) for count in counts])[order]
+    edges = [0, *(np.flatnonzero(np.diff(chunk_of)) + 1).tolist(), len(order)]
+    for low, high in itertools.pairwise(edges):
+        if low < high:
+            yield int(chunk_of[low]), row_of[low:high]

@@ -14,6 +14,7 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from cdmisfa.core.errors import LogDamagedError
+from replay.mcap.compression import check_size
 from replay.mcap.records import (
     MAGIC,
     MAX_CHUNK,
@@ -21,13 +22,16 @@ from replay.mcap.records import (
     RECORD_HEADER,
     Fields,
     MalformedRecord,
-    Statistics,
-    check_size,
     chunk_header,
-    statistics,
 )
 from replay.mcap.segments import Attachment, Definitions, IndexPart, Metadata, Refuse, Segment
-from replay.mcap.summary import indexed_segments
+from replay.mcap.summary import (
+    Summary,
+    definition,
+    read_summary,
+    stated_segments,
+    stated_spans,
+)
 from replay.storage.store import RandomFile
 
 RUN_BYTES: Final = 1024 * 1024
@@ -35,7 +39,6 @@ RUN_BYTES: Final = 1024 * 1024
 _CHUNK_HEADER: Final = 256
 _LOOSE: Final = struct.Struct("<HIQ")
 _INDEX: Final = struct.Struct("<HI")
-_FOOTER_BYTES: Final = RECORD_HEADER.size + 20
 _DATA_END_BYTES: Final = RECORD_HEADER.size + 4
 _OPEN_LENGTH: Final = 2**64 - 1
 _BEFORE_DATA: Final = 1024 * 1024
@@ -70,15 +73,12 @@ class Structure:
         self.attachments: list[Attachment] = []
         self.profile = ""
         self.library = ""
-        self.statistics: Statistics | None = None
+        self.summary: Summary | None = None
         self.complete = False
         self.missing = ""
         self.data_crc: int | None = None
         self.data_end = 0
-        self._chunk_offsets: list[int] = []
         self._limit: int | None = None
-        self._has_indexes = False
-        self._has_summary = False
         self._attachment_spans: list[tuple[int, int]] = []
         self._metadata_bytes = 0
         self._run: Segment | None = None
@@ -93,7 +93,7 @@ class Structure:
         if not by_index or not self._take_index():
             self._walk_data()
 
-    def go_on(self) -> int:
+    def resume(self) -> int:
         """Walk over what was appended to a file that had no end yet.
 
         Returns:
@@ -109,8 +109,7 @@ class Structure:
         if self.data_crc is not None:
             self._at, self.data_crc = self.data_end, None
         kept = len(self.segments)
-        self.tail, self.missing, self._limit = None, "", None
-        self.statistics, self._chunk_offsets, self._has_indexes = None, [], False
+        self.tail, self.missing = None, ""
         self._read_end()
         self._walk_data()
         return kept
@@ -123,24 +122,23 @@ class Structure:
 
     def _take_index(self) -> bool:
         """Take the chunks from the summary; whether it accounts for every message."""
-        if self._limit is None or not self._has_summary:
+        summary = self.summary
+        if summary is None:
             return False
-        known = set(self.definitions.channels)
-        stop = self._file.size - len(MAGIC) - _FOOTER_BYTES
         try:
-            found = indexed_segments(self._file, self._limit, stop, self.statistics, known)
-            if found is None:
+            segments = stated_segments(self._file, summary, set(self.definitions.channels))
+            if segments is None:
                 return False
-            segments, spans = found
+            attachments = stated_spans(self._file, summary, Opcode.ATTACHMENT_INDEX)
             self._record_at(len(MAGIC), None, Opcode.HEADER)
-            self._record_at(self._limit - _DATA_END_BYTES, self._limit, Opcode.DATA_END)
-            for start, end in spans.metadata:
-                self._record_at(start, end, Opcode.METADATA)
+            self._record_at(summary.begin - _DATA_END_BYTES, summary.begin, Opcode.DATA_END)
+            for start, stop in stated_spans(self._file, summary, Opcode.METADATA_INDEX):
+                self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord as error:
             self._refuse("summary", str(error))
             self._at, self.data_crc, self.metadata = len(MAGIC), None, []
             return False
-        self.segments, self._attachment_spans = segments, spans.attachments
+        self.segments, self._attachment_spans = segments, attachments
         self.by_index = self.complete = True
         return True
 
@@ -209,20 +207,22 @@ class Structure:
             return
         self._last_chunk = None
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self.definitions.add(opcode, self._definition(content, length), f"byte {self._at}")
+            self.definitions.add(
+                opcode, definition(self._file, content, length), f"byte {self._at}"
+            )
             return
         self._close_run()
         if opcode == Opcode.CHUNK:
             self._last_chunk = self._chunk(content, length)
             self.segments.append(self._last_chunk)
         elif opcode == Opcode.METADATA:
-            self._take_metadata(self._definition(content, length))
+            self._take_metadata(definition(self._file, content, length))
         elif opcode == Opcode.ATTACHMENT:
             self._attachment(content, length)
         elif opcode == Opcode.HEADER:
             if self._at != len(MAGIC):
                 raise MalformedRecord("a second header, as of two files in one")
-            fields = Fields(self._definition(content, length), "the header")
+            fields = Fields(definition(self._file, content, length), "the header")
             self.profile, self.library = fields.text(), fields.text()
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
@@ -232,11 +232,6 @@ class Structure:
             self.data_crc = crc
         elif opcode <= max(Opcode):
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
-
-    def _definition(self, content: int, length: int) -> bytes:
-        if length > MAX_DEFINITION:
-            raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
-        return self._file.read(content, length)
 
     def _chunk(self, content: int, length: int) -> Segment:
         header = chunk_header(self._file.peek(content, min(length, _CHUNK_HEADER)))
@@ -352,75 +347,27 @@ class Structure:
         return not any(any(block) for block in self._file.blocks(at, self._file.size))
 
     def _resume_after(self, at: int) -> bool:
-        """Go on at the next chunk the summary knows of."""
+        """Continue at the next chunk that the summary names."""
         self._close_run()
         self._last_chunk = None
-        place = bisect_right(self._chunk_offsets, at)
-        if place == len(self._chunk_offsets):
+        chunks = self.summary.chunks if self.summary else []
+        place = bisect_right(chunks, at)
+        if place == len(chunks):
             return False
-        self._at = self._chunk_offsets[place]
+        self._at = chunks[place]
         return True
 
     def _read_end(self) -> None:
         """Read footer and summary, where the file has them."""
-        file = self._file
-        footer_at = file.size - len(MAGIC) - _FOOTER_BYTES
-        if footer_at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
-            return
-        footer = file.read(footer_at, _FOOTER_BYTES)
-        opcode, length = RECORD_HEADER.unpack_from(footer)
-        if opcode != Opcode.FOOTER or length != 20:
-            self._refuse("footer", "it is no footer record")
-            return
-        start, offsets, crc = struct.unpack_from("<QQI", footer, RECORD_HEADER.size)
-        begin = start or offsets or footer_at
-        if not len(MAGIC) <= begin <= footer_at or (offsets and not begin <= offsets <= footer_at):
-            self._refuse("footer", "it points outside the file")
-            return
-        if crc:
-            value = file.crc(begin, footer_at + _FOOTER_BYTES - 4)
-            if value != crc:
-                self._refuse("summary", "its CRC does not match: damaged")
-                self._limit = begin
-                return
-        self._limit = begin
-        try:
-            self._walk_summary(begin, footer_at)
-            self._has_summary = start == begin
-        except MalformedRecord as error:
-            self._refuse("summary", str(error))
-
-    def _walk_summary(self, at: int, stop: int) -> None:
-        while at < stop:
-            opcode, length = RECORD_HEADER.unpack(
-                self._file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
-            )
-            content, end = at + RECORD_HEADER.size, at + RECORD_HEADER.size + length
-            if opcode == 0 or end > stop:
-                raise MalformedRecord(f"no record at byte {at}")
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.definitions.add(opcode, self._definition(content, length), "summary")
-            elif opcode == Opcode.STATISTICS:
-                self.statistics = statistics(self._definition(content, length))
-            elif opcode == Opcode.CHUNK_INDEX:
-                self._has_indexes = True
-                fields = Fields(self._file.peek(content, min(length, 24)), "a chunk index")
-                fields.take(16)
-                self._chunk_offsets.append(fields.integer(8))
-            elif opcode <= Opcode.DATA_END and opcode not in (
-                Opcode.ATTACHMENT_INDEX,
-                Opcode.METADATA_INDEX,
-                Opcode.SUMMARY_OFFSET,
-            ):
-                raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
-            at = end
-        self._chunk_offsets.sort()
+        self.summary = read_summary(self._file, self.definitions, self._refuse)
+        self._limit = self.summary.begin if self.summary else None
 
     def _compare_with_summary(self) -> None:
+        assert self.summary is not None
+        stated, named = self.summary.statistics, self.summary.chunks
         chunks = [s for s in self.segments if s.chunked]
-        if self._has_indexes and [c.offset for c in chunks] != self._chunk_offsets:
+        if named and [c.offset for c in chunks] != named:
             self._refuse("summary", "its chunk index does not name the chunks that are there")
-        stated = self.statistics
         if stated is None:
             return
         found = {

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import bisect
 import itertools
-from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,55 +14,24 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.viewfacts import ViewFacts
 from replay.mcap.reader import LogReader
-from replay.mcap.records import Bytes, Channel, MalformedRecord
+from replay.mcap.records import Channel, MalformedRecord
 from replay.mcap.segments import Segment
 from replay.mcap.tables import MessageTable
 
-_DECODED: Final = 4
 _BATCH: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
-    """Frames `start` to before `stop`, as the messages of a channel from `row` on."""
+class Span:
+    """The frames [start, stop), as the messages of a channel from `row` on."""
 
     start: int
     stop: int
     row: int
 
     def row_of(self, frame: int) -> int:
-        """Number of the message with a frame of the run."""
+        """Number of the message with a frame of the span."""
         return self.row + frame - self.start
-
-
-class Rows(Protocol):
-    """Decoded messages of one chunk."""
-
-    def rows(self, low: int, high: int) -> NDArray[Any]:
-        """Give rows `low` to before `high`, or to the last one."""
-
-
-@dataclass(frozen=True, slots=True)
-class PixelRows:
-    """Values that stand as bytes in a chunk: (B - size + 1, size) windows, (n,) places."""
-
-    windows: Bytes
-    at: NDArray[np.int64]
-
-    def rows(self, low: int, high: int) -> Bytes:
-        """Copy the values of some messages, (high - low, size)."""
-        return self.windows[self.at[low:high]]
-
-
-@dataclass(frozen=True, slots=True)
-class TruthRows:
-    """Ground truth of a chunk, (n, D)."""
-
-    values: NDArray[np.float64]
-
-    def rows(self, low: int, high: int) -> NDArray[np.float64]:
-        """Give the ground truth of some messages, (high - low, D)."""
-        return self.values[low:high]
 
 
 class Piece(NamedTuple):
@@ -92,44 +60,39 @@ class ChannelRows:
     Args:
         reader: the file.
         channel: the channel.
-        decode: gives for the channel's messages of one chunk an array with a row each.
     """
 
-    def __init__(
-        self, reader: LogReader, channel: Channel, decode: Callable[[MessageTable], Rows]
-    ) -> None:
+    def __init__(self, reader: LogReader, channel: Channel) -> None:
         self.channel = channel
         self._reader = reader
-        self._decode = decode
-        self._decoded: OrderedDict[int, Rows] = OrderedDict()
         self._segments: list[Segment] = []
         self._to_confirm: dict[int, ViewFacts] = {}
         self._starts = [0]
         self._taken: list[Segment] = []
         self._take_segments()
 
-    def runs(self, facts: ViewFacts, *, salvage: bool) -> list[Run]:
+    def spans(self, facts: ViewFacts, *, salvage: bool) -> list[Span]:
         """Number the messages by their log time.
 
         Args:
             facts: the clock of the recording.
-            salvage: take gaps and damaged chunks as several runs.
+            salvage: take gaps and damaged chunks as several spans.
 
         Raises:
             LogDamagedError: a log time that is no frame's, a frame twice or out of order,
                 and without `salvage` a frame that is missing.
         """
         if self._reader.by_index and not salvage:
-            return self._stated_runs(facts)
-        return self._runs_from(0, facts, salvage)
+            return self._stated_spans(facts)
+        return self._spans_from(0, facts, salvage)
 
-    def extended(self, facts: ViewFacts) -> list[Run]:
-        """Number the messages of a file that its recorder has made longer; as `runs`.
+    def extended(self, facts: ViewFacts) -> list[Span]:
+        """Number the messages of a file that its recorder has made longer; as `spans`.
 
         Raises:
-            LogDamagedError: as `runs`, without `salvage`.
+            LogDamagedError: as `spans`, without `salvage`.
         """
-        return self._runs_from(self._take_segments(), facts, False)
+        return self._spans_from(self._take_segments(), facts, False)
 
     def _take_segments(self) -> int:
         """Take in the chunks that hold messages; how many of those before are as they were."""
@@ -139,7 +102,6 @@ class ChannelRows:
             if self._segments and self._segments[-1] is last:
                 self._segments.pop()
                 self._starts.pop()
-                self._decoded.pop(len(self._segments), None)
         kept = len(self._segments)
         for segment in segments[len(self._taken) :]:
             count = self._count(segment)
@@ -149,10 +111,10 @@ class ChannelRows:
         self._taken = segments[:]
         return kept
 
-    def _runs_from(self, first: int, facts: ViewFacts, salvage: bool) -> list[Run]:
+    def _spans_from(self, first: int, facts: ViewFacts, salvage: bool) -> list[Span]:
         """Number the messages, those in the chunks before the `first`th without a look at them."""
         row = self._starts[first]
-        found = [Run(facts.first_frame, facts.first_frame + row, 0)] if row else []
+        found = [Span(facts.first_frame, facts.first_frame + row, 0)] if row else []
         batch: list[NDArray[np.uint64]] = []
         for number in range(first, len(self._segments)):
             damaged = salvage and self._reader.table(self._segments[number]) is None
@@ -167,14 +129,14 @@ class ChannelRows:
         self._number(batch, row, facts, found, salvage)
         return found
 
-    def _stated_runs(self, facts: ViewFacts) -> list[Run]:
+    def _stated_spans(self, facts: ViewFacts) -> list[Span]:
         """Number the messages by how many the summary says each chunk has.
 
         Each chunk's log times are compared with this when it is read.
         """
         self._to_confirm = dict.fromkeys(range(len(self._segments)), facts)
         count = self._starts[-1]
-        return [Run(facts.first_frame, facts.first_frame + count, 0)] if count else []
+        return [Span(facts.first_frame, facts.first_frame + count, 0)] if count else []
 
     def _confirm(self, number: int) -> None:
         """Check the log times of a chunk whose frames were numbered by the summary."""
@@ -182,7 +144,7 @@ class ChannelRows:
         if facts is None:
             return
         start = facts.first_frame + self._starts[number]
-        before = [Run(facts.first_frame, start, 0)] if self._starts[number] else []
+        before = [Span(facts.first_frame, start, 0)] if self._starts[number] else []
         try:
             self._number([self._times(number)], self._starts[number], facts, before, False)
         except MalformedRecord as error:
@@ -194,10 +156,10 @@ class ChannelRows:
         batch: list[NDArray[np.uint64]],
         row: int,
         facts: ViewFacts,
-        found: list[Run],
+        found: list[Span],
         salvage: bool,
     ) -> None:
-        """Add the frames of messages from `row` on to the runs found."""
+        """Add the frames of messages from `row` on to the spans found."""
         if not batch:
             return
         times = np.concatenate(batch)
@@ -218,9 +180,9 @@ class ChannelRows:
         for low, high in itertools.pairwise(edges):
             start = int(frames[low])
             if found and found[-1].stop == start and found[-1].row_of(start) == row + low:
-                found[-1] = Run(found[-1].start, start + high - low, found[-1].row)
+                found[-1] = Span(found[-1].start, start + high - low, found[-1].row)
             else:
-                found.append(Run(start, start + high - low, row + low))
+                found.append(Span(start, start + high - low, row + low))
 
     def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the messages in the `number`th chunk that holds any."""
@@ -230,24 +192,20 @@ class ChannelRows:
             return own[0] if len(own) == 1 else np.concatenate(own)
         return self._table(number).log_time
 
-    def first(self, row: int) -> bytes:
+    def payload(self, row: int) -> bytes:
         """Copy the payload of one message."""
         number = bisect.bisect_right(self._starts, row) - 1
         return self._table(number).payload(row - self._starts[number])
 
-    def fill(self, row: int, out: NDArray[Any]) -> None:
-        """Fill `out` with the decoded messages from `row` on.
+    def tables(self) -> Iterator[tuple[Segment, MessageTable]]:
+        """The messages chunk by chunk, without what is damaged where that is left out.
 
         Raises:
-            LogDamagedError: a chunk or a message in it is damaged.
+            LogDamagedError: a chunk is damaged, or holds more or fewer than its index says.
         """
-        at, count = 0, len(out)
-        number = bisect.bisect_right(self._starts, row) - 1
-        while at < count:
-            low = row + at - self._starts[number]
-            part = self._rows(number).rows(low, low + count - at)
-            out[at : at + len(part)] = part
-            at, number = at + len(part), number + 1
+        for segment in self._segments:
+            if self._reader.table(segment) is not None:
+                yield segment, own_messages(self._reader, segment, self.channel)
 
     def pieces(self, row: int, count: int, which: int) -> list[Piece]:
         """The chunks that hold `count` messages from `row` on."""
@@ -269,31 +227,25 @@ class ChannelRows:
         table = self._reader.table(segment)
         return 0 if table is None else int((table.channel == self.channel.id).sum())
 
-    def _rows(self, number: int) -> Rows:
-        if number in self._decoded:
-            return self._decoded[number]
-        try:
-            rows = self._decode(self._table(number))
-        except MalformedRecord as error:
-            raise LogDamagedError(
-                f"{self._reader.path}: {self._segments[number].name}: {error}"
-            ) from None
-        if len(self._decoded) >= _DECODED:
-            self._decoded.popitem(last=False)
-        self._decoded[number] = rows
-        return rows
-
     def _table(self, number: int) -> MessageTable:
-        segment = self._segments[number]
         self._confirm(number)
-        table = self._reader.table(segment)
-        if table is None:
-            raise LogDamagedError(f"{self._reader.path}: {segment.name} is damaged")
-        rows = table.select(np.flatnonzero(table.channel == self.channel.id))
-        stated = self._starts[number + 1] - self._starts[number]
-        if len(rows) != stated:
-            raise LogDamagedError(
-                f"{self._reader.path}: {segment.name} holds {len(rows)} messages of "
-                f"{self.channel.topic!r}, its index says {stated}; run cdmisfa recover"
-            )
-        return rows
+        return own_messages(self._reader, self._segments[number], self.channel)
+
+
+def own_messages(reader: LogReader, segment: Segment, channel: Channel) -> MessageTable:
+    """The messages of a channel in a chunk.
+
+    Raises:
+        LogDamagedError: the chunk is damaged, or holds more or fewer than its index says.
+    """
+    table = reader.table(segment)
+    if table is None:
+        raise LogDamagedError(f"{reader.path}: {segment.name} is damaged")
+    own = table.select(np.flatnonzero(table.channel == channel.id))
+    counts = segment.channel_counts()
+    if counts is not None and counts.get(channel.id, 0) != len(own):
+        raise LogDamagedError(
+            f"{reader.path}: {segment.name} holds {len(own)} messages of {channel.topic!r}, "
+            f"its index says {counts.get(channel.id, 0)}; run cdmisfa recover"
+        )
+    return own

@@ -1,4 +1,8 @@
-"""Chunks of a recording whose messages all look alike, decoded into memory that is used again."""
+"""Where the messages of a view hold their values, and copying these out of chunks.
+
+Chunks that are in order and written as our recorder does it are looked through by compiled
+code, in memory that is used again; all others by their tables, which say what is wrong with them.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,19 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
+from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.reader import LogReader
-from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord, decompress
+from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord
 from replay.mcap.segments import Segment
-from replay.storage.checksum import crc32
+from replay.mcap.tables import MessageTable
+from replay.recordings.channel_rows import own_messages
+from replay.storage.location import Location
 
 _KEPT: Final = 2
-_WINDOW: Final = MAX_CHUNK // 2
+
+Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,23 +32,42 @@ class RowLayout:
     """Where the messages of a channel hold their values, counted from a message's end.
 
     Attributes:
-        channel: its number.
+        channel: the channel.
+        what: a message of it, as an error names it.
         least: fewest bytes of a message.
-        marks: distance from the end -> byte that must stand there.
+        places: (M,) distances from the end of bytes that are the same in every message.
+        marks: (M,) those bytes.
         distances: (R,) of each value.
         width: bytes of a value.
     """
 
-    channel: int
+    channel: Channel
+    what: str
     least: int
-    marks: Sequence[tuple[int, int]]
-    distances: NDArray[np.int64]
+    places: Places
+    marks: Bytes
+    distances: Places
     width: int
+
+    def checked_ends(self, path: Location, segment: Segment, table: MessageTable) -> Places:
+        """Place after each message of the channel in its chunk, (n,).
+
+        Raises:
+            LogDamagedError: a message is not laid out like that.
+        """
+        ends = table.at + table.size
+        if (table.size < self.least).any():
+            wrong = "shorter than"
+        elif (table.data[ends[:, None] - self.places] != self.marks).any():
+            wrong = "laid out unlike"
+        else:
+            return ends
+        raise LogDamagedError(f"{path}: {segment.name}: {self.what} is {wrong} the others")
 
 
 @dataclass(frozen=True, slots=True)
 class ScannedChunk:
-    """A chunk that was found in order.
+    """A chunk whose messages are laid out as they should.
 
     Attributes:
         buffer: (>= B,) uint8, its records first.
@@ -49,7 +75,7 @@ class ScannedChunk:
     """
 
     buffer: Bytes
-    ends: NDArray[np.int64]
+    ends: Places
 
 
 class ChunkScanner:
@@ -62,61 +88,62 @@ class ChunkScanner:
 
     def __init__(self, reader: LogReader, layouts: Sequence[RowLayout]) -> None:
         # Imported with the first block that is read, so that looking at a log compiles nothing.
-        from replay.recordings import kernels as scan
+        from replay.recordings import kernels
 
-        self._scan, self._gather = scan.scan, scan.gather
+        self._kernels = kernels
         self._reader = reader
         self._layouts = layouts
         longest = max(len(layout.marks) for layout in layouts)
-        self._channels = np.array([layout.channel for layout in layouts], np.int64)
+        self._channels = np.array([layout.channel.id for layout in layouts], np.int64)
         self._least = np.array([layout.least for layout in layouts], np.int64)
         self._places = np.zeros((len(layouts), longest), np.int64)
         self._marks = np.zeros((len(layouts), longest), np.uint8)
         for c, layout in enumerate(layouts):
-            for k, (distance, byte) in enumerate(layout.marks):
-                self._places[c, k], self._marks[c, k] = distance, byte
-        self._zstd = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
-        self._kept: OrderedDict[int, ScannedChunk | None] = OrderedDict()
+            self._places[c, : len(layout.marks)] = layout.places
+            self._marks[c, : len(layout.marks)] = layout.marks
+        self._kept: OrderedDict[int, ScannedChunk] = OrderedDict()
 
-    def chunk(self, segment: Segment) -> ScannedChunk | None:
-        """Decode and check a chunk; None where it is not in order or not written as we do it.
+    def chunk(self, segment: Segment) -> ScannedChunk:
+        """Decode and check a chunk.
 
         What it gives is good until two other chunks are asked for.
+
+        Raises:
+            LogDamagedError: it is damaged, or a message of the view is not laid out like others.
         """
         key = segment.offset
-        if key in self._kept:
-            return self._kept[key]
-        buffer = np.empty(0, np.uint8)
-        if len(self._kept) >= _KEPT:
-            _, old = self._kept.popitem(last=False)
-            buffer = buffer if old is None else old.buffer
-        self._kept[key] = found = self._decode(segment, buffer)
-        return found
+        if key not in self._kept:
+            buffer = np.empty(0, np.uint8)
+            if len(self._kept) >= _KEPT:
+                buffer = self._kept.popitem(last=False)[1].buffer
+            self._kept[key] = self.scanned(segment, buffer) or self.tabled(segment)
+        return self._kept[key]
 
     def copy(self, chunk: ScannedChunk, which: int, low: int, out: NDArray[Any]) -> None:
         """Copy the values of a channel's messages from the `low`th of a chunk on, as bytes."""
         layout = self._layouts[which]
         ends = chunk.ends[which, low : low + len(out)]
-        self._gather(chunk.buffer, ends, layout.distances, layout.width, out)
+        self._kernels.gather(chunk.buffer, ends, layout.distances, layout.width, out)
 
-    def _decode(self, segment: Segment, buffer: Bytes) -> ScannedChunk | None:
+    def scanned(self, segment: Segment, buffer: Bytes) -> ScannedChunk | None:
+        """Decode a chunk into a buffer, where it is large enough, by compiled code.
+
+        Returns:
+            None where the chunk is not in order, or not written as our recorder does it.
+        """
         size, counts = segment.size, segment.channel_counts()
         if counts is None or segment.cut or not segment.indexes or not 0 < size <= MAX_CHUNK:
             return None
         if len(buffer) < size:
             buffer = np.empty(size + size // 8, np.uint8)
-        try:
-            stored, index = self._reader.stored(segment)
-            if not self._decompress(stored, segment, buffer):
-                return None
-        except (MalformedRecord, zstandard.ZstdError):
-            return None
         data = buffer[:size]
-        if segment.crc and crc32(data.data) != segment.crc:
+        try:
+            index = self._reader.unpack(segment, data)
+        except MalformedRecord:
             return None
-        wanted = [counts.get(layout.channel, 0) for layout in self._layouts]
+        wanted = [counts.get(int(channel), 0) for channel in self._channels]
         ends = np.empty((len(wanted), max(wanted)), np.int64)
-        if max(segment.start, segment.end) >= 2**63 or not self._scan(
+        if max(segment.start, segment.end) >= 2**63 or not self._kernels.scan(
             data,
             np.frombuffer(index, np.uint8),
             segment.start,
@@ -131,13 +158,14 @@ class ChunkScanner:
             return None
         return ScannedChunk(buffer, ends)
 
-    def _decompress(self, stored: memoryview, segment: Segment, buffer: Bytes) -> bool:
-        size = segment.size
-        if segment.compression != "zstd":
-            raw = decompress(bytes(stored), segment.compression, size)
-            buffer[:size] = np.frombuffer(raw, np.uint8)
-            return True
-        if zstandard.frame_content_size(stored) != size:
-            return False
-        # Where the whole output fits, zstd writes straight into it.
-        return bool(self._zstd.stream_reader(stored).readinto(buffer[:size].data) == size)
+    def tabled(self, segment: Segment) -> ScannedChunk:
+        """Decode a chunk by its tables.
+
+        Raises:
+            LogDamagedError: it is damaged, or a message of the view is not laid out like others.
+        """
+        tables = [own_messages(self._reader, segment, layout.channel) for layout in self._layouts]
+        ends = np.zeros((len(tables), max(map(len, tables))), np.int64)
+        for which, (layout, table) in enumerate(zip(self._layouts, tables, strict=True)):
+            ends[which, : len(table)] = layout.checked_ends(self._reader.path, segment, table)
+        return ScannedChunk(tables[0].data.copy(), ends)

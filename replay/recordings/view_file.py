@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import operator
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +22,13 @@ from recorder.log.messages import (
     VECTOR_SCHEMA,
     Payload,
     image_payload,
-    truth_layout,
     truth_tags,
     vector_payload,
     view_topic,
 )
 from recorder.log.viewfacts import view_facts
 from replay.mcap.reader import LogReader
-from replay.mcap.records import MalformedRecord
-from replay.mcap.tables import MessageTable, windows
-from replay.recordings.channel_rows import ChannelRows, PixelRows, Rows, Run, TruthRows
+from replay.recordings.channel_rows import ChannelRows, Span
 from replay.recordings.scanner import ChunkScanner, RowLayout
 from replay.storage.location import Location
 
@@ -47,8 +43,8 @@ class ViewFile:
     Attributes:
         path: the file.
         facts: what it states about itself.
-        ranges: the frames that are there with their ground truth, from and up to before;
-            one range, except with `salvage`.
+        ranges: the frames that are there with their ground truth, each [start, stop); one range,
+            except with `salvage`.
     """
 
     def __init__(
@@ -78,29 +74,20 @@ class ViewFile:
         self.facts = view_facts(self.path, records[0].values)
         self.reader.expect(self.reader.segments)
         image = self.facts.dtype == "uint8"
-        self._truth_layout = layout = truth_layout(self.facts.truth)
-        tags = truth_tags(self.facts.truth)
-        offsets = [layout.fields[f"tag_{i}"][1] for i in range(len(tags))] if layout.fields else []
-        self._tag_places = [
-            place + k for place, tag in zip(offsets, tags, strict=True) for k in range(len(tag))
-        ]
-        self._tag_bytes = np.frombuffer(b"".join(tags), np.uint8)
         self._frames = self._channel(
-            view_topic(self.facts.view), IMAGE_SCHEMA if image else VECTOR_SCHEMA, self._pixels
+            view_topic(self.facts.view), IMAGE_SCHEMA if image else VECTOR_SCHEMA
         )
-        self._truth = (
-            self._channel(TRUTH_TOPIC, TRUTH_SCHEMA, self._truths) if self.facts.truth else None
-        )
-        truth = self._truth.runs(self.facts, salvage=salvage) if self._truth is not None else []
-        self._number(self._frames.runs(self.facts, salvage=salvage), truth)
+        self._truth = self._channel(TRUTH_TOPIC, TRUTH_SCHEMA) if self.facts.truth else None
+        truth = self._truth.spans(self.facts, salvage=salvage) if self._truth is not None else []
+        self._number(self._frames.spans(self.facts, salvage=salvage), truth)
 
-    def _number(self, frames: list[Run], truth: list[Run]) -> None:
+    def _number(self, frames: list[Span], truth: list[Span]) -> None:
         """Find the frames that have their ground truth."""
-        self._frame_runs, self._truth_runs = frames, truth
-        self.ranges = [(run.start, run.stop) for run in frames]
+        self._frame_spans, self._truth_spans = frames, truth
+        self.ranges = [(span.start, span.stop) for span in frames]
         if self._truth is not None:
-            self.ranges = intersection(self.ranges, [(run.start, run.stop) for run in truth])
-        self._payload = self._find_payload() if self.ranges else Payload(0, 0, b"")
+            self.ranges = intersection(self.ranges, [(span.start, span.stop) for span in truth])
+        self._layouts = self._find_layouts() if self.ranges else []
 
     def is_at(self, path: Path) -> bool:
         """Whether a path leads to the very file that was opened."""
@@ -123,26 +110,8 @@ class ViewFile:
         """Frames that are there."""
         return sum(stop - start for start, stop in self.ranges)
 
-    def frames(self, start: int, out: NDArray[Any]) -> None:
-        """Fill (n, *frame_shape) with the frames from `start` on, all in one of `ranges`.
-
-        Raises:
-            LogDamagedError: a chunk or a message in it is damaged.
-        """
-        flat = out.reshape(len(out), -1).view(np.uint8)
-        self._frames.fill(_row(self._frame_runs, start), flat)
-
-    def truth(self, start: int, out: NDArray[np.float64]) -> None:
-        """Fill (n, D) with the ground truth of the frames from `start` on.
-
-        Raises:
-            LogDamagedError: a chunk or a message in it is damaged.
-        """
-        if self._truth is not None:
-            self._truth.fill(_row(self._truth_runs, start), out)
-
     def take(self, start: int, frames: NDArray[Any], truth: NDArray[np.float64]) -> None:
-        """Fill frames and ground truth as `frames` and `truth` do, as fast as it goes.
+        """Fill in the frames from `start` on, all in one of `ranges`, and their ground truth.
 
         Args:
             start: the first frame.
@@ -153,51 +122,55 @@ class ViewFile:
             LogDamagedError: a chunk or a message in it is damaged.
         """
         if self._scanner is None:
-            self._scanner = ChunkScanner(self.reader, self._layouts())
+            self._scanner = ChunkScanner(self.reader, self._layouts)
         outs = [frames.reshape(len(frames), -1).view(np.uint8)]
-        pieces = self._frames.pieces(_row(self._frame_runs, start), len(frames), 0)
+        pieces = self._frames.pieces(_row(self._frame_spans, start), len(frames), 0)
         if self._truth is not None:
             outs.append(truth.view(np.uint8))
-            pieces += self._truth.pieces(_row(self._truth_runs, start), len(truth), 1)
+            pieces += self._truth.pieces(_row(self._truth_spans, start), len(truth), 1)
             # In the order of the file, so that each chunk is decoded once.
             pieces.sort(key=operator.itemgetter(0))
         for piece in pieces:
-            out = outs[piece.which][piece.at : piece.at + piece.n]
             chunk = self._scanner.chunk(piece.segment)
-            if chunk is not None:
-                self._scanner.copy(chunk, piece.which, piece.low, out)
-            elif piece.which:
-                self.truth(start + piece.at, truth[piece.at : piece.at + piece.n])
-            else:
-                self.frames(start + piece.at, frames[piece.at : piece.at + piece.n])
+            out = outs[piece.which][piece.at : piece.at + piece.n]
+            self._scanner.copy(chunk, piece.which, piece.low, out)
+
+    def check(self) -> None:
+        """Look at how every frame and its ground truth are laid out, and compile nothing for it.
+
+        Raises:
+            LogDamagedError: a message in it is damaged, or a chunk that was not passed over.
+        """
+        for rows, layout in zip((self._frames, self._truth), self._layouts, strict=False):
+            for segment, table in rows.tables() if rows is not None else ():
+                layout.checked_ends(self.path, segment, table)
 
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
         self.reader.close()
 
-    def _layouts(self) -> list[RowLayout]:
+    def _find_layouts(self) -> list[RowLayout]:
         """Where the frames and the ground truth stand in their messages."""
-        payload = self._payload
+        payload = self._find_payload()
         place = payload.tail + payload.size
-        least = place + len(payload.before)
-        marks = [(least - k, byte) for k, byte in enumerate(payload.before)]
-        layouts = [
-            RowLayout(self._frames.channel.id, least, marks, np.array([place]), payload.size)
+        marks = np.frombuffer(payload.before, np.uint8)
+        least = place + len(marks)
+        places, values = least - np.arange(len(marks)), np.array([place])
+        found = [
+            RowLayout(self._frames.channel, "a frame", least, places, marks, values, payload.size)
         ]
         if self._truth is not None:
-            layout = self._truth_layout
-            size = layout.itemsize
-            marks = [
-                (size - at, int(byte))
-                for at, byte in zip(self._tag_places, self._tag_bytes, strict=True)
-            ]
-            places = [size - int(layout.fields[name][1]) for name in self.facts.truth]  # type: ignore[index]
-            layouts.append(RowLayout(self._truth.channel.id, size, marks, np.array(places), 8))
-        return layouts
+            tags = truth_tags(self.facts.truth)
+            marks = np.frombuffer(b"".join(tags), np.uint8)
+            # Each value of 8 bytes stands behind its tag.
+            sizes = np.array([len(tag) for tag in tags])
+            after = np.cumsum((sizes + 8)[::-1])[::-1]
+            places = np.concatenate([at - np.arange(n) for at, n in zip(after, sizes, strict=True)])
+            channel, least = self._truth.channel, int(after[0])
+            found.append(RowLayout(channel, "ground truth", least, places, marks, after - sizes, 8))
+        return found
 
-    def _channel(
-        self, topic: str, schema: str, decode: Callable[[MessageTable], Rows]
-    ) -> ChannelRows:
+    def _channel(self, topic: str, schema: str) -> ChannelRows:
         channels = [c for c in self.reader.channels.values() if c.topic == topic]
         if len(channels) != 1:
             raise LogDamagedError(
@@ -206,13 +179,13 @@ class ViewFile:
         known = self.reader.schemas.get(channels[0].schema_id)
         if known is None or known.name != schema or channels[0].encoding != "protobuf":
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
-        return ChannelRows(self.reader, channels[0], decode)
+        return ChannelRows(self.reader, channels[0])
 
     def _find_payload(self) -> Payload:
         shape = self.facts.frame_shape
         if self.facts.dtype == "float64":
             return vector_payload(shape[0])
-        first = self._frames.first(_row(self._frame_runs, self.ranges[0][0]))
+        first = self._frames.payload(_row(self._frame_spans, self.ranges[0][0]))
         try:
             image = RawImage.FromString(first)
         except DecodeError:
@@ -225,31 +198,6 @@ class ViewFile:
         if image.encoding != IMAGE_ENCODING:
             raise LogDamagedError(f"{self.path}: its frames are {image.encoding!r}, not mono8")
         return image_payload(shape[0], shape[1], image.frame_id)
-
-    def _pixels(self, table: MessageTable) -> PixelRows:
-        payload = self._payload
-        before = np.frombuffer(payload.before, np.uint8)
-        at = table.at + table.size - payload.tail - payload.size
-        if (at - len(before) < table.at).any():
-            raise MalformedRecord("a frame is shorter than the others")
-        if (table.gather(at - len(before), len(before)) != before).any():
-            raise MalformedRecord("a frame is laid out unlike the others")
-        return PixelRows(windows(table.data, payload.size), at)
-
-    def _truths(self, table: MessageTable) -> TruthRows:
-        names = self.facts.truth
-        layout = self._truth_layout
-        at = table.at + table.size - layout.itemsize
-        if (at < table.at).any():
-            raise MalformedRecord("ground truth is shorter than its fields")
-        raw = table.gather(at, layout.itemsize)
-        if (raw[:, self._tag_places] != self._tag_bytes).any():
-            raise MalformedRecord("ground truth is not laid out as cdmisfa does it")
-        rows = raw.view(layout)[:, 0]
-        values = np.empty((len(rows), len(names)))
-        for i, name in enumerate(names):
-            values[:, i] = rows[name]
-        return TruthRows(values)
 
 
 def intersection(one: list[tuple[int, int]], two: list[tuple[int, int]]) -> list[tuple[int, int]]:
@@ -267,6 +215,6 @@ def intersection(one: list[tuple[int, int]], two: list[tuple[int, int]]) -> list
     return found
 
 
-def _row(runs: list[Run], frame: int) -> int:
-    place = bisect.bisect_right(runs, frame, key=lambda run: run.start) - 1
-    return runs[place].row_of(frame)
+def _row(spans: list[Span], frame: int) -> int:
+    place = bisect.bisect_right(spans, frame, key=lambda span: span.start) - 1
+    return spans[place].row_of(frame)

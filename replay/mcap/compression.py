@@ -1,0 +1,112 @@
+"""Decompressing chunks, which may lie about their size and hold anything."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import lz4.frame
+import numpy as np
+import zstandard
+
+from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
+
+_WINDOW: Final = MAX_CHUNK // 2
+"""Most memory that zstd may take for its window, in bytes."""
+_BROKEN: Final = (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError)
+
+
+class Decompressor:
+    """Decompresses the chunks of a file, one after the other."""
+
+    def __init__(self) -> None:
+        self._zstd = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
+
+    def decompress(self, stored: memoryview, compression: str, out: Bytes) -> None:
+        """Write the records of a chunk into memory of the size that it states.
+
+        Raises:
+            MalformedRecord: an unknown compression, more than `MAX_CHUNK` bytes, broken data,
+                or another number of bytes than stated.
+        """
+        size = len(out)
+        check_size(compression, size)
+        try:
+            if compression == "zstd":
+                there = self._from_zstd(stored, out)
+            else:
+                data = _from_lz4(stored, size) if compression == "lz4" else stored
+                there = len(data)
+                if there == size:
+                    out[:] = np.frombuffer(data, np.uint8)
+        except _BROKEN as error:
+            raise MalformedRecord(f"its {compression} data is broken ({error})") from None
+        if there != size:
+            raise MalformedRecord(f"it states {size} bytes decompressed and holds {there}")
+
+    def _from_zstd(self, stored: memoryview, out: Bytes) -> int:
+        """How many bytes there are; one more than fit stands for any number of them."""
+        size = len(out)
+        stated = int(zstandard.frame_content_size(stored))
+        if stated > size:
+            return stated
+        if stated == size:
+            # Where the whole output fits, zstd writes straight into it.
+            if size and self._zstd.stream_reader(stored).readinto(out.data) != size:
+                raise MalformedRecord("its zstd data is cut short")
+            return size
+        data = b""
+        if stated == -1:
+            data = self._zstd.decompress(stored, max_output_size=max(size, 1))
+        if len(data) != size:
+            data = self._zstd.stream_reader(stored, read_across_frames=True).read(size + 1)
+        if len(data) == size:
+            out[:] = np.frombuffer(data, np.uint8)
+        return len(data)
+
+    def prefix(self, stored: bytes, compression: str, size: int) -> bytes:
+        """Give what can be decompressed of a chunk that was cut short, `size` bytes at most.
+
+        Raises:
+            MalformedRecord: an unknown compression, or nothing can be.
+        """
+        check_size(compression, size)
+        if compression == "":
+            return stored[:size]
+        parts: list[bytes] = []
+        try:
+            if compression == "lz4":
+                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size))
+            held = 0
+            reader = self._zstd.stream_reader(stored)
+            while held < size and (part := reader.read(min(size - held, 1 << 17))):
+                parts.append(part)
+                held += len(part)
+        except _BROKEN as error:
+            if not (parts and isinstance(error, zstandard.ZstdError)):
+                raise MalformedRecord(f"its {compression} data is broken ({error})") from None
+        return b"".join(parts)
+
+
+def check_size(compression: str, size: int) -> None:
+    """Refuse a chunk that cannot or must not be decompressed.
+
+    Raises:
+        MalformedRecord: an unknown compression, or more than `MAX_CHUNK` bytes.
+    """
+    if compression not in ("", "zstd", "lz4"):
+        raise MalformedRecord(f"its compression {compression[:40]!r} is unknown")
+    if size > MAX_CHUNK:
+        raise MalformedRecord(
+            f"it states {size} bytes decompressed, above the limit of {MAX_CHUNK} bytes"
+        )
+
+
+def _from_lz4(stored: memoryview, size: int) -> bytes:
+    stated = lz4.frame.get_frame_info(stored)["content_size"]
+    if stated not in (0, size):
+        raise MalformedRecord(f"it states {size} bytes decompressed, its data {stated}")
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    data = bytes(decompressor.decompress(stored, max_length=size + 1))
+    if not decompressor.eof and len(data) <= size:
+        raise MalformedRecord("its lz4 data is cut short")
+    return data
