@@ -36,8 +36,9 @@ from replay.viewer.catalogue import (
     serve_catalogue,
     set_layout,
 )
+from replay.viewer.display import missing_driver
+from replay.viewer.headless import headless_viewer
 from replay.viewer.program import free_port, running
-from replay.viewer.window import headless_viewer, missing_driver
 
 
 @pytest.fixture

@@ -19,8 +19,7 @@ from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings import kernels as scan
 from replay.runs.stretches import read_signals
-from replay.viewer import live
-from replay.viewer import window as viewer
+from replay.viewer import display, headless, live
 from replay.viewer.live import LiveView
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
@@ -129,9 +128,9 @@ def test_rerun_switched_off_is_said(monkeypatch):
         LiveView(VECTOR, MANIFEST, 40, 1)
 
 
-@pytest.mark.skipif(bool(viewer.missing_driver()), reason=viewer.missing_driver())
+@pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
 def test_a_viewer_that_connects_shows_it(tmp_path):
-    with LiveView(IMAGE, MANIFEST, 40, 1) as view, viewer.headless_viewer("900x600") as opened:
+    with LiveView(IMAGE, MANIFEST, 40, 1) as view, headless.headless_viewer("900x600") as opened:
         feed(view, IMAGE)
         view.flush()
 

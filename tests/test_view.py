@@ -29,11 +29,12 @@ from replay.runs.outline import read_outline
 from replay.runs.stretches import read_signals
 from replay.view import layout
 from replay.view import run as run_view
+from replay.view.bindings import viewer_program
 from replay.view.build import build_view
 from replay.view.columns import TensorBatch
 from replay.view.summary import summary_text
-from replay.viewer import window as viewer
-from replay.viewer.program import check_limit, environment, program, run_program
+from replay.viewer import display, headless, window
+from replay.viewer.program import check_limit, environment, run_program
 
 ITERATIONS = 24
 TAU = 40
@@ -230,10 +231,10 @@ def test_the_view_that_is_opened_has_no_name_to_be_left_behind(tmp_path, monkeyp
         assert list((tmp_path / "temporary").iterdir()) == []
         given.append((arguments, view.read(4)))
 
-    monkeypatch.setattr(viewer, "run_program", program)
-    monkeypatch.setattr(viewer, "has_display", lambda: True)
-    viewer.open_window(tmp_path)
-    viewer.serve(tmp_path)
+    monkeypatch.setattr(window, "run_program", program)
+    monkeypatch.setattr(window, "has_display", lambda: True)
+    window.open_window(tmp_path)
+    window.serve(tmp_path)
     assert [("-" in arguments, head) for arguments, head in given] == [(True, b"RRF2")] * 2
 
 
@@ -321,7 +322,7 @@ def test_a_recording_has_a_view(tmp_path):
     assert len(rows["/world/truth"]["frame"]) == 120
 
 
-needs_driver = pytest.mark.skipif(bool(viewer.missing_driver()), reason=viewer.missing_driver())
+needs_driver = pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
 
 
 @needs_driver
@@ -330,7 +331,7 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
     write_run(tmp_path / "run.mcap", IMAGE, ITERATIONS)
     build_view(tmp_path, tmp_path / "run.rrd")
     blocks = [block for _, block in run_of(IMAGE, ITERATIONS)]
-    with viewer.headless_viewer() as opened:
+    with headless.headless_viewer() as opened:
         opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
         views = {view.name: view for view in opened.ask(all_views)}
         assert "What happened" in views
@@ -356,7 +357,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(tmp_path
     monkeypatch.setattr(layout, "blueprint", side_by_side)
     build_view(tmp_path, tmp_path / "run.rrd")
     assert len(tabs) == 6
-    with viewer.headless_viewer("2400x1600") as opened:
+    with headless.headless_viewer("2400x1600") as opened:
         opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
         views = opened.ask(all_views)
         assert len(views) > 25
@@ -382,43 +383,43 @@ def shows(client, view, grey):
 @needs_driver
 def test_a_screenshot_is_a_picture(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 6)
-    viewer.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
+    headless.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
     with Image.open(tmp_path / "s.png") as picture:
         assert picture.size in ((800, 500), (1600, 1000))
         assert len(np.unique(np.asarray(picture.convert("L")))) > 20
     with pytest.raises(UsageError, match="--force"):
-        viewer.screenshot(tmp_path, tmp_path / "s.png")
+        headless.screenshot(tmp_path, tmp_path / "s.png")
 
 
 def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.setattr(viewer, "DRIVERS", str(tmp_path / "*.json"))
-    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
+    monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(CdmisfaError, match="mesa-vulkan-drivers"):
-        viewer.screenshot(tmp_path, tmp_path / "s.png")
+        headless.screenshot(tmp_path, tmp_path / "s.png")
 
 
 def test_telemetry_is_off():
     assert environment()["CI"] == "1"
-    assert program().is_file()
+    assert viewer_program().is_file()
 
 
 def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(CdmisfaError, match=r"no display .* --web"):
-        viewer.open_window(tmp_path)
+        window.open_window(tmp_path)
     for limit in ("banana", "4", "GB", "-1GB"):
         with pytest.raises(UsageError, match="4GB or 75%"):
-            viewer.open_window(tmp_path, memory_limit=limit)
+            window.open_window(tmp_path, memory_limit=limit)
     assert [check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
     with pytest.raises(UsageError, match="at least 1"):
         build_view(tmp_path, tmp_path / "v.rrd", every=0)
     last = max(s.t + len(s.y) - 1 for s in read_signals(tmp_path))
     with pytest.raises(UsageError, match=f"the last of .* is {last}$"):
-        viewer.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)
+        headless.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a child")
@@ -429,7 +430,7 @@ def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
     program.chmod(0o755)
     code = (
         "import sys, pathlib, replay.viewer.program as v\n"
-        f"v.program = lambda: pathlib.Path({str(program)!r})\n"
+        f"v.viewer_program = lambda: pathlib.Path({str(program)!r})\n"
         "v.run_program([])\n"
     )
     with subprocess.Popen([sys.executable, "-c", code]) as parent:
@@ -449,7 +450,7 @@ def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
     script = tmp_path / "program"
     script.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
     script.chmod(0o755)
-    monkeypatch.setattr("replay.viewer.program.program", lambda: script)
+    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: script)
     with pytest.raises(CdmisfaError, match="code 3: no luck"):
         run_program([])
     assert capfd.readouterr().err == ""

@@ -6,6 +6,7 @@ The view can always be built again: the logs are the archive.
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -69,6 +70,20 @@ def build_view(
     else:
         with recording_to(out, path.resolve().stem, path) as recording:
             write_recording(recording, path, every)
+
+
+@contextlib.contextmanager
+def view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
+    """The view of a run, built for as long as it is looked at."""
+    if path.suffix == ".rrd":
+        if not path.is_file():
+            raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="cdmisfa-view-") as folder:
+        view = Path(folder) / f"{path.resolve().stem}.rrd"
+        build_view(path, view, every=every, all_views=all_views)
+        yield view
 
 
 @contextlib.contextmanager

@@ -14,7 +14,6 @@ from cdmisfa.core.errors import UsageError
 from replay.palette import colour
 from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
-from replay.runs.folders import run_log
 from replay.runs.stretches import read_columns
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, Column, line_column
@@ -85,7 +84,7 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
     header = row.outline.header
     shown = row.outline.streams(MOST_STREAMS)
     lines: dict[str, Column] = {}
-    for columns in read_columns(run_log(run), header):
+    for columns in read_columns(run, header):
         for entity, values in _curves(columns, header.spec.streams, shown):
             path, rows = f"{root}/{entity}", values.reshape(len(columns), -1)
             if path not in lines:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import re
-import subprocess
 import sys
 import tempfile
 import threading
@@ -20,12 +19,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rerun_bindings import CatalogClientInternal, RrdReaderInternal
-
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import run_log, runs_in
+from replay.view.bindings import CatalogueClient, RrdReader
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
-from replay.viewer.program import free_port, has_display, running
+from replay.viewer.display import has_display
+from replay.viewer.program import Program, free_port, open_address, running
 
 VIEW_FILE = "run.rrd"
 """Name of the view in a run's folder."""
@@ -118,19 +117,18 @@ def serve_catalogue(
             follow.join(LAST_SECONDS)
 
 
-def _created(address: str, name: str, server: subprocess.Popen[bytes]) -> Any:
+def _created(address: str, name: str, server: Program) -> Any:
     """A new dataset of a server that is starting; None where the server has ended.
 
     Raises:
         CdmisfaError: it does not listen in time.
     """
-    # Rerun's public client of a catalogue needs DataFusion; for this it is too much.
     end, refusal = time.monotonic() + START_SECONDS, ""
     while time.monotonic() < end:
         if server.poll() is not None:
             return None
         try:
-            return CatalogClientInternal(address).create_dataset(name)
+            return CatalogueClient(address).create_dataset(name)
         except REFUSALS as error:
             refusal = str(error).splitlines()[0]
         time.sleep(0.01)
@@ -147,9 +145,7 @@ def _follow(
 ) -> None:
     """Open the table of runs, and add the views to it."""
     if has_display():
-        from replay.viewer.live import open_live
-
-        open_live(table)
+        open_address(table)
     try:
         set_layout(runs, dataset, place)
     except (CdmisfaError, *REFUSALS) as error:
@@ -241,7 +237,7 @@ def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str
 
 def _without_properties(view: Path, out: Path) -> Path:
     """A copy of a view that leaves a run's properties to its row."""
-    reader = RrdReaderInternal(str(view))
+    reader = RrdReader(str(view))
     (store,) = (s for s in reader.store_entries() if s.kind == "recording")
     kept = reader.stream(store).drop_matching(content=["/__properties/**"])
     kept.write_rrd(str(out), store.application_id, store.recording_id)
@@ -256,6 +252,6 @@ def _dataset_name(folder: Path) -> str:
 def _identity(view: Path) -> str:
     """Name of the recording in a view, "" where it cannot be read."""
     with contextlib.suppress(*REFUSALS):
-        stores = RrdReaderInternal(str(view)).store_entries()
+        stores = RrdReader(str(view)).store_entries()
         return next((str(s.recording_id) for s in stores if s.kind == "recording"), "")
     return ""

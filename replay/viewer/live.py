@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,7 +30,7 @@ from replay.runs.stretches import read_stretches
 from replay.view.layout import MOST_MODULES, MOST_STREAMS, RunLayout
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
-from replay.viewer.program import environment, free_port, program
+from replay.viewer.program import free_port
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
@@ -167,19 +166,6 @@ class LiveView(Sink):
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-
-def open_live(address: str, memory_limit: str = "2GB") -> None:
-    """Open a viewer on a live view; it stays open when the run has ended."""
-    command = [str(program()), "--connect", address, "--memory-limit", memory_limit]
-    subprocess.Popen(
-        command,
-        env=environment(),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
 
 
 def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:

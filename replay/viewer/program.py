@@ -12,20 +12,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import BinaryIO
 
-import rerun_cli
-
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.view.bindings import viewer_program
 
 LIMIT = re.compile(r"\d+(%|B|[kMGT]B|[KMGT]iB)")
 """What Rerun takes for a limit of memory; another makes it panic."""
-
-
-def program() -> Path:
-    """The viewer itself; the `rerun` on the path is a wrapper that leaves it behind when ended."""
-    return Path(rerun_cli.__file__).with_name("rerun.exe" if os.name == "nt" else "rerun")
 
 
 def environment() -> dict[str, str]:
@@ -44,25 +37,47 @@ def check_limit(limit: str) -> str:
     return limit
 
 
-def has_display() -> bool:
-    """Whether a window can be opened."""
-    return not sys.platform.startswith("linux") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
+class Program(subprocess.Popen[bytes]):
+    """The viewer, or its server, as it runs.
 
+    Args:
+        arguments: of the program.
+        words: a file for its output; it hangs when nobody empties a pipe.
+        given: its standard input.
+    """
 
-def last_words(words: BinaryIO) -> str:
-    """What a viewer said about its end, in one line."""
-    words.seek(0)
-    lines = [line for line in words.read().decode("utf-8", "replace").splitlines() if line.strip()]
-    last = lines[-1].strip() if lines else "it does not say why"
-    return next((line for line in lines if "panicked" in line), last)
+    def __init__(self, arguments: Sequence[str], words: BinaryIO, given: BinaryIO | None) -> None:
+        self._words = words
+        super().__init__(
+            [str(viewer_program()), *arguments],
+            env={**environment(), "RUST_LOG": "warn"},
+            stdin=given,
+            stdout=words,
+            stderr=words,
+            preexec_fn=ends_with_parent(),
+        )
+
+    def last_words(self) -> str:
+        """What it said about its end, in one line."""
+        self._words.seek(0)
+        text = self._words.read().decode("utf-8", "replace")
+        lines = [line for line in text.splitlines() if line.strip()]
+        last = lines[-1].strip() if lines else "it does not say why"
+        return next((line for line in lines if "panicked" in line), last)
+
+    def end(self) -> None:
+        """End it, if need be by force."""
+        with contextlib.suppress(ProcessLookupError):
+            self.terminate()
+        try:
+            self.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            self.wait()
 
 
 @contextlib.contextmanager
-def running(
-    arguments: Sequence[str], given: BinaryIO | None = None
-) -> Iterator[subprocess.Popen[bytes]]:
+def running(arguments: Sequence[str], given: BinaryIO | None = None) -> Iterator[Program]:
     """The viewer, or its server, while the body runs; ended on the way out.
 
     Args:
@@ -72,24 +87,15 @@ def running(
     Raises:
         CdmisfaError: it has ended with an error, whose last words are given.
     """
-    command = [str(program()), *arguments]
-    variables = {**environment(), "RUST_LOG": "warn"}
     with tempfile.TemporaryFile() as words:
-        process = subprocess.Popen(
-            command,
-            env=variables,
-            stdin=given,
-            stdout=words,
-            stderr=words,
-            preexec_fn=ends_with_parent(),
-        )
+        process = Program(arguments, words, given)
         try:
             yield process
             code = process.poll()
         finally:
-            stop(process)
+            process.end()
         if code:
-            raise CdmisfaError(f"the viewer ended with code {code}: {last_words(words)}")
+            raise CdmisfaError(f"the viewer ended with code {code}: {process.last_words()}")
 
 
 def run_program(arguments: Sequence[str], given: BinaryIO | None = None) -> None:
@@ -119,14 +125,17 @@ def ends_with_parent() -> Callable[[], None] | None:
     return ask
 
 
-def stop(process: subprocess.Popen[bytes]) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(timeout=5)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+def open_address(address: str, memory_limit: str = "2GB") -> None:
+    """Open a viewer on what is served at an address; it stays open when we have ended."""
+    command = [str(viewer_program()), "--connect", address, "--memory-limit", memory_limit]
+    subprocess.Popen(
+        command,
+        env=environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
 
 
 def free_port() -> int:

@@ -104,20 +104,11 @@ def _kernel_cache() -> Iterator[Check]:
 
 
 def _vulkan() -> Iterator[Check]:
+    from replay.viewer.display import vulkan_drivers
+
     drivers = sorted(vulkan_drivers())
     detail = ", ".join(d.stem for d in drivers) or "apt-get install mesa-vulkan-drivers"
     yield Check("vulkan driver", bool(drivers), detail, "view --screenshot without a screen")
-
-
-def vulkan_drivers() -> Iterator[Path]:
-    """Manifests of the Vulkan drivers that a loader would find."""
-    chosen = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
-    if chosen:
-        yield from (p for p in map(Path, chosen.split(os.pathsep)) if p.exists())
-        return
-    shared = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
-    for folder in ("/etc", *shared.split(os.pathsep)):
-        yield from Path(folder, "vulkan", "icd.d").glob("*.json")
 
 
 def _screen() -> Iterator[Check]:

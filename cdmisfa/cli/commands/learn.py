@@ -170,12 +170,12 @@ def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
 
 def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.live import open_live
-    from replay.viewer.program import has_display
+    from replay.viewer.display import has_display
+    from replay.viewer.program import open_address
 
     click.echo(f"live view {address}    look at it: rerun --connect {address}", err=True)
     if has_display():
-        open_live(address)
+        open_address(address)
 
 
 class Reporter(Sink):

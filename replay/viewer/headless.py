@@ -1,0 +1,154 @@
+"""The viewer without a window: pictures without a screen."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from recorder.log.whole import whole
+from replay.recordings.source import RecordedSource
+from replay.runs.folders import is_run
+from replay.runs.stretches import read_columns
+from replay.view.bindings import viewer_client
+from replay.view.build import view_of
+from replay.view.columns import FRAME
+from replay.viewer.display import missing_driver
+from replay.viewer.program import Program, free_port, running
+
+WINDOW = "1600x1000"
+SETTLE = 6.0
+"""Seconds after which the viewer has painted everything and taken its notices away."""
+
+SECONDS = 120.0
+"""Longest time for a picture."""
+
+
+def screenshot(
+    path: Path,
+    out: Path,
+    *,
+    at: int | None = None,
+    every: int = 10,
+    all_views: Path | None = None,
+    force: bool = False,
+    window: str = WINDOW,
+) -> None:
+    """Draw the view of a run or recording without a screen.
+
+    Args:
+        path: a run or recording, or an .rrd file.
+        out: the PNG file.
+        at: frame at which the time cursor stands; by default the last.
+        every: show every so many watched frames.
+        all_views: see `build_view`.
+        force: replace an existing file.
+        window: size, as "1600x1000".
+
+    Raises:
+        UsageError: `out` exists and `force` is not set, or there is no frame `at`.
+        CdmisfaError: no driver, or the viewer failed.
+    """
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    if at is not None and path.suffix != ".rrd" and at > (last := _last_frame(path)):
+        raise UsageError(f"--at {at}: there is no such frame, the last of {path} is {last}")
+    if missing_driver():
+        raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
+    with view_of(path, every, all_views) as view:
+        png = _draw(view, at, window)
+    with whole(out) as partial:
+        partial.write_bytes(png)
+
+
+def _last_frame(path: Path) -> int:
+    if is_run(path):
+        ends = (int(piece.frames[-1]) + piece.tau - 1 for piece in read_columns(path))
+        return max(ends, default=0)
+    with contextlib.closing(RecordedSource(path, salvage=True)) as source:
+        return max(ranges[-1][1] for ranges in source.coverage().values()) - 1
+
+
+def _draw(view: Path, at: int | None, window: str) -> bytes:
+    """A PNG of the whole window, once everything in it is loaded."""
+    with headless_viewer(window) as viewer:
+        viewer.ask(lambda client: client.open(str(view)))
+        viewer.ask(lambda client: _painted(client.get_state()))
+        if at is not None:
+            viewer.go_to(at)
+        time.sleep(SETTLE)
+        viewer.ask(lambda client: _painted(client.get_state()))
+        return bytes(viewer.ask(lambda client: client.take_screenshot()))
+
+
+def _painted(state: Any) -> bool:
+    return bool(state.recordings) and bool(state.views) and not state.loading
+
+
+class HeadlessViewer:
+    """A running viewer without a window.
+
+    Args:
+        process: the viewer.
+        port: where it listens, on this machine.
+
+    Raises:
+        CdmisfaError: it does not start.
+    """
+
+    def __init__(self, process: Program, port: int) -> None:
+        self._process = process
+        self._client: Any = None
+
+        def connect(_: Any) -> Any:
+            client = viewer_client().connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+            return client
+
+        self._client = self.ask(connect, what="start")
+
+    def ask(
+        self, question: Callable[[Any], Any], seconds: float = SECONDS, what: str = "show it"
+    ) -> Any:
+        """Ask Rerun's client until it answers: what is not painted yet is an error to it.
+
+        Raises:
+            CdmisfaError: it did not answer in time, or the viewer has ended.
+        """
+        end, refusal = time.monotonic() + seconds, ""
+        while time.monotonic() < end:
+            try:
+                answer = question(self._client)
+                if answer:
+                    return answer
+            except (OSError, RuntimeError, ValueError) as error:
+                refusal = f": {error}".splitlines()[0]
+            if self._process.poll() is not None:
+                raise CdmisfaError(f"the viewer ended: {self._process.last_words()}")
+            time.sleep(0.1)
+        raise CdmisfaError(f"the viewer did not {what} within {seconds:.0f} s{refusal}")
+
+    def go_to(self, frame: int) -> None:
+        """Put the time cursor on a frame."""
+
+        def move(client: Any) -> bool:
+            client.set_time(FRAME, sequence=frame, play_state="paused")
+            return True
+
+        self.ask(move)
+
+
+@contextlib.contextmanager
+def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
+    """A viewer without a window; ended on the way out.
+
+    Raises:
+        CdmisfaError: it does not start.
+    """
+    port = free_port()
+    place = ["--port", str(port), "--bind", "127.0.0.1", "--window-size", window]
+    with running(["--headless", "--hide-welcome-screen", *place]) as process:
+        yield HeadlessViewer(process, port)
