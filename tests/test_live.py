@@ -86,7 +86,7 @@ def test_a_run_gives_the_same_with_and_without(tmp_path):
     assert len(said) == 1
 
 
-def test_a_run_that_goes_on_shows_what_went_before(tmp_path, monkeypatch):
+def test_a_resumed_run_shows_what_went_before(tmp_path, monkeypatch):
     """All of a resumed run is handed over, each record once, and in order."""
     config, sent = LearnerConfig(), []
 

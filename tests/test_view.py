@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import re
 import subprocess
 import sys
 import time
@@ -36,6 +37,7 @@ from replay.view.summary import summary_text
 from replay.viewer import display, headless, window
 from replay.viewer.program import check_limit, environment, run_program
 
+REPLAY = Path(__file__).parents[1] / "replay"
 ITERATIONS = 24
 TAU = 40
 
@@ -296,6 +298,13 @@ def test_tensors_are_encoded_as_rerun_does():
     for row, tensor in zip(found.to_pylist(), block, strict=True):
         batch = rr.Tensor(tensor, dim_names=names).as_component_batches()[0]
         assert row == batch.as_arrow_array().to_pylist()
+
+
+def test_private_names_of_rerun_are_taken_in_one_place():
+    private = re.compile(r"\b(rerun_\w+|rerun\.experimental|rerun\._\w+|rrb?\.(\w+\.)*_\w+)\b")
+    files = [file for room in ("view", "viewer") for file in (REPLAY / room).glob("*.py")]
+    users = [file.name for file in files if private.search(file.read_text("utf-8"))]
+    assert users == ["bindings.py"]
 
 
 def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):

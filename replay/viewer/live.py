@@ -23,10 +23,9 @@ from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from replay.runs.columns import columns_of_records
-from replay.runs.folders import run_log
-from replay.runs.log import RunHeader, read_header
+from replay.runs.log import RunHeader
 from replay.runs.outline import LINES, Outline
-from replay.runs.stretches import read_stretches
+from replay.runs.stretches import Stretch, read_stretches
 from replay.view.layout import MOST_MODULES, MOST_STREAMS, RunLayout
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
@@ -89,42 +88,35 @@ class LiveView(Sink):
         )
         self._tau = tau
         self._images = spec.images
+        self._next = time.monotonic() + EVERY_SECONDS
+        self._forget()
+
+    def _forget(self) -> None:
         self._records: list[BlockSignals] = []
         self._watched: list[NDArray[Any]] = []
         self._truth: list[NDArray[np.float64]] = []
-        self._next = time.monotonic() + EVERY_SECONDS
-        self._phi: NDArray[np.float64] | None = None
+        self._phi: list[tuple[int, NDArray[np.float64]]] = []
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Take what one iteration gave; see `Sink`."""
-        phi = weights_after(signals, learner)
+        if self._records and not self._records[-1].saved:
+            self._phi.pop()  # of the abstraction's weights, the last and the saved ones are shown
+        self._phi.append((block.t, weights_after(signals, learner)))
         self._records.append(signals)
-        self._watched.append(block.frames[:: len(block) if self._images else 1].copy())
-        self._truth.append(block.truth.copy())
-        self._phi = phi
-        if signals.saved:
-            self._view.weights(f"modules/{signals.module}/weights", block.t, phi)
+        self._watched.append(block.frames[:1].copy() if self._images else block.frames)
+        self._truth.append(block.truth)
         if len(self._records) >= MOST_BLOCKS or time.monotonic() >= self._next:
             self.flush()
 
     def earlier(self, run: Path) -> None:
-        """Show what the log of a run that goes on holds already, before its next block.
+        """Show what the log of a resumed run holds already, before its next block.
 
         Raises:
             UsageError: there is no such run.
             LogDamagedError: its log cannot be read.
         """
-        log = run_log(run)
-        for stretch in read_stretches(log, read_header(log), every=self._tau):
-            self._view.take(stretch)
-            weights = dict(stretch.phi)
-            for columns in stretch.signals:
-                self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
-                for i in np.flatnonzero(columns["saved"]).tolist():
-                    t, module = int(columns.frames[i]), int(columns["module"][i])
-                    if t in weights:
-                        self._view.weights(f"modules/{module}/weights", t, weights[t])
-            self._view.flush()
+        for stretch in read_stretches(run, every=self._tau):
+            self._show(stretch)
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Say in words what happened; see `Sink`."""
@@ -136,18 +128,32 @@ class LiveView(Sink):
 
     def flush(self) -> None:
         """Hand over everything that waits."""
-        if self._records and self._phi is not None:
-            last, starts = self._records[-1], np.array([s.t for s in self._records])
-            every = (starts[:, None] + np.arange(len(last.y))).reshape(-1)
-            for columns in columns_of_records(self._records):
-                self._view.add(columns)
-            self._view.watched(starts if self._images else every, np.concatenate(self._watched))
-            self._view.truth(every, np.concatenate(self._truth))
-            self._view.threshold(np.array([last.t]), np.array([last.iteration]))
-            self._view.weights("abstraction/phi", last.t, self._phi)
-            self._records, self._watched, self._truth = [], [], []
-        self._view.flush()
+        if self._records:
+            starts, tau = np.array([s.t for s in self._records]), len(self._records[-1].y)
+            every = (starts[:, None] + np.arange(tau)).reshape(-1)
+            at = starts if self._images else every
+            self._show(
+                Stretch(
+                    signals=tuple(columns_of_records(self._records)),
+                    watched=((at, np.concatenate(self._watched)),),
+                    truth=((every, np.concatenate(self._truth)),),
+                    phi=tuple(self._phi),
+                    events=(),
+                )
+            )
+            self._forget()
         self._next = time.monotonic() + EVERY_SECONDS
+
+    def _show(self, stretch: Stretch) -> None:
+        self._view.take(stretch)
+        weights = dict(stretch.phi)
+        for columns in stretch.signals:
+            self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
+            for i in np.flatnonzero(columns["saved"]).tolist():
+                t, module = int(columns.frames[i]), int(columns["module"][i])
+                if t in weights:
+                    self._view.weights(f"modules/{module}/weights", t, weights[t])
+        self._view.flush()
 
     def close(self) -> None:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
