@@ -15,7 +15,8 @@ import numpy as np
 from benchmarks.report import save
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.log.viewlog import Identity, ViewLog
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
 
 SHAPE = (240, 320)
 TAU = 40

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.report import interleaved, ratio, save
-from recorder.recording import record
-from recorder.world.rendering import render_here, requests
+from recorder.recording import record_scene
+from recorder.world.rendering import take_here
 from recorder.world.scenes import open_scene
 
 
@@ -20,8 +20,8 @@ def rendering(scene: str, frames: int) -> Callable[[], int]:
 
     def call() -> int:
         with contextlib.closing(open_scene(scene)) as source:
-            wanted = requests(dict.fromkeys(range(len(source.spec.streams)), 0), frames)
-            return sum(len(block.frames) for block in render_here(source, wanted))
+            starts = dict.fromkeys(range(len(source.spec.streams)), 0)
+            return sum(len(block.frames) for block in take_here(source, starts, frames))
 
     return call
 
@@ -30,7 +30,7 @@ def recording(scene: str, frames: int, folder: Path, jobs: int) -> Callable[[], 
     """A call that records every view's frames."""
 
     def call() -> int:
-        record(scene, folder / f"jobs{jobs}", frames=frames, jobs=jobs, force=True)
+        record_scene(scene, folder / f"jobs{jobs}", frames=frames, jobs=jobs, force=True)
         return 3 * frames
 
     return call

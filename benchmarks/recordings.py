@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.log.viewlog import Identity, ViewLog
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 

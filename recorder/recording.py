@@ -1,33 +1,44 @@
-"""Recording a scene: every view at every frame, one MCAP file for each view."""
+"""Recording a source: every view at every frame, one MCAP file for each view."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import hashlib
+import re
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
-from typing import Any, cast
+from typing import Any
 
 from cdmisfa.core.blocks import FrameSource, HeadPose, SourceSpec
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.folder import held
+from recorder.log.folder import (
+    REMEDY,
+    held,
+    make_folder,
+    refuse_existing,
+    remove_views,
+    view_logs,
+)
 from recorder.log.manifest import Manifest, forget_views, keep_recording, read_recording
-from recorder.log.parts import Split, ViewParts, view_logs
-from recorder.log.viewlog import FramesHeld, Identity, frames_held, sha256
-from recorder.world.rendering import render_here, render_in_processes, requests
-from recorder.world.scenes import open_scene
+from recorder.log.parts import ViewParts
+from recorder.log.resume import FramesHeld, Resume, frames_held, resume_view
+from recorder.log.split import Split
+from recorder.log.viewfacts import FASTEST, SLOWEST, Identity
+from recorder.log.whole import whole
+from recorder.world.rendering import render_in_processes, take_here
+from recorder.world.scenes import SCENES, OpenScene, prepare, scene_of
 
 MAX_JOBS = 256
 
+_FILE_NAME = re.compile(r"[\w-][\w.-]*")
+
 DEFAULT_FRAMES = 1000
-"""Frames of each view where nothing else is asked for."""
+"""Frames of each view where the source does not end and nothing else is wanted."""
 
 Progress = Callable[[float], None]
 """Told, after every block, how many frames have been written of every view."""
@@ -56,129 +67,192 @@ class ViewRecording:
         return {**dataclasses.asdict(self), "file": str(self.file)}
 
 
+class RecordingStoppedError(CdmisfaError):
+    """A recording was asked to stop; its `.partial` files are readable and can be resumed."""
+
+    exit_code = 130
+
+
 def record(
-    kind: str,
+    source: FrameSource,
     folder: Path,
-    scene: SceneConfig | None = None,
-    settings: RecordConfig | None = None,
     *,
     frames: int | None = None,
     views: Sequence[str] | None = None,
+    names: Sequence[str] | None = None,
+    settings: RecordConfig | None = None,
+    split: Split | None = None,
     jobs: int = 1,
     force: bool = False,
     resume: bool = False,
-    split: Split | None = None,
+    stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
+    scene: OpenScene | None = None,
 ) -> list[ViewRecording]:
-    """Record the first frames of a scene into a folder.
+    """Record the first frames of a source into a folder.
 
-    The files depend on the scene's configuration and seed only: not on `jobs`, not on
-    which views are recorded, not on having been interrupted and resumed. Ctrl-C,
-    SIGTERM and errors leave readable `.partial` files.
+    The files depend on what the source shows and states of itself only: not on `jobs`, not on
+    which views are recorded, not on having been interrupted and resumed. Errors, and exceptions
+    that signal handlers raise, leave readable `.partial` files.
 
     Args:
-        kind: name of the scene.
+        source: anything with frames, also one that cannot go back; left open.
         folder: made if it does not exist.
-        scene: the world; a seed of None is 0.
-        settings: the clock and the files.
-        frames: how many, of each view; by default `DEFAULT_FRAMES`, and where a recording is
-            resumed as many as it was asked to have.
+        frames: how many, of each view; by default all of the source, or `DEFAULT_FRAMES` where it
+            does not end, and where a recording is resumed as many as it was begun with.
         views: which views; by default all.
-        jobs: processes that render.
-        force: overwrite an earlier recording in the folder.
-        resume: go on where an earlier attempt with the same arguments ended.
+        names: of the views, and so of their files; by default those of the streams.
+        settings: how the files are written; the clock is the source's.
         split: write every view as parts of limited size or duration; where a recording is
             resumed by default as it was begun.
+        jobs: processes that render; only a scene can be opened in more than one.
+        force: overwrite an earlier recording in the folder.
+        resume: continue where an earlier attempt with the same arguments ended.
+        stop: asked after every block; true ends the recording with an error.
         progress: called after every block; never where there was nothing left to record.
+        scene: what the source was opened from; known of those of `open_scene`.
 
     Raises:
         UsageError: the folder exists, or an argument is wrong.
         LogWriteError: the disk does not take it.
-        CdmisfaError: the scene cannot be opened.
+        LogExhaustedError: the source has fewer frames.
+        RecordingStoppedError: it was stopped.
     """
-    scene = dataclasses.replace(scene or SceneConfig(), kind=cast(Any, kind))
-    scene = dataclasses.replace(scene, seed=scene.seed or 0)
-    settings = settings or RecordConfig()
+    scene = scene or scene_of(source)
+    settings = settings or (RecordConfig() if scene is None else scene.record)
     folder = Path(folder)
-    if frames is not None and frames < 1:
-        raise UsageError(f"--frames is {frames}: record at least one")
+    length = source.spec.length
+    if frames is not None and not 1 <= frames <= (length or frames):
+        most = "" if length is None else f", and no more than the {length} that there are"
+        raise UsageError(f"--frames is {frames}: record at least one{most}")
     if not 1 <= jobs <= MAX_JOBS:
         raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
+    if jobs > 1 and scene is None:
+        raise UsageError(f"--jobs is {jobs}: only a scene can be opened by several processes")
     if force and resume:
         raise UsageError("--force starts anew and --resume goes on: use one of them")
     if not resume:
-        refuse_existing(folder, force=force, remedy="go on with --resume or overwrite with --force")
-    with contextlib.closing(open_scene(kind, scene, settings)) as source:
-        names = _chosen(source.spec, views)
-        identity = Identity(
-            kind,
-            scene.seed or 0,
-            source.spec,
-            {"scene": as_table(scene), "record": as_table(settings)},
-        )
-        make_folder(folder)
-        with _stoppable() as stopped, ExitStack() as open_logs:
-            open_logs.enter_context(held(folder))
-            if force:
-                remove_views(folder, names)
-            earlier: dict[str, dict[Path, FramesHeld]] = {}
-            if resume:
-                split = _as_begun(folder, kind, scene.seed or 0, names, split)
-                earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in names}
-                frames = _length(folder, earlier, frames)
-            frames = frames or DEFAULT_FRAMES
-            poses = _poses(source)
-            logs = [
-                ViewParts(
-                    folder,
-                    name,
-                    identity,
-                    settings,
-                    split=split,
-                    pose=poses.get(name),
-                    resume=frames if resume else None,
-                    earlier=earlier.get(name),
-                )
-                for name in names
-            ]
-            unfinished = [log.view for log in logs if not log.complete]
-            limits = {} if split is None else dict.fromkeys(unfinished, str(split))
-            lengths = dict.fromkeys(unfinished, frames)
-            if unfinished:
-                options = {"seed": scene.seed or 0, "frames": lengths, "split": limits}
-                keep_recording(folder, Manifest((kind,), options))
-            for log in logs:
-                open_logs.callback(log.abandon)
-                log.open()
-            by_stream = {log.stream: log for log in logs}
-            wanted = requests({log.stream: log.t for log in logs}, frames)
-            blocks = (
-                render_here(source, wanted)
-                if jobs == 1 or not unfinished
-                else render_in_processes(kind, scene, settings, wanted, jobs)
+        refuse_existing(folder, force=force, remedy=REMEDY)
+    identity = _identity(source, names, settings, scene)
+    chosen = _chosen(identity.spec, views)
+    make_folder(folder)
+    with ExitStack() as open_logs:
+        open_logs.enter_context(held(folder))
+        if force:
+            remove_views(folder, chosen)
+        places = dict.fromkeys(chosen, Resume())
+        if resume:
+            split = _as_begun(folder, identity, chosen, split)
+            earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in chosen}
+            frames = _length(folder, earlier, frames, length)
+            places = {
+                view: resume_view(folder, view, identity, split, there, frames)
+                for view, there in earlier.items()
+            }
+        frames = frames or length or DEFAULT_FRAMES
+        poses = _poses(source, identity.spec)
+        logs = [
+            ViewParts(
+                folder, view, identity, settings, split=split, pose=poses.get(view), resume=place
             )
-            with contextlib.closing(blocks):
-                for block in blocks:
-                    by_stream[block.stream].write(block)
-                    if progress is not None:
-                        progress(min(log.t for log in logs))
-                    if stopped():
-                        raise _StoppedError(f"{folder} is not finished: go on with --resume")
-            for log in logs:
-                log.finish()
-            forget_views(folder, names)
+            for view, place in places.items()
+        ]
+        unfinished = [log.view for log in logs if not log.complete]
+        if unfinished:
+            lengths = dict.fromkeys(unfinished, frames)
+            limits = {} if split is None else dict.fromkeys(unfinished, str(split))
+            options = {"seed": identity.seed, "frames": lengths, "split": limits}
+            keep_recording(folder, Manifest((identity.kind,), options))
+        for log in logs:
+            open_logs.callback(log.abandon)
+            log.open()
+        by_stream = {log.stream: log for log in logs}
+        starts = {log.stream: log.t for log in logs}
+        blocks = (
+            render_in_processes(scene, starts, frames, jobs)
+            if scene and jobs > 1 and unfinished
+            else take_here(source, starts, frames)
+        )
+        with contextlib.closing(blocks):
+            for block in blocks:
+                by_stream[block.stream].write(block)
+                if progress is not None:
+                    progress(min(log.t for log in logs))
+                if stop():
+                    raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
+        for log in logs:
+            log.finish()
+        forget_views(folder, chosen)
     return [written(log.view, path, n) for log in logs for path, n in log.parts]
+
+
+def record_scene(
+    name: str,
+    folder: Path,
+    config: SceneConfig | None = None,
+    settings: RecordConfig | None = None,
+    **options: Any,
+) -> list[ViewRecording]:
+    """Open a scene by its name, `record` it and close it.
+
+    Args:
+        name: one of `SCENES`.
+        folder: of the recording.
+        config: of the scene; by default the preset's, with seed 0.
+        settings: the clock and the files.
+        options: those of `record`.
+
+    Raises:
+        CdmisfaError: the scene cannot be opened, or as for `record`.
+    """
+    scene = prepare(name, config, settings)
+    with contextlib.closing(scene.open()) as source:
+        return record(source, folder, scene=scene, **options)
 
 
 def written(view: str, path: Path, frames: int) -> ViewRecording:
     """What a finished file of a view came to."""
-    return ViewRecording(view, path, frames, path.stat().st_size, sha256(path))
+    with path.open("rb") as file:
+        checksum = hashlib.file_digest(file, "sha256").hexdigest()
+    return ViewRecording(view, path, frames, path.stat().st_size, checksum)
 
 
-class _StoppedError(CdmisfaError):
-    """A signal asked the recording to end."""
+def _identity(
+    source: FrameSource,
+    names: Sequence[str] | None,
+    settings: RecordConfig,
+    scene: OpenScene | None,
+) -> Identity:
+    """What a recording of a source states.
 
-    exit_code = 130
+    Raises:
+        UsageError: no recording can hold such frames, or a view cannot have its name.
+    """
+    spec = replace(source.spec, streams=tuple(names or source.spec.streams))
+    for name in spec.streams:
+        if not _FILE_NAME.fullmatch(name) or spec.streams.count(name) > 1:
+            raise UsageError(f"a view cannot be called {name!r}: give different names of files")
+    if not spec.images and (spec.dtype, len(spec.frame_shape)) != ("float64", 1):
+        raise UsageError(
+            f"a recording holds gray images, (height, width) uint8, or vectors, (n,) float64, not "
+            f"{spec.frame_shape} {spec.dtype}"
+        )
+    if not SLOWEST <= spec.fps <= FASTEST:
+        raise UsageError(
+            f"a recording of {spec.fps} frames a second cannot be read: give it an fps in "
+            f"[{SLOWEST:g}, {FASTEST:g}]"
+        )
+    if scene is None:
+        stated = dict(source.describe())
+        return Identity(str(stated["kind"]), int(stated.get("seed") or 0), spec, {"source": stated})
+    clock = replace(settings, fps=spec.fps, start_ns=spec.start_ns)
+    return Identity(
+        scene.name,
+        scene.config.seed or 0,
+        spec,
+        {"scene": scene.table(), "record": as_table(clock)},
+        SCENES[scene.name].packages,
+    )
 
 
 def _chosen(spec: SourceSpec, views: Sequence[str] | None) -> list[str]:
@@ -188,54 +262,21 @@ def _chosen(spec: SourceSpec, views: Sequence[str] | None) -> list[str]:
     return [name for name in spec.streams if not views or name in views]
 
 
-def _poses(source: FrameSource) -> dict[str, HeadPose]:
+def _poses(source: FrameSource, spec: SourceSpec) -> dict[str, HeadPose]:
     poses: Sequence[HeadPose] = getattr(source, "head_poses", ())
-    return dict(zip(source.spec.streams, poses, strict=False))
-
-
-def refuse_existing(folder: Path, *, force: bool, remedy: str = "overwrite with --force") -> None:
-    """Refuse to write a recording where there is something.
-
-    Raises:
-        UsageError: the folder is not empty, or no folder, and `force` is not set.
-    """
-    if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder} exists: choose another folder, {remedy}")
-
-
-def make_folder(folder: Path) -> None:
-    """Make a recording's folder.
-
-    Raises:
-        LogWriteError: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
-
-
-def remove_views(folder: Path, names: Sequence[str]) -> None:
-    """Remove what a recording holds of some views.
-
-    Raises:
-        LogWriteError: it cannot be removed.
-    """
-    try:
-        for name in names:
-            for old in view_logs(folder, name):
-                old.unlink()
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+    return dict(zip(spec.streams, poses, strict=False))
 
 
 def _length(
-    folder: Path, earlier: Mapping[str, Mapping[Path, FramesHeld]], frames: int | None
+    folder: Path,
+    earlier: Mapping[str, Mapping[Path, FramesHeld]],
+    frames: int | None,
+    length: int | None,
 ) -> int:
-    """Frames of each view of a recording that is gone on with.
+    """Frames of each view of a recording that is resumed.
 
     Raises:
-        UsageError: a file has more frames than asked for.
+        UsageError: a file has more frames than are wanted.
     """
     longest = 0
     for path, there in (item for files in earlier.values() for item in files.items()):
@@ -247,60 +288,51 @@ def _length(
         longest = max(longest, there.end)
     begun = read_recording(folder).options["frames"]
     wanted = max((begun[view] for view in earlier if view in begun), default=0)
-    return frames or max(longest, wanted or (longest if _finished(earlier) else DEFAULT_FRAMES))
+    finished = all(
+        files and all(path.suffix == ".mcap" for path in files) for files in earlier.values()
+    )
+    return frames or max(longest, wanted or (0 if finished else length or DEFAULT_FRAMES))
 
 
 def _as_begun(
-    folder: Path, kind: str, seed: int, views: Sequence[str], split: Split | None
+    folder: Path, identity: Identity, views: Sequence[str], split: Split | None
 ) -> Split | None:
-    """Where parts end in a recording that is gone on with.
+    """Where parts end in a recording that is resumed.
 
     Raises:
         UsageError: it was begun with another scene, seed or split.
     """
     begun = read_recording(folder)
     splits = begun.options["split"]
-    limits = sorted({splits[view] for view in views if view in splits})
-    now = {"": kind, "seed": seed}
-    if limits and split is not None:
+    limit = min((splits[view] for view in views if view in splits), default="")
+    now = {"": identity.kind, "seed": identity.seed}
+    if limit and split is not None:
         now["split"] = str(split)
-    replace(begun, options={**begun.options, "split": limits[0] if limits else ""}).refuse_other(
-        folder, now
-    )
-    return split if split is not None or not limits else Split.parse(limits[0])
+    replace(begun, options={**begun.options, "split": limit}).refuse_other(folder, now)
+    return split if split is not None or not limit else Split.parse(limit)
 
 
-def _finished(earlier: Mapping[str, Mapping[Path, FramesHeld]]) -> bool:
-    """Whether every view has files, and all of them are finished."""
-    return all(
-        files and all(path.suffix == ".mcap" for path in files) for files in earlier.values()
-    )
+def save_picture(scene: OpenScene, path: Path, *, force: bool = False) -> None:
+    """Draw a scene from outside into a PNG file.
 
-
-@contextlib.contextmanager
-def _stoppable() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and SIGTERM into a question asked between blocks.
-
-    An exception in the middle of a write could tear a file. Once the files are closed
-    the signal is sent on to whom it was for. A second signal is not waited for.
+    Raises:
+        UsageError: the scene has no picture, or the file exists, or is no .png.
+        LogWriteError: the file or its folder cannot be written.
+        CdmisfaError: the simulator is not installed.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    received: list[int] = []
-
-    def note(number: int, _: FrameType | None) -> None:
-        received.append(number)
-        signal.signal(number, before[number])
-
-    before = {
-        int(number): signal.signal(number, note) or signal.SIG_DFL
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
+    draw = SCENES[scene.name].picture
+    if draw is None:
+        able = " or ".join(name for name, entry in SCENES.items() if entry.picture)
+        raise UsageError(f"the scene {scene.name} has no picture: --scene-picture is for {able}")
+    path = Path(path)
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"{path}: the picture is a PNG, name it .png")
+    if path.is_dir() or (path.exists() and not force):
+        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
     try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if received:
-            signal.raise_signal(received[0])
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogWriteError(f"{path.parent} cannot be made: {error.strerror}") from error
+    image = draw(scene.config)
+    with whole(path) as partial:
+        image.save(partial, format="PNG", optimize=True)

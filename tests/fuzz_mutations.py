@@ -24,7 +24,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.log.viewlog import Identity, ViewLog
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
 
 FRAMES = 20
 SHAPE = (2, 3)

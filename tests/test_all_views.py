@@ -12,8 +12,8 @@ from rerun.chunk import RrdReader
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.runs import run
-from recorder.config import SceneConfig
-from recorder.recording import record
+from recorder.recording import record_scene
+from recorder.world.oscillatory import OscillatoryConfig
 from replay.recordings.poses import head_poses, yaw_of
 from replay.recordings.source import RecordedSource
 from replay.runs.stretches import read_signals
@@ -24,7 +24,7 @@ from replay.view.build import build_view
 def made(tmp_path_factory):
     """A recording, and a run that went twice around it."""
     place = tmp_path_factory.mktemp("made")
-    record("oscillatory", place / "rec", SceneConfig(kind="oscillatory"), frames=500)
+    record_scene("oscillatory", place / "rec", OscillatoryConfig(), frames=500)
     source = RecordedSource(place / "rec", loop=True)
     run(source, LearnerConfig(), place / "run", max_iterations=8, rerun=False)
     source.close()
@@ -55,7 +55,7 @@ def test_every_view_is_there_at_every_frame(made, tmp_path, monkeypatch):
 
 
 def test_another_recording_is_refused(made, tmp_path):
-    record("oscillatory", tmp_path / "other", SceneConfig(kind="oscillatory"), frames=501)
+    record_scene("oscillatory", tmp_path / "other", OscillatoryConfig(), frames=501)
     with pytest.raises(UsageError, match="not the recording"):
         build_view(made / "run", tmp_path / "v.rrd", all_views=tmp_path / "other")
     assert not (tmp_path / "v.rrd").exists()

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa
 
-from recorder.config import SceneConfig
-from recorder.log.parts import Split
-from recorder.recording import record
+from recorder.log.split import Split
+from recorder.recording import record_scene
+from recorder.world.oscillatory import OscillatoryConfig
 
 PNG = b"\x89PNG"
 
@@ -62,10 +62,10 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
             raise OSError
 
     with pytest.raises(OSError):  # noqa: PT011 - what stops it is no matter
-        record(
+        record_scene(
             "oscillatory",
             folder,
-            SceneConfig(seed=7),
+            OscillatoryConfig(seed=7),
             frames=400,
             split=Split(seconds=5),
             progress=stop,

@@ -12,7 +12,8 @@ from PIL import Image
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
-from recorder.log.viewlog import Identity, ViewLog
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
 from replay.export import images as frames
 from replay.export import videos as film
 from replay.export.recordings import export

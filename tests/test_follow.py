@@ -19,8 +19,8 @@ from source_contract import SourceContract, same
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from recorder.log.parts import Split
-from recorder.recording import record
+from recorder.log.split import Split
+from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.followed import FollowedSource
 from replay.storage.store import FileStore
@@ -29,8 +29,8 @@ FRAMES = 600
 RECORDER = """
 import sys, time
 from pathlib import Path
-from recorder.recording import record
-record("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]),
+from recorder.recording import record_scene
+record_scene("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]),
        progress=lambda done: time.sleep(float(sys.argv[3])))
 """
 
@@ -50,7 +50,7 @@ def recorder(folder: Path, *, wait: float = 0.02) -> Iterator[subprocess.Popen[b
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished") / "rec"
-    record("oscillatory", folder, frames=200)
+    record_scene("oscillatory", folder, frames=200)
     return folder
 
 
@@ -155,7 +155,7 @@ def test_nothing_is_read_twice(
             same(source[0].take(1, 10), live.take(1, 10))
 
     parts = None if split is None else Split.parse(split)
-    record("oscillatory", folder, frames=3000, split=parts, progress=look)
+    record_scene("oscillatory", folder, frames=3000, split=parts, progress=look)
     followed = source[0]
     while followed.t < 3000:
         same(followed.take(1, 10), live.take(1, 10))
@@ -179,10 +179,10 @@ def test_a_resumed_recorder_is_followed_on(tmp_path: Path) -> None:
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
-        record("oscillatory", tmp_path / "rec", frames=400, progress=stop)
+        record_scene("oscillatory", tmp_path / "rec", frames=400, progress=stop)
     source = FollowedSource(tmp_path / "rec", timeout=30)
     same(source.take(0, 150), live.take(0, 150))
-    record("oscillatory", tmp_path / "rec", resume=True)
+    record_scene("oscillatory", tmp_path / "rec", resume=True)
     same(source.take(2, 250), live.take(2, 250))
     assert source.finished
     source.close()

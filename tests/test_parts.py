@@ -14,8 +14,8 @@ from source_contract import SourceContract, same
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
-from recorder.log.parts import Split
-from recorder.recording import record
+from recorder.log.split import Split
+from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import verify
 from replay.recordings.source import RecordedSource
@@ -33,7 +33,7 @@ def split(request: pytest.FixtureRequest) -> Split:
 @pytest.fixture(scope="module")
 def parts(split: Split, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("parts") / "rec"
-    record("oscillatory", folder, frames=FRAMES, split=split)
+    record_scene("oscillatory", folder, frames=FRAMES, split=split)
     return folder
 
 
@@ -63,9 +63,9 @@ def test_parts_read_as_one(parts: Path) -> None:
 
 
 def test_parts_are_as_long_as_asked_for(tmp_path: Path) -> None:
-    files = record("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
+    files = record_scene("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
     assert [f.frames for f in files if f.name == "x2"] == [150, 150, 100]
-    files = record("oscillatory", tmp_path / "b", frames=FRAMES, split=BY_SIZE)
+    files = record_scene("oscillatory", tmp_path / "b", frames=FRAMES, split=BY_SIZE)
     sizes = np.array([f.bytes for f in files if f.name == "x1"])
     assert (sizes[:-1] >= 12_000).all()
     assert (sizes < 20_000).all()
@@ -74,13 +74,13 @@ def test_parts_are_as_long_as_asked_for(tmp_path: Path) -> None:
 def test_a_resumed_recording_has_the_same_parts(parts: Path, split: Split, tmp_path: Path) -> None:
     folder = tmp_path / "rec"
     for frames in (90, 300, 431, FRAMES):
-        record("oscillatory", folder, frames=frames, split=split, resume=True)
+        record_scene("oscillatory", folder, frames=frames, split=split, resume=True)
     assert contents(folder) == contents(parts)
     torn = folder / "x2-002.mcap"
     torn.with_name(torn.name + ".partial").write_bytes(torn.read_bytes()[:9000])
     for later in sorted(folder.glob("x2-*.mcap"))[2:]:
         later.unlink()
-    record("oscillatory", folder, frames=FRAMES, split=split, resume=True)
+    record_scene("oscillatory", folder, frames=FRAMES, split=split, resume=True)
     assert contents(folder) == contents(parts)
 
 
@@ -89,9 +89,9 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
 ) -> None:
     words = "3s" if split == BY_TIME else "12kB"
     program = (
-        "import sys, time; from pathlib import Path; from recorder.log.parts import Split;"
-        "from recorder.recording import record;"
-        "record('oscillatory', Path(sys.argv[1]), frames=700, split=Split.parse(sys.argv[2]),"
+        "import sys, time; from pathlib import Path; from recorder.log.split import Split;"
+        "from recorder.recording import record_scene;"
+        "record_scene('oscillatory', Path(sys.argv[1]), frames=700, split=Split.parse(sys.argv[2]),"
         " progress=lambda _: time.sleep(0.03))"
     )
     for attempt, at in enumerate((200, 330, 460)):
@@ -110,37 +110,37 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
         assert length is not None
         same(source.take(1, length), OscillatorySource().take(1, length))
         source.close()
-        record("oscillatory", folder, frames=FRAMES, split=split, resume=True)
+        record_scene("oscillatory", folder, frames=FRAMES, split=split, resume=True)
         assert contents(folder) == contents(parts)
 
 
 def test_a_lost_part_is_not_written_over(parts: Path, split: Split, tmp_path: Path) -> None:
     folder = tmp_path / "rec"
-    record("oscillatory", folder, frames=FRAMES, split=split)
+    record_scene("oscillatory", folder, frames=FRAMES, split=split)
     (folder / "x2-001.mcap").unlink()
     before = contents(folder)
     with pytest.raises(UsageError, match=r"x2-002\.mcap is there, x2-001\.mcap before it is not"):
-        record("oscillatory", folder, frames=FRAMES, split=split, resume=True)
+        record_scene("oscillatory", folder, frames=FRAMES, split=split, resume=True)
     assert contents(folder) == before
 
 
 def test_a_shorter_split_than_the_first_part_is_refused(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "a", frames=150, split=Split(seconds=100))
+    record_scene("oscillatory", tmp_path / "a", frames=150, split=Split(seconds=100))
     with pytest.raises(UsageError, match="has 150 frames, with this --split it would have 100"):
-        record("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
+        record_scene("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
 
 
 def test_another_split_is_refused(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
+    record_scene("oscillatory", tmp_path / "a", frames=400, split=BY_TIME)
     before = contents(tmp_path / "a")
     with pytest.raises(UsageError, match="with this --split it would have 100"):
-        record("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
+        record_scene("oscillatory", tmp_path / "a", frames=500, split=Split(seconds=2), resume=True)
     with pytest.raises(UsageError, match="recorded with --split"):
-        record("oscillatory", tmp_path / "a", frames=500, resume=True)
+        record_scene("oscillatory", tmp_path / "a", frames=500, resume=True)
     with pytest.raises(UsageError, match="holds 150 frames, more than --frames 100"):
-        record("oscillatory", tmp_path / "a", frames=100, split=BY_TIME, resume=True)
+        record_scene("oscillatory", tmp_path / "a", frames=100, split=BY_TIME, resume=True)
     assert contents(tmp_path / "a") == before
-    record("oscillatory", tmp_path / "a", frames=60, force=True)
+    record_scene("oscillatory", tmp_path / "a", frames=60, force=True)
     assert sorted(contents(tmp_path / "a")) == ["x1.mcap", "x2.mcap", "x3.mcap"]
 
 

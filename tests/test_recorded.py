@@ -12,8 +12,9 @@ from source_contract import SourceContract, same
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from recorder.config import RecordConfig
-from recorder.log.viewlog import Identity, ViewLog
-from recorder.recording import record
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
+from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.info import describe
 from replay.integrity.recover import recover
@@ -49,7 +50,7 @@ def write_pictures(folder: Path, **settings: object) -> list[Block]:
 @pytest.fixture(scope="module")
 def vectors(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("vectors")
-    record("oscillatory", folder, frames=FRAMES)
+    record_scene("oscillatory", folder, frames=FRAMES)
     return folder
 
 

@@ -11,22 +11,24 @@ from source_contract import SourceContract
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.config import EyesConfig, RecordConfig, SceneConfig, SphereConfig
+from recorder.config import RecordConfig
+from recorder.recording import save_picture
 from recorder.world.eyes import LUMA, eye_matrix, grey, look, perspective
+from recorder.world.icub_config import EyesConfig, IcubConfig, SphereConfig
 from recorder.world.motions import Motions
-from recorder.world.scenes import SCENES, open_scene
+from recorder.world.scenes import SCENES, open_scene, prepare
 
 pytest.importorskip("pybullet")
 
 from recorder.world.live import TRUTH, LiveSource
-from recorder.world.picture import SIZE, scene_picture
+from recorder.world.picture import SIZE
 from recorder.world.world import World
 
-SCENE = SceneConfig(seed=1)
+SCENE = IcubConfig(seed=1)
 FRAMES = 80
 
 
-def look_at(scene: SceneConfig, n: int = FRAMES) -> np.ndarray:
+def look_at(scene: IcubConfig, n: int = FRAMES) -> np.ndarray:
     """All views of a scene's first frames, (views, n, height, width)."""
     source = LiveSource(scene, RecordConfig())
     views = []
@@ -50,7 +52,8 @@ class TestLive(SourceContract):
 def test_the_preset_is_the_default_scene():
     for kind in SCENES:
         preset = load_preset(kind)
-        assert build(SceneConfig, "scene", preset["scene"]) == SceneConfig(kind=kind)
+        config = SCENES[kind].config
+        assert build(config, "scene", preset["scene"]) == config()
         assert build(RecordConfig, "record", preset["record"]) == RecordConfig()
 
 
@@ -158,7 +161,7 @@ def test_another_seed_is_another_recording(seen):
 
 def test_a_scene_of_another_size(seen):
     eyes = EyesConfig(views=("one",), yaw=(10.0,), width=20, height=10)
-    source = LiveSource(SceneConfig(eyes=eyes, object3=SphereConfig(radius=0.03)), RecordConfig())
+    source = LiveSource(IcubConfig(eyes=eyes, object3=SphereConfig(radius=0.03)), RecordConfig())
     assert source.take(0, 3).frames.shape == (3, 10, 40)
     source.close()
 
@@ -179,7 +182,7 @@ def test_a_scene_of_another_size(seen):
 )
 def test_a_scene_that_cannot_be_is_named(scene, words):
     with pytest.raises(UsageError, match=words):
-        open_scene("icub", build(SceneConfig, "scene", scene))
+        open_scene("icub", build(IcubConfig, "scene", scene))
 
 
 def test_an_unknown_scene_names_the_nearest():
@@ -197,7 +200,8 @@ def test_without_the_simulator_the_remedy_is_told(monkeypatch):
 def test_the_picture_shows_the_robot_the_table_and_the_objects(tmp_path):
     from PIL import Image
 
-    path = scene_picture(SceneConfig(), tmp_path / "scene.png")
+    path = tmp_path / "scene.png"
+    save_picture(prepare("icub"), path)
     with Image.open(path) as image:
         assert image.size == SIZE
         pixels = np.asarray(image).astype(int)
@@ -207,6 +211,6 @@ def test_the_picture_shows_the_robot_the_table_and_the_objects(tmp_path):
     assert np.ptp(np.nonzero(red)[0]) > 300
     assert dark.sum() > 3_000
     with pytest.raises(UsageError, match="exists"):
-        scene_picture(SceneConfig(), path)
+        save_picture(prepare("icub"), path)
     with pytest.raises(UsageError, match=r"\.png"):
-        scene_picture(SceneConfig(), tmp_path / "scene.jpg")
+        save_picture(prepare("icub"), tmp_path / "scene.jpg")

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdmisfa.core.errors import UsageError
-from recorder.config import BoxConfig, SceneConfig, SphereConfig
+from recorder.world.icub_config import BoxConfig, IcubConfig, SphereConfig
 from recorder.world.motions import CHUNK, Motions, reflect
 
-SCENE = SceneConfig()
+SCENE = IcubConfig()
 WHOLE = Motions(SCENE, 3).take(2 * CHUNK + 100)
 
 
@@ -62,7 +62,7 @@ def test_object_3_walks_within_its_limits_y_slower_than_x():
 
 
 def test_one_object_never_changes_another():
-    other = SceneConfig(object1=BoxConfig(toggle_every=7), object3=SphereConfig(step_x=0.01))
+    other = IcubConfig(object1=BoxConfig(toggle_every=7), object3=SphereConfig(step_x=0.01))
     np.testing.assert_array_equal(Motions(other, 3).take(200)[:, 1], WHOLE[:200, 1])
 
 

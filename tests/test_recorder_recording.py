@@ -1,6 +1,7 @@
 """Recordings: the same bytes however they are made, readable by others, safe from any end."""
 
 import errno
+import hashlib
 import json
 import os
 import signal
@@ -14,23 +15,27 @@ import pytest
 from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
 
-from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder import recording
-from recorder.config import RecordConfig, SceneConfig
-from recorder.log import viewlog
+from recorder.config import RecordConfig
+from recorder.log import resume
 from recorder.log.folder import held
 from recorder.log.manifest import RECORDING
-from recorder.log.parts import Split
-from recorder.log.viewlog import METADATA, frames_held, sha256
+from recorder.log.messages import METADATA
+from recorder.log.resume import frames_held
+from recorder.log.split import Split
 from recorder.log.whole import partial_path
-from recorder.recording import record
+from recorder.recording import RecordingStoppedError, record, record_scene
+from recorder.world.icub_config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
 from recorder.world.rendering import BLOCK, requests
-from recorder.world.scenes import open_scene
+from recorder.world.scenes import SCENES, open_scene
 
 ROOT = Path(__file__).parent.parent
 STREAMS = ("x1", "x2", "x3")
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def whole_frames(path: Path, view: str) -> int:
@@ -44,7 +49,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def oscillatory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "oscillatory"
-    record("oscillatory", folder, frames=3000)
+    record_scene("oscillatory", folder, frames=3000)
     return folder
 
 
@@ -52,12 +57,12 @@ def oscillatory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def icub(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("pybullet")
     folder = tmp_path_factory.mktemp("whole") / "icub"
-    record("icub", folder, SceneConfig(seed=3), frames=150)
+    record_scene("icub", folder, IcubConfig(seed=3), frames=150)
     return folder
 
 
 def test_every_view_of_every_frame_is_there_and_equals_live(icub):
-    live = open_scene("icub", SceneConfig(seed=3))
+    live = open_scene("icub", IcubConfig(seed=3))
     for stream, view in enumerate(live.spec.streams):
         live.seek(0)
         block = live.take(stream, 150)
@@ -121,12 +126,12 @@ def test_rerun_shows_the_frames_as_images(icub):
 def test_bytes_do_not_depend_on_jobs(kind, request, tmp_path):
     whole = request.getfixturevalue(kind)
     seed, frames = (3, 150) if kind == "icub" else (0, 3000)
-    record(kind, tmp_path / "b", SceneConfig(seed=seed), frames=frames, jobs=2)
+    record_scene(kind, tmp_path / "b", SCENES[kind].config(seed=seed), frames=frames, jobs=2)
     assert contents(tmp_path / "b") == contents(whole)
 
 
 def test_one_view_alone_is_the_same_file(icub, tmp_path):
-    files = record("icub", tmp_path / "b", SceneConfig(seed=3), frames=150, views=["right"])
+    files = record_scene("icub", tmp_path / "b", IcubConfig(seed=3), frames=150, views=["right"])
     assert [f.name for f in files] == ["right"]
     assert files[0].sha256 == sha256(icub / "right.mcap")
     assert files[0].bytes == (icub / "right.mcap").stat().st_size
@@ -134,14 +139,14 @@ def test_one_view_alone_is_the_same_file(icub, tmp_path):
 
 
 def test_another_seed_gives_other_bytes(icub, tmp_path):
-    record("icub", tmp_path / "b", SceneConfig(seed=4), frames=20, views=["center"])
-    record("icub", tmp_path / "c", SceneConfig(seed=3), frames=20, views=["center"])
+    record_scene("icub", tmp_path / "b", IcubConfig(seed=4), frames=20, views=["center"])
+    record_scene("icub", tmp_path / "c", IcubConfig(seed=3), frames=20, views=["center"])
     assert contents(tmp_path / "b") != contents(tmp_path / "c")
 
 
 def test_progress_ends_at_the_number_of_frames(tmp_path):
     told = []
-    record("oscillatory", tmp_path / "a", frames=150, progress=told.append)
+    record_scene("oscillatory", tmp_path / "a", frames=150, progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 150
 
@@ -159,13 +164,13 @@ def test_requests_cover_every_missing_frame_once_in_time_order():
 def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
     folder = tmp_path / "a"
     folder.mkdir()
-    record("oscillatory", folder, frames=10)
+    record_scene("oscillatory", folder, frames=10)
     before = contents(folder)
     with pytest.raises(UsageError, match=r"a exists.*--force"):
-        record("oscillatory", folder, frames=3000)
+        record_scene("oscillatory", folder, frames=3000)
     assert contents(folder) == before
     (folder / "notes.txt").write_text("mine")
-    record("oscillatory", folder, frames=3000, views=["x2"], force=True)
+    record_scene("oscillatory", folder, frames=3000, views=["x2"], force=True)
     after = contents(folder)
     assert sorted(after) == ["notes.txt", "x1.mcap", "x2.mcap", "x3.mcap"]
     assert {name: after[name] for name in ("x1.mcap", "x3.mcap")} == {
@@ -176,10 +181,10 @@ def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
 
 def test_going_on_shortens_nothing(tmp_path):
     folder = tmp_path / "a"
-    record("oscillatory", folder, frames=60)
+    record_scene("oscillatory", folder, frames=60)
     before = contents(folder)
     with pytest.raises(UsageError, match="holds 60 frames, more than --frames 20"):
-        record("oscillatory", folder, frames=20, resume=True)
+        record_scene("oscillatory", folder, frames=20, resume=True)
     assert contents(folder) == before
 
 
@@ -187,7 +192,7 @@ def test_a_folder_in_use_is_refused(tmp_path):
     folder = tmp_path / "a"
     folder.mkdir()
     with held(folder), pytest.raises(UsageError, match="in use by another process"):
-        record("oscillatory", folder, frames=20)
+        record_scene("oscillatory", folder, frames=20)
     assert contents(folder) == {}
 
 
@@ -202,17 +207,22 @@ def test_a_folder_in_use_is_refused(tmp_path):
 )
 def test_wrong_arguments_are_named_and_nothing_is_made(tmp_path, options, words):
     with pytest.raises(UsageError, match=words):
-        record("oscillatory", tmp_path / "a", **({"frames": 10} | options))
+        record_scene("oscillatory", tmp_path / "a", **({"frames": 10} | options))
     assert not (tmp_path / "a").exists()
 
 
 RECORD = """
 import sys
 from pathlib import Path
-from recorder.recording import record
+from cdmisfa.cli.interrupts import stoppable
+from recorder.recording import RecordingStoppedError, record_scene
 if __name__ == "__main__":
-    record("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]),
-           progress=lambda t: print(int(t), flush=True))
+    with stoppable() as stop:
+        try:
+            record_scene("oscillatory", Path(sys.argv[1]), frames=int(sys.argv[2]), stop=stop,
+                         progress=lambda t: print(int(t), flush=True))
+        except RecordingStoppedError as error:
+            sys.exit(stop.exit_code)
 """
 
 
@@ -238,7 +248,7 @@ def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path)
         assert whole_frames(partial_path(folder / f"{view}.mcap"), view) >= told - 50
     noted = json.loads((folder / RECORDING).read_text())
     assert noted["frames"] == dict.fromkeys(STREAMS, 1000000)
-    files = record("oscillatory", folder, frames=3000, resume=True)
+    files = record_scene("oscillatory", folder, frames=3000, resume=True)
     assert [f.frames for f in files] == [3000] * 3
     assert contents(folder) == contents(oscillatory)
 
@@ -246,15 +256,41 @@ def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_leaves_everything_that_was_recorded(tmp_path, number):
     code, told = interrupt(tmp_path / "a", number)
-    assert code == -number or (number == signal.SIGINT and code in (1, 130))
+    assert code == 128 + number
     for view in STREAMS:
         assert whole_frames(partial_path(tmp_path / "a" / f"{view}.mcap"), view) >= told
     assert not list((tmp_path / "a").glob("*.mcap"))
 
 
+def test_signals_are_left_to_the_caller(tmp_path):
+    handlers = []
+
+    def note(_: float) -> None:
+        handlers.append([signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)])
+
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    record_scene("oscillatory", tmp_path / "a", frames=100, progress=note)
+    assert handlers
+    assert all(each == before for each in handlers)
+
+
+def test_stop_ends_a_recording_that_can_be_resumed(oscillatory, tmp_path):
+    folder, told = tmp_path / "a", []
+    with pytest.raises(RecordingStoppedError, match="a is not finished: go on with --resume"):
+        record_scene(
+            "oscillatory", folder, frames=3000, progress=told.append, stop=lambda: len(told) == 9
+        )
+    assert not list(folder.glob("*.mcap"))
+    assert [whole_frames(partial_path(folder / f"{view}.mcap"), view) for view in STREAMS] == [
+        192
+    ] * 3
+    record_scene("oscillatory", folder, resume=True)
+    assert contents(folder) == contents(oscillatory)
+
+
 def test_resume_knows_how_long_it_was_to_be(tmp_path):
     folder, whole = tmp_path / "a", tmp_path / "whole"
-    record("oscillatory", whole, frames=1300)
+    record_scene("oscillatory", whole, frames=1300)
 
     def stop_at(frame: int):
         def progress(done: float) -> None:
@@ -264,10 +300,10 @@ def test_resume_knows_how_long_it_was_to_be(tmp_path):
         return progress
 
     with pytest.raises(RuntimeError, match="stop"):
-        record("oscillatory", folder, frames=1300, progress=stop_at(200))
+        record_scene("oscillatory", folder, frames=1300, progress=stop_at(200))
     with pytest.raises(RuntimeError, match="stop"):
-        record("oscillatory", folder, resume=True, views=["x2"], progress=stop_at(600))
-    files = record("oscillatory", folder, resume=True)
+        record_scene("oscillatory", folder, resume=True, views=["x2"], progress=stop_at(600))
+    files = record_scene("oscillatory", folder, resume=True)
     assert [f.frames for f in files] == [1300] * 3
     assert contents(folder) == contents(whole)
 
@@ -275,20 +311,20 @@ def test_resume_knows_how_long_it_was_to_be(tmp_path):
 @pytest.mark.parametrize("split", [None, Split(seconds=3), Split(size=10_000)])
 def test_a_complete_recording_is_left_as_it_is(tmp_path, monkeypatch, split):
     folder, told = tmp_path / "a", []
-    first = record("oscillatory", folder, frames=400, split=split)
+    first = record_scene("oscillatory", folder, frames=400, split=split)
     before = {path.name: path.stat().st_ino for path in folder.iterdir()}
     reads: list[Path] = []
-    read = viewlog._messages
-    monkeypatch.setattr(viewlog, "_messages", lambda path: reads.append(path) or read(path))
-    again = record(
+    read = resume.messages
+    monkeypatch.setattr(resume, "messages", lambda path: reads.append(path) or read(path))
+    again = record_scene(
         "oscillatory", folder, frames=400, split=split, resume=True, progress=told.append
     )
-    assert again == first == record("oscillatory", folder, split=split, resume=True)
+    assert again == first == record_scene("oscillatory", folder, split=split, resume=True)
     assert told == []
     assert sorted(reads) == sorted([f.file for f in first] * 2)  # once each time
     assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
     (folder / first[-1].file.name).rename(folder / f"{first[-1].file.name}.partial")
-    assert record("oscillatory", folder, frames=400, split=split, resume=True) == first
+    assert record_scene("oscillatory", folder, frames=400, split=split, resume=True) == first
     assert first[0].file.stat().st_ino == before[first[0].file.name]
 
 
@@ -300,23 +336,23 @@ def test_resume_goes_on_from_any_torn_byte(oscillatory, tmp_path):
         for view, size in zip(STREAMS[:2], sizes, strict=False):
             data = (oscillatory / f"{view}.mcap").read_bytes()[: int(cut * size)]
             partial_path(folder / f"{view}.mcap").write_bytes(data)
-        record("oscillatory", folder, frames=3000, resume=True)
+        record_scene("oscillatory", folder, frames=3000, resume=True)
         assert contents(folder) == contents(oscillatory)
 
 
 def test_resume_of_a_finished_recording_can_make_it_longer(oscillatory, tmp_path):
-    record("oscillatory", tmp_path / "a", frames=130)
-    record("oscillatory", tmp_path / "a", frames=3000, resume=True)
+    record_scene("oscillatory", tmp_path / "a", frames=130)
+    record_scene("oscillatory", tmp_path / "a", frames=3000, resume=True)
     assert contents(tmp_path / "a") == contents(oscillatory)
 
 
 def test_resume_of_something_else_is_refused_and_changes_nothing(tmp_path):
     folder = tmp_path / "a"
-    record("oscillatory", folder, frames=130)
+    record_scene("oscillatory", folder, frames=130)
     (folder / "x1.mcap").unlink()
     before = contents(folder)
     with pytest.raises(UsageError, match=r"x2\.mcap cannot be continued: its fps is '50\.0'"):
-        record("oscillatory", folder, None, RecordConfig(fps=25), frames=200, resume=True)
+        record_scene("oscillatory", folder, None, RecordConfig(fps=25), frames=200, resume=True)
     assert contents(folder) == before
 
 
@@ -325,7 +361,7 @@ def test_resume_never_removes_a_file_it_did_not_write(tmp_path):
     folder.mkdir()
     (folder / "x2.mcap").write_bytes(b"precious")
     with pytest.raises(UsageError, match=r"x2\.mcap holds no frames of x2"):
-        record("oscillatory", folder, frames=10, resume=True)
+        record_scene("oscillatory", folder, frames=10, resume=True)
     assert (folder / "x2.mcap").read_bytes() == b"precious"
 
 
@@ -338,13 +374,9 @@ class Breaking(OscillatorySource):
         return super().take(stream, n)
 
 
-def test_an_exception_leaves_readable_partials(tmp_path, monkeypatch):
-    def broken(*_: object) -> FrameSource:
-        return Breaking()
-
-    monkeypatch.setattr(recording, "open_scene", broken)
+def test_an_exception_leaves_readable_partials(tmp_path):
     with pytest.raises(OSError, match="camera"):
-        record("oscillatory", tmp_path / "a", frames=1000)
+        record(Breaking(), tmp_path / "a", frames=1000)
     for view in STREAMS:
         assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) == 640
 
@@ -352,7 +384,7 @@ def test_an_exception_leaves_readable_partials(tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LogWriteError, match="file/a cannot be used"):
-        record("oscillatory", tmp_path / "file" / "a", frames=10)
+        record_scene("oscillatory", tmp_path / "file" / "a", frames=10)
 
 
 @pytest.mark.parametrize("wait_for_frames", [False, True])

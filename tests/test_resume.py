@@ -31,8 +31,9 @@ from cdmisfa.experiments.checkpoint import (
 )
 from cdmisfa.experiments.manifest import SET_ASIDE, differences
 from cdmisfa.experiments.runs import RunResult, run
-from recorder.config import RecordConfig, SceneConfig
-from recorder.recording import record
+from recorder.config import RecordConfig
+from recorder.recording import record_scene
+from recorder.world.icub_config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
@@ -109,7 +110,7 @@ def test_the_first_algorithm_goes_on_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("frames", "loop"), [(LENGTH * CONFIG.tau, False), (1500, True)])
 def test_a_recording_goes_on(tmp_path: Path, frames: int, loop: bool) -> None:
-    record("oscillatory", tmp_path / "log", frames=frames)
+    record_scene("oscillatory", tmp_path / "log", frames=frames)
     for iterations, resume in ((43, False), (LENGTH, True)):
         source = RecordedSource(tmp_path / "log", loop=loop)
         result = go(source, tmp_path / "run", iterations, resume=resume)
@@ -118,7 +119,7 @@ def test_a_recording_goes_on(tmp_path: Path, frames: int, loop: bool) -> None:
 
 
 def test_a_recording_that_ended_goes_on_to_the_same_end(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "log", frames=30 * CONFIG.tau)
+    record_scene("oscillatory", tmp_path / "log", frames=30 * CONFIG.tau)
     source = RecordedSource(tmp_path / "log")
     for resume in (False, True):
         with pytest.raises(LogExhaustedError, match="30 iterations"):
@@ -132,7 +133,7 @@ def test_a_simulator_goes_on(tmp_path: Path) -> None:
     from recorder.world.scenes import open_scene
 
     def live() -> FrameSource:
-        return open_scene("icub", SceneConfig(kind="icub", seed=1), RecordConfig())
+        return open_scene("icub", IcubConfig(seed=1), RecordConfig())
 
     config = LearnerConfig(tau=10, components=3, expansion="none")
     source = live()

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError
 from recorder.config import RecordConfig
-from recorder.log.viewlog import Identity, ViewLog
-from recorder.recording import record
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
+from recorder.recording import record_scene
 from replay.mcap.reader import LogReader
 from replay.mcap.tables import indexed_table
 from replay.recordings.kernels import scan
@@ -69,7 +70,7 @@ def test_blocks_are_those_of_the_tables(pictures: dict[str, Path], compression: 
 
 
 def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path, frames=FRAMES)
+    record_scene("oscillatory", tmp_path, frames=FRAMES)
     for path in sorted(tmp_path.glob("*.mcap")):
         view = ViewFile(path)
         for ours, theirs in zip(fast(view, 3, 190), plain(view, 3, 190), strict=True):

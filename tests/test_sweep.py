@@ -39,7 +39,7 @@ from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.runs import run
 from cdmisfa.experiments.sweep import ROWS, plan, read_rows, sweep
-from recorder.recording import record
+from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 
 GRID = {"learner.sigma": [0, 0.0009]}
@@ -98,7 +98,7 @@ def test_a_worker_with_other_code_refuses() -> None:
 
 def test_a_recording_is_named_by_its_bytes(tmp_path: Path) -> None:
     for name, frames in (("a", 200), ("b", 200), ("c", 300)):
-        record("oscillatory", tmp_path / name, frames=frames)
+        record_scene("oscillatory", tmp_path / name, frames=frames)
     a, b, c = (plan(tmp_path / n, grid={}, seeds=[0])[0] for n in ("a", "b", "c"))
     assert a.id == b.id != c.id
 
@@ -131,7 +131,7 @@ def test_logs_change_nothing_and_are_made_up_for(tmp_path: Path) -> None:
 
 
 def test_a_recording_is_swept_as_the_scene_is(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "log", frames=3000)
+    record_scene("oscillatory", tmp_path / "log", frames=3000)
     found = []
     for source in (tmp_path / "log", "oscillatory"):
         folder = tmp_path / f"sweep{len(found)}"
@@ -194,7 +194,7 @@ def test_failed_trials_are_listed_and_retried_when_asked(
 
 
 def test_a_trial_that_raises_fails_alone(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "log", frames=1000)
+    record_scene("oscillatory", tmp_path / "log", frames=1000)
     grid = {"learner.tau": [40, 100]}
     report = sweep(tmp_path / "log", tmp_path / "s", grid=grid, seeds=[0], max_iterations=20)
     (failed,) = report.failed
@@ -498,7 +498,7 @@ def test_a_folder_without_a_sweep_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_one_document_and_says_what_failed(tmp_path: Path) -> None:
-    record("oscillatory", tmp_path / "log", frames=1000)
+    record_scene("oscillatory", tmp_path / "log", frames=1000)
     words = [str(tmp_path / "log"), "--grid", "learner.tau=40,100", "--seeds", "0:2"]
     words += ["--max-iterations", "20", "-o", str(tmp_path / "s"), "--json"]
     found = CliRunner().invoke(sweep_command, words)

@@ -23,8 +23,8 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
-from recorder.config import SceneConfig
-from recorder.recording import record
+from recorder.recording import record_scene
+from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
 from replay.runs.stretches import read_signals
@@ -323,7 +323,7 @@ def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):
 
 def test_a_recording_has_a_view(tmp_path):
     folder = tmp_path / "recording"
-    record("oscillatory", folder, SceneConfig(kind="oscillatory"), frames=120)
+    record_scene("oscillatory", folder, OscillatoryConfig(), frames=120)
     build_view(folder, tmp_path / "r.rrd")
     rows = rows_of(tmp_path / "r.rrd")
     for name in ("1_x1", "2_x2", "3_x3"):

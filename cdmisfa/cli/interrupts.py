@@ -44,8 +44,10 @@ def interruptible() -> Iterator[Stop]:
 
 
 @contextmanager
-def stoppable() -> Iterator[Stop]:
-    """Let the body end its step at the first signal; the second one interrupts it."""
+def stoppable(
+    notice: str = "stopping after this iteration; again to stop at once\n",
+) -> Iterator[Stop]:
+    """Let the body end its step at the first signal, and say so; the second one interrupts it."""
     stop = Stop()
 
     def ask(number: int, frame: FrameType | None) -> None:
@@ -53,7 +55,7 @@ def stoppable() -> Iterator[Stop]:
             raise KeyboardInterrupt
         stop.number = number
         # not print: the signal may have come in the middle of one
-        os.write(2, b"stopping after this iteration; again to stop at once\n")
+        os.write(2, notice.encode())
 
     with _handled_by(ask):
         yield stop

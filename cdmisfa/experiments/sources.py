@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,8 @@ from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.names import did_you_mean
-from recorder.config import SCENE_KEYS, RecordConfig, SceneConfig, scene_table
+from recorder.config import RecordConfig, SceneConfig
+from recorder.world.scenes import SCENES
 
 if TYPE_CHECKING:
     from replay.camera_logs.source import Align, ForeignSource
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
-
-_SCENE_FIELDS = {name for keys in SCENE_KEYS.values() for name in keys}
 
 FRAME_SIZE = (48, 128)
 """Height and width of the paper's frames, which images of others are shrunk to."""
@@ -45,7 +44,7 @@ class Configuration:
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
-        return {"scene": scene_table(self.scene), "record": as_table(self.record)}
+        return {"scene": as_table(self.scene), "record": as_table(self.record)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +78,13 @@ def configure(
         seed: becomes `scene.seed` where that is not set.
 
     Raises:
-        UsageError: an unknown preset, learner, section or key, or a value that does not fit.
+        UsageError: an unknown scene, preset, learner, section or key, or a value that does not
+            fit.
     """
     words = parse_settings(settings)
     algorithm = words.get("learner", {}).get("algorithm")
     own = LEARNERS[algorithm].preset if algorithm is not None else None
-    tables = load_preset(preset or own or kind)
+    tables = load_preset(preset or own or SCENES[kind].preset)
     for section in (*tables, *words):
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
@@ -100,16 +100,17 @@ def configure(
         )
     if words.get("scene", {}).get("kind", kind) != kind:
         raise UsageError(f"scene.kind cannot be set: the source says that it is {kind}")
+    known = {name: {f.name: f for f in fields(entry.config)} for name, entry in SCENES.items()}
     for key in (*tables.get("scene", {}), *words.get("scene", {})):
         name = key.partition(".")[0]
-        if name in _SCENE_FIELDS and name not in SCENE_KEYS[kind]:
+        if name not in known[kind] and any(name in others for others in known.values()):
             raise UsageError(
                 f"scene.{key} means nothing to the scene {kind}, which has "
-                f"{', '.join(f'scene.{own}' for own in SCENE_KEYS[kind])}"
+                f"{', '.join(f'scene.{own}' for own in known[kind])}"
             )
     if algorithm is None:
         algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
-    scene = build(SceneConfig, "scene", *layers("scene"), {"kind": kind})
+    scene = build(SCENES[kind].config, "scene", *layers("scene"), {"kind": kind})
     return Configuration(
         learner=build(LEARNERS[algorithm].configuration, "learner", *layers("learner")),
         scene=scene if scene.seed is not None else replace(scene, seed=seed),
@@ -117,28 +118,11 @@ def configure(
     )
 
 
-def configure_scene(
-    name: str, preset: str | None = None, settings: Sequence[str] = (), seed: int = 0
-) -> Configuration:
-    """`configure` for the name of a scene as a user wrote it.
-
-    Raises:
-        UsageError: no such scene, or as for `configure`.
-    """
-    from recorder.world.scenes import SCENES
-
-    if name not in SCENES:
-        raise UsageError(f"no scene {name!r}: {did_you_mean(name, SCENES)}")
-    return configure(name, preset, settings, seed)
-
-
 def preset_for(spec: SourceSpec, described: Mapping[str, Any], preset: str | None = None) -> str:
     """The kind of scene, and so the preset, for a recording: that of its scene.
 
     What shows another scene takes the kind of the `preset` chosen, else by what a frame is.
     """
-    from recorder.world.scenes import SCENES
-
     scene = str(described.get("scene", ""))
     if scene in SCENES:
         return scene
@@ -176,7 +160,7 @@ def open_source(
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
-    from recorder.world.scenes import SCENES, open_scene
+    from recorder.world.scenes import open_scene
 
     cameras = cameras or CameraOptions()
     if follow is not None and (

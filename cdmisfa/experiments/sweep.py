@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from cdmisfa.core.config import LearnerConfig, as_table
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
@@ -27,6 +27,7 @@ from cdmisfa.experiments.manifest import write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
 from recorder.log.folder import held
+from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES, open_scene
 
 ROWS = "rows.jsonl"
@@ -303,7 +304,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 def _compiled_trial(trial: Trial) -> dict[str, Any]:
     from cdmisfa.experiments.trial import run_trial as run_oscillatory
 
-    streams = trial.configuration.scene.streams
+    streams = cast(OscillatoryConfig, trial.configuration.scene).streams
     result = run_oscillatory(
         trial.configuration.learner,
         streams,

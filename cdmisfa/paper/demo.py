@@ -96,13 +96,13 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Repor
         CdmisfaError: there is no simulator, or files cannot be written.
         NotReproducedError: live and recorded signals differ.
     """
-    from recorder.recording import record
+    from recorder.recording import record_scene
     from replay.export.figures import draw_figures
 
     configuration = configure(SCENE, seed=seed)
     recording, folder = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
     with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
-        record(
+        record_scene(
             SCENE,
             recording,
             configuration.scene,

@@ -60,9 +60,9 @@ def recording_of(request: Request) -> Path:
     finished = folder / "finished.json"
     if not finished.exists():
         from cdmisfa.experiments.manifest import write_json
-        from recorder.recording import record
+        from recorder.recording import record_scene
 
-        views = record(
+        views = record_scene(
             "icub",
             folder,
             frames=ITERATIONS * learner_config().tau,
@@ -85,11 +85,10 @@ def identity(path: str) -> dict[str, Any]:
 def open_world(settings: Settings) -> FrameSource:
     """The recording, or a live scene of the trial's own seed."""
     if settings["recording"] == LIVE:
-        from recorder.config import RecordConfig, SceneConfig
+        from recorder.world.icub_config import IcubConfig
         from recorder.world.scenes import open_scene
 
-        scene = build(SceneConfig, "scene", {"kind": "icub", "seed": settings["seed"]})
-        return open_scene("icub", scene, RecordConfig())
+        return open_scene("icub", IcubConfig(seed=settings["seed"]))
     from replay.recordings.source import RecordedSource
 
     return RecordedSource(settings["recording"])

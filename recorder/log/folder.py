@@ -1,14 +1,19 @@
-"""A folder that one process at a time writes in."""
+"""A recording's folder: held by one process at a time, and the names of its files."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
+
+REMEDY: Final = "go on with --resume or overwrite with --force"
+"""What to do where a recording is there already."""
 
 
 @contextlib.contextmanager
@@ -34,3 +39,63 @@ def held(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def part_name(view: str, number: int | None) -> str:
+    """Name of a view's file, or of one of its parts."""
+    return f"{view}.mcap" if number is None else f"{view}-{number:03d}.mcap"
+
+
+def part_number(path: Path) -> int:
+    """Number of a part by its file's name."""
+    return int(path.name.partition(".")[0].rpartition("-")[2])
+
+
+def view_logs(folder: Path, view: str, *, split: bool | None = None) -> list[Path]:
+    """Files of a view in a folder, finished or not.
+
+    Args:
+        folder: of the recording.
+        view: name of the view.
+        split: only parts, or only whole views; None for both.
+    """
+    parts = r"-\d{3,}"
+    middle = {True: parts, False: "", None: f"({parts})?"}[split]
+    pattern = re.compile(rf"{re.escape(view)}{middle}\.mcap(\.partial(\.kept)?)?")
+    return sorted(p for p in folder.iterdir() if pattern.fullmatch(p.name))
+
+
+def refuse_existing(folder: Path, *, force: bool, remedy: str = REMEDY) -> None:
+    """Refuse to write a recording where there is something.
+
+    Raises:
+        UsageError: the folder is not empty, or no folder, and `force` is not set.
+    """
+    if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder} exists: choose another folder, {remedy}")
+
+
+def make_folder(folder: Path) -> None:
+    """Make a recording's folder.
+
+    Raises:
+        LogWriteError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+
+
+def remove_views(folder: Path, names: Sequence[str]) -> None:
+    """Remove what a recording holds of some views.
+
+    Raises:
+        LogWriteError: it cannot be removed.
+    """
+    try:
+        for name in names:
+            for old in view_logs(folder, name):
+                old.unlink()
+    except OSError as error:
+        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import HeadPose
-from recorder.config import EyesConfig
+from recorder.world.icub_config import EyesConfig
 from recorder.world.world import World
 
 LUMA = (299, 587, 114)

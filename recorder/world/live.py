@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.blocks import Block, HeadPose, SeekableSource, SourceSpec, check_request, freeze
-from recorder.config import RecordConfig, SceneConfig, scene_table
+from cdmisfa.core.config import as_table
+from recorder.config import RecordConfig
 from recorder.world.eyes import Eyes
+from recorder.world.icub_config import IcubConfig
 from recorder.world.motions import Motions
 from recorder.world.world import World
 
@@ -29,7 +31,7 @@ class LiveSource(SeekableSource):
         UsageError: a scene that cannot be built.
     """
 
-    def __init__(self, scene: SceneConfig, record: RecordConfig) -> None:
+    def __init__(self, scene: IcubConfig, record: RecordConfig) -> None:
         self._scene = scene
         self._seed = scene.seed or 0
         self._motions = Motions(scene, self._seed)
@@ -71,7 +73,7 @@ class LiveSource(SeekableSource):
 
     def describe(self) -> Mapping[str, Any]:
         """The scene's seed and everything it was built from."""
-        return {"kind": "icub", "seed": self._seed, "scene": scene_table(self._scene)}
+        return {"kind": "icub", "seed": self._seed, "scene": as_table(self._scene)}
 
     def close(self) -> None:
         """End the simulator."""

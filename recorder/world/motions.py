@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.config import BoxConfig, CylinderConfig, Range, SceneConfig, SphereConfig
+from recorder.world.icub_config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 
 CHUNK = 4096
 """Frames drawn at a time."""
@@ -106,7 +106,7 @@ class Motions:
         seed: of their motions.
     """
 
-    def __init__(self, scene: SceneConfig, seed: int) -> None:
+    def __init__(self, scene: IcubConfig, seed: int) -> None:
         self._makers: list[Callable[[np.random.Generator], Motion]] = [
             partial(Toggling, scene.object1),
             partial(Uniform, scene.object2),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from cdmisfa.core.blocks import (
 )
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
+from recorder.config import SceneConfig, view_names
 
 PERIOD = 500
 """Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500."""
@@ -72,6 +74,22 @@ def one_period(name: str) -> Float:
         raise UsageError(f"no oscillatory stream {name!r}: there are {', '.join(STREAMS)}")
     theta = 2 * np.pi * np.arange(PERIOD) / PERIOD
     return freeze(np.ascontiguousarray(STREAMS[name](theta)))
+
+
+@dataclass(frozen=True, slots=True)
+class OscillatoryConfig(SceneConfig):
+    """The oscillatory streams (keys `scene.*`).
+
+    Attributes:
+        streams: names from `STREAMS`.
+    """
+
+    kind: str = "oscillatory"
+    streams: tuple[str, ...] = ("x1", "x2", "x3")
+
+    def __post_init__(self) -> None:
+        SceneConfig.__post_init__(self)
+        view_names(self.streams, "scene.streams")
 
 
 class OscillatorySource(SeekableSource):

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.config import SceneConfig
 from recorder.world.eyes import look, perspective
+from recorder.world.icub_config import IcubConfig
 from recorder.world.motions import Motions
 from recorder.world.world import World
 
@@ -26,29 +24,15 @@ _FLOOR = -0.6
 _TABLE_BACK, _TABLE_FRONT, _TABLE_SIDE = -0.3, -0.95, 0.75
 
 
-def scene_picture(scene: SceneConfig, path: Path, *, force: bool = False) -> Path:
-    """Draw the iCub scene at its first frame, the head turned to the middle view.
+def scene_picture(scene: IcubConfig) -> Image.Image:
+    """The iCub scene at its first frame, the head turned to the middle view.
 
     The table is drawn as large as the objects need, since the real one, which fills
     every eye image, would hide the robot's legs.
 
-    Returns:
-        The picture's path.
-
     Raises:
-        UsageError: the file exists, or is no .png.
-        LogWriteError: the file or its folder cannot be written.
         CdmisfaError: the simulator is not installed.
     """
-    path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise UsageError(f"{path}: the picture is a PNG, name it .png")
-    if path.exists() and not force:
-        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogWriteError(f"{path.parent} cannot be made: {error.strerror}") from error
     width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
     with World(scene, robot_seen=True) as world:
         _furnish(world, scene)
@@ -61,15 +45,10 @@ def scene_picture(scene: SceneConfig, path: Path, *, force: bool = False) -> Pat
             height,
             _LIGHT,
         )
-    image = Image.fromarray(colours[..., :3]).resize(SIZE, Image.Resampling.LANCZOS)
-    try:
-        image.save(path, format="PNG", optimize=True)
-    except OSError as error:
-        raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
-    return path
+    return Image.fromarray(colours[..., :3]).resize(SIZE, Image.Resampling.LANCZOS)
 
 
-def _furnish(world: World, scene: SceneConfig) -> None:
+def _furnish(world: World, scene: IcubConfig) -> None:
     """A floor and a table with legs in place of the endless table top."""
     world.hide_table()
     table = dataclasses.replace(scene.table, thickness=0.03)

@@ -1,4 +1,4 @@
-"""Blocks of every view in order of time, rendered here or by several processes."""
+"""Blocks of several streams in order of time, taken here or by several processes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 
-from cdmisfa.core.blocks import Block, SeekableSource
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.world.scenes import open_scene
+from recorder.world.scenes import SCENES, Opener, OpenScene
 
 Request = tuple[int, int, int]
 """Stream, first frame and number of frames of a block."""
@@ -45,16 +45,46 @@ def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
                 yield stream, first, high - first
 
 
-def render_here(source: SeekableSource, wanted: Iterable[Request]) -> Generator[Block, None, None]:
-    """The blocks, one after the other, from one source."""
-    for request in wanted:
-        yield _take(source, request)
+def take_here(
+    source: FrameSource, starts: dict[int, int], frames: int
+) -> Generator[Block, None, None]:
+    """The missing blocks of some streams, one after the other, from one source.
+
+    Args:
+        source: can go back, or has not yet come to any of the missing frames.
+        starts: the first missing frame of each stream.
+        frames: where all streams end.
+
+    Raises:
+        UsageError: the source cannot go back to the first missing frame.
+        LogExhaustedError: it ends before.
+    """
+    if isinstance(source, SeekableSource):
+        for request in requests(starts, frames):
+            yield _take(source, request)
+        return
+    first = min(starts.values(), default=frames)
+    if source.t > min(first, frames):
+        raise UsageError(
+            f"the source is at frame {source.t} and cannot go back to {first}: open it anew"
+        )
+    step = max(1, min(BLOCK, int(source.spec.fps / 2)))  # so that files grow every second
+    while source.t < frames:
+        if source.t < first:
+            source.take_all(min(step, first - source.t))
+            continue
+        for block in source.take_all(min(step, frames - source.t)):
+            done = starts.get(block.stream, frames) - block.t
+            if done < len(block):
+                new = slice(max(done, 0), None)
+                t = block.t + max(done, 0)
+                yield Block(block.stream, t, block.frames[new], block.truth[new])
 
 
 def render_in_processes(
-    kind: str, scene: SceneConfig, record: RecordConfig, wanted: Iterable[Request], jobs: int
+    scene: OpenScene, starts: dict[int, int], frames: int, jobs: int
 ) -> Generator[Block, None, None]:
-    """The blocks in the same order, rendered by `jobs` processes with a world each.
+    """The blocks of `take_here` in the same order, by `jobs` processes with a world each.
 
     Raises:
         CdmisfaError: a process died, or could not open the scene.
@@ -64,10 +94,10 @@ def render_in_processes(
         jobs,
         mp_context=multiprocessing.get_context("spawn"),
         initializer=_start,
-        initargs=(kind, scene, record),
+        initargs=(SCENES[scene.name].open, scene.config, scene.record),
     )
     try:
-        for request in wanted:
+        for request in requests(starts, frames):
             with _interrupts_held():
                 pending.append(pool.submit(_render, request))
             if len(pending) > _AHEAD * jobs:
@@ -96,11 +126,11 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start(kind: str, scene: SceneConfig, record: RecordConfig) -> None:
+def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
     """Open a world in a rendering process, which ends with its parent."""
     global _source
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _source = open_scene(kind, scene, record)
+    _source = opener(config, record)
 
 
 def _end_with_parent() -> None:

@@ -1,40 +1,152 @@
-"""The scenes there are, opened by name."""
+"""The scenes there are, opened by name; `SCENES.add` adds another."""
 
 from __future__ import annotations
 
-import difflib
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
-from cdmisfa.core.blocks import SeekableSource
+from cdmisfa.core.blocks import FrameSource, SeekableSource
+from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
-from recorder.world.oscillatory import OscillatorySource
+from recorder.world.icub_config import IcubConfig
+from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
 
-SCENES = ("icub", "oscillatory")
-"""Names of the live scenes."""
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+Opener = Callable[[Any, RecordConfig], SeekableSource]
+"""Makes a scene's source from its configuration and the clock of the frames.
+
+Only a function that can be imported can also open it in other processes.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A simulated world: everything that the rest knows of it.
+
+    Attributes:
+        config: what it can be told (keys `scene.*`).
+        open: makes its source.
+        preset: its configuration where none is chosen: name of a preset, or a .toml file.
+        picture: draws it from outside, where that can be done.
+        packages: whose versions its frames depend on.
+    """
+
+    config: type[SceneConfig]
+    open: Opener
+    preset: str
+    picture: Callable[[Any], Image] | None = None
+    packages: tuple[str, ...] = ()
+
+
+def _open_icub(config: IcubConfig, record: RecordConfig) -> SeekableSource:
+    from recorder.world.live import LiveSource
+
+    return LiveSource(config, record)
+
+
+def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> SeekableSource:
+    return OscillatorySource(config.streams, fps=record.fps, start_ns=record.start_ns)
+
+
+def _icub_picture(config: IcubConfig) -> Image:
+    from recorder.world.picture import scene_picture
+
+    return scene_picture(config)
+
+
+SCENES: Registry[Scene] = Registry(
+    "scene",
+    {
+        "icub": Scene(IcubConfig, _open_icub, "icub", _icub_picture, ("pybullet", "icub-models")),
+        "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
+    },
+)
+"""The live scenes."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenScene:
+    """A scene and what it is told, from which sources of it are opened.
+
+    Attributes:
+        name: of the scene.
+        config: its configuration, with a seed.
+        record: the clock of the frames.
+    """
+
+    name: str
+    config: SceneConfig
+    record: RecordConfig
+
+    def table(self) -> dict[str, Any]:
+        """The scene's configuration as recordings state it.
+
+        Those of the first two scenes state the keys of both, so that they stay the same bytes.
+        """
+        first = (IcubConfig, OscillatoryConfig)
+        tables = [as_table(config()) for config in first] if type(self.config) in first else []
+        return {key: v for table in (*tables, as_table(self.config)) for key, v in table.items()}
+
+    def open(self) -> SeekableSource:
+        """A source of it.
+
+        Raises:
+            UsageError: a scene that cannot be built.
+            CdmisfaError: the scene needs a simulator that is not installed.
+        """
+        return SCENES[self.name].open(self.config, self.record)
+
+
+_OPEN: WeakKeyDictionary[FrameSource, OpenScene] = WeakKeyDictionary()
+
+
+def prepare(
+    name: str, config: SceneConfig | None = None, record: RecordConfig | None = None
+) -> OpenScene:
+    """A scene that is ready to be opened.
+
+    Args:
+        name: one of `SCENES`.
+        config: of the scene; by default the preset's, with seed 0.
+        record: the clock of the frames.
+
+    Raises:
+        UsageError: no such scene, or the configuration of another one.
+    """
+    kind = SCENES[name].config
+    config = config if config is not None else kind()
+    if not isinstance(config, kind):
+        raise UsageError(f"the scene {name} takes {kind.__name__}, not {type(config).__name__}")
+    return OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
 
 
 def open_scene(
-    kind: str, scene: SceneConfig | None = None, record: RecordConfig | None = None
+    name: str, config: SceneConfig | None = None, record: RecordConfig | None = None
 ) -> SeekableSource:
-    """A live source of a scene's streams.
-
-    Args:
-        kind: one of `SCENES`.
-        scene: the world; by default the preset's, with seed 0.
-        record: the clock of the frames.
+    """A live source of a scene's streams; see `prepare`.
 
     Raises:
         UsageError: no such scene, or a scene that cannot be built.
         CdmisfaError: the scene needs a simulator that is not installed.
     """
-    scene = scene if scene is not None else SceneConfig()
-    record = record if record is not None else RecordConfig()
-    if kind == "oscillatory":
-        return OscillatorySource(scene.streams, fps=record.fps, start_ns=record.start_ns)
-    if kind == "icub":
-        from recorder.world.live import LiveSource
+    scene = prepare(name, config, record)
+    source = scene.open()
+    with contextlib.suppress(TypeError):  # a class without hashes or weak references
+        _OPEN[source] = scene
+    return source
 
-        return LiveSource(scene, record)
-    match = difflib.get_close_matches(kind, SCENES, n=1, cutoff=0.5)
-    hint = f"did you mean {match[0]}?" if match else f"there are {', '.join(SCENES)}"
-    raise UsageError(f"no scene {kind!r}: {hint}")
+
+def scene_of(source: FrameSource) -> OpenScene | None:
+    """The scene that `open_scene` opened a source of, where that is known."""
+    try:
+        return _OPEN.get(source)
+    except TypeError:
+        return None

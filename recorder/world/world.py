@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.config import SceneConfig
+from recorder.world.icub_config import IcubConfig
 
 NECK_YAW = b"neck_yaw"
 """The joint that turns the head to the left; the last of the neck."""
@@ -44,7 +44,7 @@ class World:
         neck: (3,) origin of the neck yaw joint in the root frame, metres.
     """
 
-    def __init__(self, scene: SceneConfig, *, robot_seen: bool = False) -> None:
+    def __init__(self, scene: IcubConfig, *, robot_seen: bool = False) -> None:
         with silenced():
             self._bullet, models = _import_simulator()
             path = _robot_file(models, scene.robot)
@@ -158,7 +158,7 @@ class World:
     ) -> None:
         self.close()
 
-    def _build(self, scene: SceneConfig, path: str, robot_seen: bool) -> None:
+    def _build(self, scene: IcubConfig, path: str, robot_seen: bool) -> None:
         bullet, client = self._bullet, self._client
         # Without merging, no link of this robot has a state: it has too many fixed joints.
         self._robot = bullet.loadURDF(
@@ -190,7 +190,7 @@ class World:
         self.neck = np.array([round(part, 6) for part in place])
         self._add_bodies(scene)
 
-    def _add_bodies(self, scene: SceneConfig) -> None:
+    def _add_bodies(self, scene: IcubConfig) -> None:
         bullet, top = self._bullet, scene.table.top
         box, cylinder, sphere = scene.object1, scene.object2, scene.object3
         half = (scene.table.half_size, scene.table.half_size, scene.table.thickness / 2)

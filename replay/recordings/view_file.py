@@ -26,7 +26,7 @@ from recorder.log.messages import (
     vector_payload,
     view_topic,
 )
-from recorder.log.viewfacts import view_facts
+from recorder.log.viewfacts import ViewFacts
 from replay.mcap.reader import LogReader
 from replay.recordings.channel_rows import ChannelRows, Span
 from replay.recordings.scanner import ChunkScanner, RowLayout
@@ -71,7 +71,7 @@ class ViewFile:
                 f"{self.path}: no recording of cdmisfa ({len(records)} {METADATA} records); "
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
-        self.facts = view_facts(self.path, records[0].values)
+        self.facts = ViewFacts.from_metadata(self.path, records[0].values)
         self.reader.expect(self.reader.segments)
         image = self.facts.dtype == "uint8"
         self._frames = self._channel(

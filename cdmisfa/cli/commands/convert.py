@@ -10,8 +10,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.cameras import camera_options, say_about
-from cdmisfa.cli.commands.record import print_recording
-from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.commands.record import print_recording, recording_stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
@@ -46,9 +45,9 @@ def convert_command(
     SOURCE is MCAP files or their URLs, ROS bags, or a video or a folder of pictures for each
     stream. Interrupted, it goes on with --resume.
     """
-    from cdmisfa.experiments.convert import REMEDY, convert
+    from cdmisfa.experiments.convert import convert
     from cdmisfa.experiments.sources import CameraOptions, open_cameras
-    from recorder.recording import refuse_existing
+    from recorder.log.folder import REMEDY, refuse_existing
     from replay.storage.location import Url, location
 
     places = [location(word) for word in source]
@@ -62,16 +61,13 @@ def convert_command(
     with contextlib.closing(open_cameras(places, cameras, salvage=salvage, goal=goal)) as frames:
         say_about(frames)
         length = frames.spec.length or 0
-        with bar("converting", "frames") as shown, stoppable() as stop:
-
-            def advance(done: float) -> None:
-                shown.update(done, length)
-                if stop():
-                    raise KeyboardInterrupt
-
-            try:
-                files = convert(frames, out, force=force, resume=resume, progress=advance)
-            except KeyboardInterrupt:
-                click.echo(f"cdmisfa: {out} is not finished: go on with --resume", err=True)
-                ctx.exit(stop.exit_code)
+        with bar("converting", "frames") as shown, recording_stoppable(ctx, out) as stop:
+            files = convert(
+                frames,
+                out,
+                force=force,
+                resume=resume,
+                stop=stop,
+                progress=lambda done: shown.update(done, length),
+            )
     print_recording(out, length, files, as_json=as_json)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import click
 from click.core import ParameterSource
 
 from cdmisfa.cli import options
+from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import bar
 
 if TYPE_CHECKING:
@@ -66,9 +68,9 @@ def record_command(
     SCENE is icub or oscillatory; --resume knows it, the seed and the split of what was begun. The
     same seed gives the same bytes.
     """
-    from cdmisfa.experiments.sources import configure_scene
+    from cdmisfa.experiments.sources import configure
     from recorder.log.manifest import Manifest, read_recording
-    from recorder.world.scenes import SCENES
+    from recorder.world.scenes import SCENES, prepare
 
     begun = read_recording(out) if resume and out is not None else Manifest()
     scene = scene or "".join(begun.source)
@@ -77,13 +79,11 @@ def record_command(
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     if ctx.get_parameter_source("seed") is ParameterSource.DEFAULT:
         seed = begun.options.get("seed", seed)
-    configuration = configure_scene(scene, preset, settings, seed)
+    configuration = configure(scene, preset, settings, seed)
     if scene_picture is not None:
-        if scene != "icub":
-            raise click.UsageError(f"the scene {scene} has no picture: --scene-picture is for icub")
-        from recorder.world.picture import scene_picture as draw
+        from recorder.recording import save_picture
 
-        draw(configuration.scene, scene_picture, force=force)
+        save_picture(prepare(scene, configuration.scene), scene_picture, force=force)
         click.echo(f"picture {scene_picture}", err=True)
         if out is None:
             if as_json:
@@ -91,8 +91,8 @@ def record_command(
             return
     if out is None:
         raise click.UsageError("say -o FOLDER, where the recording goes")
-    from recorder.log.parts import Split
-    from recorder.recording import DEFAULT_FRAMES, record
+    from recorder.log.split import Split
+    from recorder.recording import DEFAULT_FRAMES, record_scene
 
     parts = None if split is None else Split.parse(split)
     recorded = False
@@ -102,27 +102,39 @@ def record_command(
         recorded = True
         shown.update(done, max(done, frames or DEFAULT_FRAMES))
 
-    try:
-        with bar("recording", "frames") as shown:
-            files = record(
-                scene,
-                out,
-                configuration.scene,
-                configuration.record,
-                frames=frames,
-                views=views or None,
-                jobs=jobs,
-                force=force,
-                resume=resume,
-                split=parts,
-                progress=report,
-            )
-    except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(f"{out} is not finished: go on with --resume") from error
+    with bar("recording", "frames") as shown, recording_stoppable(ctx, out, notice="") as stop:
+        files = record_scene(
+            scene,
+            out,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            views=views or None,
+            jobs=jobs,
+            force=force,
+            resume=resume,
+            split=parts,
+            stop=stop,
+            progress=report,
+        )
     if resume and not recorded:
         click.echo(f"{out} is complete: nothing was left to record", err=True)
     held = sum(file.frames for file in files if file.name == files[0].name)
     print_recording(out, held, files, as_json=as_json)
+
+
+@contextmanager
+def recording_stoppable(ctx: click.Context, out: Path, **notice: str) -> Iterator[Stop]:
+    """Let the body end its block at a signal, say how to resume, and exit with its code."""
+    from recorder.recording import RecordingStoppedError
+
+    with stoppable(**notice) as stop:
+        try:
+            yield stop
+        except (RecordingStoppedError, KeyboardInterrupt):
+            line = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
+            click.echo(line, err=True)
+            ctx.exit(stop.exit_code)
 
 
 def print_recording(
