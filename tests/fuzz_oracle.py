@@ -19,8 +19,8 @@ from fuzz_mutations import Case, bases
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
 from replay.integrity.info import describe
-from replay.integrity.recover import recover
-from replay.integrity.verify import verify
+from replay.integrity.recover import recover_log
+from replay.integrity.verify import check_log
 from replay.mcap.reader import LogReader, Message
 from replay.mcap.records import MAX_CHUNK
 from replay.recordings.channel_rows import own_messages
@@ -65,7 +65,7 @@ def check(case: Case, path: Path, number: int = 0) -> None:
         with _only_our_errors():
             describe(path)
         with _only_our_errors():
-            verify(path)
+            check_log(path)
         _recover(path)
 
 
@@ -176,7 +176,7 @@ def _recover(path: Path) -> None:
     saved = path.with_name("saved.mcap")
     with _only_our_errors():
         try:
-            recover(path, saved, force=True)
+            recover_log(path, saved, force=True)
         finally:
             saved.with_name("saved.mcap.partial").unlink(missing_ok=True)
         with LogReader(saved) as reader:

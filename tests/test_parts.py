@@ -17,7 +17,7 @@ from cdmisfa.core.errors import UsageError
 from recorder.log.split import Split
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
-from replay.integrity.verify import verify
+from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
 
 FRAMES = 700
@@ -55,7 +55,7 @@ class TestParts(SourceContract):
 
 def test_parts_read_as_one(parts: Path) -> None:
     assert len(list(parts.glob("x1-*.mcap"))) > 3
-    assert verify(parts)["ok"]
+    assert check_log(parts).ok
     live, recorded = OscillatorySource(), RecordedSource(parts)
     assert recorded.spec.length == FRAMES
     for i in range(FRAMES // 35):

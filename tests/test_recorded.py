@@ -17,8 +17,8 @@ from recorder.log.viewlog import ViewLog
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.info import describe
-from replay.integrity.recover import recover
-from replay.integrity.verify import verify
+from replay.integrity.recover import recover_log
+from replay.integrity.verify import check_log
 from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 
@@ -193,39 +193,39 @@ def live_frames(stream: int, start: int, stop: int) -> np.ndarray:
 
 
 def test_verify_finds_what_is_wrong(vectors: Path, copy: Path) -> None:
-    assert verify(vectors)["ok"]
+    assert check_log(vectors).ok
     damage(copy / "x1.mcap")
     raw = (copy / "x2.mcap").read_bytes()
     (copy / "x2.mcap").write_bytes(raw[:-500])
     (copy / "x3.mcap").unlink()
-    report = verify(copy)
-    assert not report["ok"]
-    told = " | ".join(f"{p['where']}: {p['what']}" for p in report["problems"])
+    report = check_log(copy)
+    assert not report.ok
+    told = " | ".join(f"{p.where}: {p.what}" for p in report.problems)
     for expected in ("CRC", "frames 100 to 149 are missing", "x2.mcap: ", "'x3'"):
         assert expected in told
 
 
 def test_info_says_what_is_there(vectors: Path, copy: Path, pictures: Path) -> None:
     whole = describe(vectors)
-    assert (whole["kind"], whole["complete"], whole["crc"]) == ("recording", True, "ok")
-    views = [c for c in whole["channels"] if c["topic"].startswith("/view/")]
-    assert [c["messages"] for c in views] == [FRAMES] * 3
-    assert {c["schema"] for c in views} == {"cdmisfa.Vector"}
-    assert views[0]["end_ns"] - views[0]["start_ns"] == (FRAMES - 1) * 20_000_000
+    assert (whole.kind, whole.complete, whole.crc) == ("recording", True, "ok")
+    views = [c for c in whole.channels if c.topic.startswith("/view/")]
+    assert [c.messages for c in views] == [FRAMES] * 3
+    assert {c.schema for c in views} == {"cdmisfa.Vector"}
+    assert views[0].end_ns - views[0].start_ns == (FRAMES - 1) * 20_000_000
     damage(copy / "x1.mcap")
-    assert describe(copy / "x1.mcap")["crc"] == "bad"
+    assert describe(copy / "x1.mcap").crc == "bad"
     raw = (copy / "x2.mcap").read_bytes()
     (copy / "x2.mcap").write_bytes(raw[: len(raw) // 2])
     torn = describe(copy / "x2.mcap")
-    assert not torn["complete"]
-    assert torn["channels"][0]["messages"] > 0
+    assert not torn.complete
+    assert torn.channels[0].messages > 0
 
 
 def test_recover_saves_what_is_readable(copy: Path, tmp_path: Path) -> None:
     damage(copy / "x1.mcap")
-    report = recover(copy / "x1.mcap", tmp_path / "saved.mcap")
-    assert not report["complete"]
-    assert {(c["topic"], c["kept"], c["lost"]) for c in report["channels"]} == {
+    report = recover_log(copy / "x1.mcap", tmp_path / "saved.mcap")
+    assert not report.complete
+    assert {(c.topic, c.kept, c.lost) for c in report.channels} == {
         ("/view/x1", FRAMES - 50, 50),
         ("/truth", FRAMES - 50, 50),
     }
@@ -237,25 +237,25 @@ def test_recover_saves_what_is_readable(copy: Path, tmp_path: Path) -> None:
         assert [m.data for m in old.messages()] == [m.data for m in new.messages()]
         assert old.metadata == new.metadata
     with pytest.raises(UsageError, match="--force"):
-        recover(copy / "x1.mcap", tmp_path / "saved.mcap")
+        recover_log(copy / "x1.mcap", tmp_path / "saved.mcap")
 
 
 def test_a_recovered_folder_plays(copy: Path, tmp_path: Path) -> None:
     raw = (copy / "x2.mcap").read_bytes()
     (copy / "x2.mcap").unlink()
     (copy / "x2.mcap.partial").write_bytes(raw[: len(raw) // 2])
-    report = recover(copy, tmp_path / "saved")
-    assert not report["complete"]
-    assert any(c["lost"] is None for c in report["channels"])
+    report = recover_log(copy, tmp_path / "saved")
+    assert not report.complete
+    assert any(c.lost is None for c in report.channels)
     assert (tmp_path / "saved" / "x2.mcap").exists()
     same(RecordedSource(tmp_path / "saved").take(1, 90), OscillatorySource().take(1, 90))
 
 
 def test_recovering_a_whole_log_keeps_everything(vectors: Path, tmp_path: Path) -> None:
-    report = recover(vectors, tmp_path / "saved")
-    assert report["complete"]
-    assert not report["lost"]
-    assert verify(tmp_path / "saved")["ok"]
+    report = recover_log(vectors, tmp_path / "saved")
+    assert report.complete
+    assert not report.lost
+    assert check_log(tmp_path / "saved").ok
 
 
 def test_memory_does_not_grow_with_the_length(pictures: Path) -> None:

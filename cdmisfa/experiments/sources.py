@@ -262,7 +262,7 @@ def _refuse_what_is_no_log(path: Location) -> None:
 
 def _refuse_remote_run(path: Location) -> None:
     """Refuse a run behind a URL, once it is known to be no recording."""
-    from replay.integrity.info import kind_of
+    from replay.integrity.survey import kind_of
     from replay.mcap.reader import LogReader
     from replay.storage.location import Url
 

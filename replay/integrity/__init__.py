@@ -5,6 +5,9 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "replay.integrity.info": "describe",
+        "replay.integrity.info": "LogInfo describe",
+        "replay.integrity.verify": "LogCheck check_log",
+        "replay.integrity.recover": "Recovery recover_log",
+        "replay.integrity.survey": "Problem kind_of",
     },
 )

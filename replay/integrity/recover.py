@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.logfile import LogFile
 from recorder.log.whole import PARTIAL
-from replay.integrity.info import ChannelSurvey
+from replay.integrity.survey import SCHEMA, ChannelSurvey, Problem, problems_of
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel, Schema
 from replay.mcap.tables import MessageTable
@@ -30,18 +30,51 @@ class _Tally:
     digest: Any = field(default_factory=hashlib.sha256)
 
 
-def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class ChannelRecovery:
+    """What was saved of a channel; `lost` is None where nothing tells how much."""
+
+    topic: str
+    kept: int
+    lost: int | None
+    start_ns: int | None
+    end_ns: int | None
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What was saved of a log, or of all logs of a folder.
+
+    Attributes:
+        out: the log or folder that was written.
+        channels: of all files.
+        lost: what could not be saved.
+        unverified: messages saved of a cut chunk, whose checksum cannot be checked.
+    """
+
+    out: str
+    channels: tuple[ChannelRecovery, ...]
+    lost: tuple[Problem, ...]
+    unverified: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.lost
+
+    def as_json(self) -> dict[str, Any]:
+        """What was saved as JSON values."""
+        found = asdict(self)
+        return {"schema": SCHEMA, "out": found.pop("out"), "complete": self.complete, **found}
+
+
+def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) -> Recovery:
     """Write a complete, indexed log of everything in `src` that is readable.
 
     The new file is read again, with its checksums, and compared before this returns.
     Of a folder each log is recovered into the folder `dst`. What lies behind a URL is copied
     first.
-
-    Returns:
-        `schema`, `out`, `complete` (nothing was lost), `channels` (topic, kept, lost,
-        start_ns, end_ns, file; lost is None where nothing tells how much), `lost`
-        (where, what) and `unverified`: messages saved of a cut chunk, whose checksum
-        cannot be checked.
 
     Raises:
         UsageError: no such log, or the output exists and `force` is not set.
@@ -50,13 +83,11 @@ def recover(src: str | Location, dst: str | Path, *, force: bool = False) -> dic
     """
     place, dst = location(src), Path(dst)
     with fetched(place) as copy:
-        report = _recover(copy, dst, force)
-    for lost in report["lost"]:
-        lost["where"] = lost["where"].replace(str(copy), str(place))
-    return report
+        found = _recover(copy, dst, force)
+    return replace(found, lost=tuple(lost.moved(copy, place) for lost in found.lost))
 
 
-def _recover(src: Path, dst: Path, force: bool) -> dict[str, Any]:
+def _recover(src: Path, dst: Path, force: bool) -> Recovery:
     files = [file for file in log_files(src) if isinstance(file, Path)]
     if src.is_dir() and dst.exists() and not dst.is_dir():
         raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
@@ -71,18 +102,16 @@ def _recover(src: Path, dst: Path, force: bool) -> dict[str, Any]:
         if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
     alone = not src.is_dir()  # else it may be that there is something in the other logs
-    reports = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
-    return {
-        "schema": 1,
-        "out": str(dst),
-        "complete": all(r["complete"] for r in reports),
-        "channels": [c for r in reports for c in r["channels"]],
-        "lost": [p for r in reports for p in r["lost"]],
-        "unverified": sum(r["unverified"] for r in reports),
-    }
+    found = [_recover_file(f, t, force, alone) for f, t in zip(files, targets, strict=True)]
+    return Recovery(
+        out=str(dst),
+        channels=tuple(c for one in found for c in one.channels),
+        lost=tuple(p for one in found for p in one.lost),
+        unverified=sum(one.unverified for one in found),
+    )
 
 
-def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> dict[str, Any]:
+def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
     with LogReader(src, salvage=True) as reader:
         found = reader.channels or reader.metadata or reader.attachments
         if alone and reader.missing and not found:
@@ -91,26 +120,18 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> dict[str, A
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
             tallies, unverified = _copy(reader, log)
         _compare(dst, reader, tallies)
-        lost = [{"where": f"{src}: {p.where}", "what": p.what} for p in reader.problems]
-        if reader.missing:
-            lost.append({"where": str(src), "what": reader.missing})
         channels = [
-            {
-                "topic": reader.channels[number].topic,
-                "kept": tally.kept.messages,
-                "lost": tally.lost,
-                "start_ns": tally.kept.start,
-                "end_ns": tally.kept.end,
-                "file": dst.name,
-            }
+            ChannelRecovery(
+                topic=reader.channels[number].topic,
+                kept=tally.kept.messages,
+                lost=tally.lost,
+                start_ns=tally.kept.start,
+                end_ns=tally.kept.end,
+                file=dst.name,
+            )
             for number, tally in sorted(tallies.items())
         ]
-        return {
-            "complete": not lost,
-            "channels": channels,
-            "lost": lost,
-            "unverified": unverified,
-        }
+        return Recovery(str(dst), tuple(channels), problems_of(reader), unverified)
 
 
 def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:

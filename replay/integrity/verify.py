@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.integrity.info import crc_state, kind_of, survey
+from replay.integrity.survey import SCHEMA, Kind, Problem, crc_state, kind_of, problems_of, survey
 from replay.mcap.reader import Crc, LogReader
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
@@ -16,7 +17,37 @@ from replay.storage.listing import log_files
 from replay.storage.location import Location, location
 
 
-def verify(path: str | Location) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class FileCheck:
+    """What the checksums of one log amount to.
+
+    Attributes:
+        file: the log.
+        crc: "absent" where nothing protects the messages of a log that is fine otherwise.
+    """
+
+    file: str
+    crc: Crc
+
+
+@dataclass(frozen=True, slots=True)
+class LogCheck:
+    """Whether a log, or all logs of a folder, are whole."""
+
+    problems: tuple[Problem, ...]
+    files: tuple[FileCheck, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+    def as_json(self) -> dict[str, Any]:
+        """What was found as JSON values."""
+        return {"schema": SCHEMA, "ok": self.ok, **asdict(self)}
+
+
+def check_log(path: str | Location) -> LogCheck:
     """Check a log, or all logs of a folder, by decoding everything in them.
 
     What lies behind a URL is copied first, for all of it is needed more than once.
@@ -24,54 +55,46 @@ def verify(path: str | Location) -> dict[str, Any]:
     Of a recording also: each view has every frame once; of a folder, that the views have the
     same frames and none is missing.
 
-    Returns:
-        `ok`, `problems` (where, what), and `files`: for each its name and `crc`, "absent"
-        where nothing protects the messages of a log that is fine otherwise.
-
     Raises:
         UsageError: no such log.
     """
     place = location(path)
-    problems: list[dict[str, str]] = []
-    files: list[dict[str, str]] = []
+    problems: list[Problem] = []
+    files: list[FileCheck] = []
     views: list[Location] = []
     with fetched(place) as copy:
         for file in log_files(copy):
             state, kind = _check_file(file, problems)
-            files.append({"file": str(file), "crc": state})
+            files.append(FileCheck(str(file).replace(str(copy), str(place)), state))
             if kind == "recording":
                 views.append(file)
         if views:
             _check_views(views, problems, alone=copy.is_file())
-    return {
-        "ok": not problems,
-        "problems": [p | {"where": p["where"].replace(str(copy), str(place))} for p in problems],
-        "files": [f | {"file": f["file"].replace(str(copy), str(place))} for f in files],
-    }
+    unique = dict.fromkeys(problem.moved(copy, place) for problem in problems)
+    return LogCheck(tuple(unique), tuple(files))
 
 
-def _check_file(path: Location, problems: list[dict[str, str]]) -> tuple[Crc, str]:
+def _check_file(path: Location, problems: list[Problem]) -> tuple[Crc, Kind]:
     try:
         with LogReader(path, salvage=True) as reader:
-            found = survey(reader)
+            found = survey(reader, decode=True)
             for number in found.keys() - reader.channels.keys():
-                _note(problems, path, f"holds messages of channel {number}, never defined")
+                what = f"holds messages of channel {number}, never defined"
+                problems.append(Problem(str(path), what))
             there = sum(channel.messages for channel in found.values())
             if reader.statistics and not reader.problems and reader.statistics.messages != there:
                 stated = reader.statistics.messages
-                _note(problems, path, f"its summary states {stated} messages, there are {there}")
-            for problem in reader.problems:
-                _note(problems, path, problem.what, problem.where)
-            if reader.missing:
-                _note(problems, path, reader.missing)
+                what = f"its summary states {stated} messages, there are {there}"
+                problems.append(Problem(str(path), what))
+            problems += problems_of(reader)
             return crc_state(reader, decoded=True), kind_of(reader)
     except LogDamagedError as error:
-        _note(problems, path, _without(path, error))
+        problems.append(_said(path, error))
         return "bad", "foreign"
 
 
-def _check_views(paths: list[Location], problems: list[dict[str, str]], *, alone: bool) -> None:
-    sound = True
+def _check_views(paths: list[Location], problems: list[Problem], *, alone: bool) -> None:
+    sound, folder = True, paths[0].parent
     streams: set[str] = set()
     names: set[str] = set()
     for path in paths:
@@ -82,19 +105,21 @@ def _check_views(paths: list[Location], problems: list[dict[str, str]], *, alone
                 edges = [(0, view.facts.first_frame), *view.ranges]
                 for (_, end), (start, _) in itertools.pairwise(edges):
                     if start > end:
-                        _note(problems, path, f"frames {end} to {start - 1} are missing")
+                        what = f"frames {end} to {start - 1} are missing"
+                        problems.append(Problem(str(path), what))
                 view.check()
         except LogDamagedError as error:
             sound = False
-            _note(problems, path, _without(path, error))
+            problems.append(_said(path, error))
     for name in () if alone else sorted(streams - names):
-        _note(problems, paths[0].parent, f"the view {name!r} of the recording has no file")
+        what = f"the view {name!r} of the recording has no file"
+        problems.append(Problem(str(folder), what))
     if not sound:
         return
     try:
         source = RecordedSource(paths, salvage=True)
     except LogDamagedError as error:
-        _note(problems, paths[0].parent, _without(paths[0], error))
+        problems.append(_said(paths[0], error, folder))
         return
     with contextlib.closing(source):
         ends = {name: ranges[-1][1] for name, ranges in source.coverage().items()}
@@ -102,14 +127,9 @@ def _check_views(paths: list[Location], problems: list[dict[str, str]], *, alone
         for name, end in ends.items():
             if end > shortest:
                 what = f"the view {name!r} ends before frame {end}, another before {shortest}"
-                _note(problems, paths[0].parent, what)
+                problems.append(Problem(str(folder), what))
 
 
-def _note(problems: list[dict[str, str]], path: Location, what: str, where: str = "") -> None:
-    problem = {"where": f"{path}: {where}" if where else str(path), "what": what}
-    if problem not in problems:
-        problems.append(problem)
-
-
-def _without(path: Location, error: LogDamagedError) -> str:
-    return str(error).removeprefix(f"{path}: ")
+def _said(path: Location, error: LogDamagedError, where: Location | None = None) -> Problem:
+    """An error as a problem of the log that it names, or of another place."""
+    return Problem(str(where or path), str(error).removeprefix(f"{path}: "))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from cdmisfa.cli import options
 from cdmisfa.core.errors import LogDamagedError
+
+if TYPE_CHECKING:
+    from replay.integrity.info import LogInfo
 
 
 @click.command("info")
@@ -23,35 +26,31 @@ def info_command(ctx: click.Context, path: str, as_json: bool) -> None:
     """
     from replay.integrity.info import describe
 
-    document = describe(path)
+    found = describe(path)
     if as_json:
-        options.print_json(document)
+        options.print_json(found.as_json())
     else:
-        _print_info(path, document)
-    if document["crc"] == "bad":
+        _print_info(path, found)
+    if found.crc == "bad":
         ctx.exit(LogDamagedError.exit_code)
 
 
-def _print_info(path: str, document: dict[str, Any]) -> None:
-    state = "complete" if document["complete"] else "cut short"
-    words = [document["kind"], state, f"checksums {document['crc']}"]
-    if document["seed"] is not None:
-        words.append(f"seed {document['seed']}")
-    if document["ended"] is not None:
-        words.append(f"ended: {document['ended']}")
+def _print_info(path: str, found: LogInfo) -> None:
+    state = "complete" if found.complete else "cut short"
+    words = [found.kind, state, f"checksums {found.crc}"]
+    if found.seed is not None:
+        words.append(f"seed {found.seed}")
+    if found.ended is not None:
+        words.append(f"ended: {found.ended}")
     click.echo(f"{path}: {', '.join(words)}")
-    if document["signals"] is not None and document["signals"]["missing"]:
-        version, lacks = (document["signals"][key] for key in ("version", "missing"))
-        click.echo(f"signals of version {version}: {', '.join(lacks)} are not in it, read as NaN")
+    if found.signals is not None and found.signals.missing:
+        version, lacks = found.signals.version, ", ".join(found.signals.missing)
+        click.echo(f"signals of version {version}: {lacks} are not in it, read as NaN")
     options.print_table(
         ("topic", "messages", "encoding", "schema", "from", "to"),
         [
-            [
-                *(c[key] for key in ("topic", "messages", "encoding", "schema")),
-                _clock(c["start_ns"]),
-                _clock(c["end_ns"]),
-            ]
-            for c in document["channels"]
+            (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
+            for c in found.channels
         ],
     )
 
@@ -74,18 +73,16 @@ def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
 
     Exits with 3 when anything is wrong.
     """
-    from replay.integrity.verify import verify
+    from replay.integrity.verify import check_log
 
-    document = {"schema": options.SCHEMA, **verify(path)}
+    found = check_log(path)
     if as_json:
-        options.print_json(document)
-    elif document["ok"]:
+        options.print_json(found.as_json())
+    elif found.ok:
         click.echo(f"{path}: whole")
     else:
-        options.print_table(
-            ("where", "what"), [(p["where"], p["what"]) for p in document["problems"]]
-        )
-    if not document["ok"]:
+        options.print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
+    if not found.ok:
         ctx.exit(LogDamagedError.exit_code)
 
 
@@ -100,19 +97,16 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
 
     Exits with 3 when something could not be saved.
     """
-    from replay.integrity.recover import recover
+    from replay.integrity.recover import recover_log
 
-    report = recover(path, out, force=force)
+    found = recover_log(path, out, force=force)
     if as_json:
-        options.print_json(report)
+        options.print_json(found.as_json())
     else:
         options.print_table(
             ("topic", "kept", "lost"),
-            [
-                (c["topic"], c["kept"], "unknown" if c["lost"] is None else c["lost"])
-                for c in report["channels"]
-            ],
+            [(c.topic, c.kept, "unknown" if c.lost is None else c.lost) for c in found.channels],
         )
         click.echo(f"written {out}")
-    if not report["complete"]:
+    if not found.complete:
         ctx.exit(LogDamagedError.exit_code)

@@ -1,0 +1,145 @@
+"""What is in one log, counted, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError
+from recorder.log.messages import METADATA as RECORDING
+from replay.mcap.reader import Crc, LogReader
+from replay.mcap.records import MalformedRecord
+from replay.mcap.segments import Segment
+from replay.runs.folders import METADATA as RUN
+from replay.storage.location import Location
+
+SCHEMA: Final = 1
+"""Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
+
+Kind = Literal["recording", "run", "foreign"]
+Times = NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something that is wrong with a log, or was lost of it."""
+
+    where: str
+    what: str
+
+    def moved(self, copy: Path, place: Location) -> Problem:
+        """The same one with what was copied called by its own name."""
+        return replace(self, where=self.where.replace(str(copy), str(place)))
+
+
+@dataclass(slots=True)
+class ChannelSurvey:
+    """How many messages of a channel are there, from when to when (log time, nanoseconds)."""
+
+    messages: int = 0
+    start: int | None = None
+    end: int | None = None
+
+    def add(self, times: NDArray[Any]) -> None:
+        """Take more log times in."""
+        self.messages += len(times)
+        self.widen(times)
+
+    def widen(self, times: NDArray[Any]) -> None:
+        """Take log times in of messages that are counted."""
+        if len(times):
+            low, high = int(times.min()), int(times.max())
+            self.start = low if self.start is None else min(self.start, low)
+            self.end = high if self.end is None else max(self.end, high)
+
+
+def kind_of(reader: LogReader) -> Kind:
+    """Tell a recording and a run from other logs by their metadata."""
+    names = {m.name for m in reader.metadata}
+    if RECORDING in names:
+        return "recording"
+    return "run" if RUN in names else "foreign"
+
+
+def crc_state(reader: LogReader, *, decoded: bool) -> Crc:
+    """Say what the checksums of a log amount to."""
+    if any("CRC" in problem.what for problem in reader.problems):
+        return "bad"
+    if not decoded:
+        return "unchecked"
+    return "absent" if reader.crc_absent() else "ok"
+
+
+def problems_of(reader: LogReader) -> tuple[Problem, ...]:
+    """What was found to be wrong so far, and what is missing at the end."""
+    found = [Problem(f"{reader.path}: {p.where}", p.what) for p in reader.problems]
+    return (*found, *([Problem(str(reader.path), reader.missing)] if reader.missing else ()))
+
+
+def survey(reader: LogReader, *, decode: bool) -> dict[int, ChannelSurvey]:
+    """Count the messages of each channel.
+
+    Args:
+        reader: of a log; of one behind a URL the summary and few message indexes are read.
+        decode: decode every chunk, which finds all damage, and not only where it has no
+            message indexes.
+
+    Raises:
+        LogDamagedError: a message index is damaged.
+    """
+    found = {number: ChannelSurvey() for number in reader.channels}
+    if reader.by_index:
+        _survey_summary(reader, found)
+        return found
+    for segment in reader.segments:
+        for number, times in _times(reader, segment, decode):
+            found.setdefault(number, ChannelSurvey()).add(times)
+    return found
+
+
+def _times(reader: LogReader, segment: Segment, decode: bool) -> Iterator[tuple[int, Times]]:
+    """The log times of each channel's messages in a chunk."""
+    if segment.indexes and not decode:
+        yield from _indexed(reader, segment)
+    elif (table := reader.table(segment)) is not None:
+        for number in np.unique(table.channel).tolist():
+            yield number, table.log_time[table.channel == number]
+
+
+def _indexed(reader: LogReader, segment: Segment) -> list[tuple[int, Times]]:
+    try:
+        return [(number, pairs[:, 0]) for number, pairs in reader.index(segment)]
+    except MalformedRecord as error:
+        raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
+
+
+def _survey_summary(reader: LogReader, found: dict[int, ChannelSurvey]) -> None:
+    """Count by the summary.
+
+    A channel begins in one of the chunks that begin before any message of it that is known.
+    """
+    chunks: dict[int, list[Segment]] = {}
+    for segment in reader.segments:
+        for number, count in (segment.channel_counts() or {}).items():
+            if count:
+                found[number].messages += count
+                chunks.setdefault(number, []).append(segment)
+    for number, segments in chunks.items():
+        channel = found[number]
+        for segment in sorted(segments, key=lambda s: s.start):
+            if channel.start is not None and segment.start >= channel.start:
+                break
+            channel.widen(_times_of(reader, segment, number))
+        for segment in sorted(segments, key=lambda s: s.end, reverse=True):
+            if channel.end is not None and segment.end <= channel.end:
+                break
+            channel.widen(_times_of(reader, segment, number))
+
+
+def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:
+    return np.concatenate([times for n, times in _indexed(reader, segment) if n == number])
