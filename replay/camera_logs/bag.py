@@ -46,6 +46,7 @@ class BagImages:
         self._reader = reader
         try:
             self._connections, self._decode = self._find(topic, ros1=ros1)
+            self.topic = str(self._connections[0].topic)
             with explained(path, "rosbags"):
                 stamps = [stamp for stamp, _ in self._from(None)]
             if not stamps:
@@ -55,16 +56,9 @@ class BagImages:
             self.close()
             raise
         self.count = len(stamps)
-
-    @property
-    def topic(self) -> str:
-        """The topic."""
-        return str(self._connections[0].topic)
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Bags have no checksums: damage of a pixel in one cannot be seen."""
-        return (f"{self.path}: a ROS bag has no checksums, damaged pixels would go unnoticed",)
+        self.warnings: Sequence[str] = [
+            f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"
+        ]
 
     def frame(self, row: int) -> Bytes:
         """Decode a message into a frame, (height, width) uint8.

@@ -26,6 +26,11 @@ class JoinedImages:
     def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
         self.path = path
         self.recipe = parts[0].recipe
+        self.topic = parts[0].topic
+        self.warnings: Sequence[str] = [
+            f"{path}: {self.topic} is joined from {len(parts)} logs, by time",
+            *(warning for part in parts for warning in part.warnings),
+        ]
         self.parts = list(parts)
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")
@@ -33,17 +38,6 @@ class JoinedImages:
         self.count = len(order)
         self._part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
         self._row_in = np.concatenate([np.arange(part.count) for part in parts])[order]
-
-    @property
-    def topic(self) -> str:
-        """The topic that all parts share."""
-        return self.parts[0].topic
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """What was cut off or left out in a part, and that there are parts."""
-        joined = f"{self.path}: {self.topic} is joined from {len(self.parts)} logs, by time"
-        return [joined, *(warning for part in self.parts for warning in part.warnings)]
 
     def frame(self, row: int) -> Bytes:
         """Decode an image into a frame, (height, width) uint8.

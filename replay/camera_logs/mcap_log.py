@@ -41,26 +41,18 @@ class McapImages:
         self, path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
     ) -> None:
         self.path = path
-        self.size = size
+        self._size = size
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
-        self.count = 0
         try:
-            self.channel, self._decode = self._find(topic)
+            self._channel, self._decode = self._find(topic)
+            self.topic = self._channel.topic
             self._index()
         except BaseException:
             self.reader.close()
             raise
-
-    @property
-    def topic(self) -> str:
-        """The topic."""
-        return self.channel.topic
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """What was cut off or left out."""
         problems = [f"{p.where}: {p.what}" for p in self.reader.problems]
-        return [f"{self.path}: {text}" for text in (self.reader.missing, *problems) if text]
+        found = (self.reader.missing, *problems)
+        self.warnings: Sequence[str] = [f"{path}: {text}" for text in found if text]
 
     def frame(self, row: int) -> Bytes:
         """Decode a message into a frame, (height, width) uint8.
@@ -69,7 +61,7 @@ class McapImages:
             LogDamagedError: the message is no image that is read.
         """
         try:
-            return shrink(self._decode(self._payload(row)), *self.size)
+            return shrink(self._decode(self._payload(row)), *self._size)
         except MalformedRecord as error:
             raise LogDamagedError(
                 f"{self.path}: {self.topic} at {self.times[row]} ns: {error}"
@@ -85,7 +77,7 @@ class McapImages:
             raise MalformedRecord("it is damaged")
         place = int(self._row_in[row])
         if self.reader.by_index:
-            own = np.flatnonzero(table.channel == self.channel.id)
+            own = np.flatnonzero(table.channel == self._channel.id)
             if place >= len(own) or table.log_time[own[place]] != self.times[row]:
                 raise MalformedRecord("its chunk holds other messages than the summary names")
             place = int(own[place])
@@ -115,7 +107,7 @@ class McapImages:
             rows.append(places.astype(np.int32))
             self._segments.append(segment)
         if not times:
-            raise UsageError(f"{self.path}: there is no message on {self.channel.topic}")
+            raise UsageError(f"{self.path}: there is no message on {self.topic}")
         order = np.argsort(np.concatenate(times), kind="stable")
         self.times = sorted_times(f"{self.path}: {self.topic}", np.concatenate(times)[order])
         self._segment_of = np.concatenate(members)[order]
@@ -126,13 +118,13 @@ class McapImages:
     def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
         """Log times of the topic's messages in each chunk, and their rows in its table."""
         for segment, table in self.reader.tables(ordered=False):
-            own = np.flatnonzero(table.channel == self.channel.id)
+            own = np.flatnonzero(table.channel == self._channel.id)
             if len(own):
                 yield segment, table.log_time[own], own
 
     def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
         """As `_by_pass`, with their rows among the topic's own messages of the chunk."""
-        number = self.channel.id
+        number = self._channel.id
         segments = [s for s in self.reader.segments if (s.channel_counts() or {}).get(number)]
         self.reader.expect(segments, indexes=True)
         for segment in segments:

@@ -39,46 +39,12 @@ def open_images(
         if _is_bag(path):
             return BagImages(path, topic, size)
         if _is_split(path):
-            return open_joined(path, _parts_of(path), topic, size, salvage=salvage)
+            return _open_parts(path, topic, size, salvage=salvage)
         if path.is_dir():
             return FolderImages(path, topic, size)
         if path.suffix.lower() in VIDEOS:
             return VideoImages(path, topic, size)
     return McapImages(path, topic, size, salvage=salvage)
-
-
-def open_joined(
-    path: Path,
-    files: Sequence[Path],
-    topic: str | None,
-    size: tuple[int, int],
-    *,
-    salvage: bool = False,
-) -> ImageStream:
-    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
-
-    Raises:
-        UsageError: no part has images on the topic, or they have several topics.
-        LogDamagedError: a part is damaged.
-    """
-    parts: list[ImageStream] = []
-    refusal: UsageError | None = None
-    try:
-        for file in files:
-            try:
-                parts.append(McapImages(file, topic, size, salvage=salvage))
-            except UsageError as error:
-                refusal = refusal or error
-        if refusal is not None and (topic is None or not parts):
-            raise refusal
-        topics = {part.topic for part in parts}
-        if len(topics) > 1:
-            raise UsageError(f"{path}: name one --topic; it has images on: {sorted(topics)}")
-    except BaseException:
-        for part in parts:
-            part.close()
-        raise
-    return JoinedImages(path, parts)
 
 
 def image_logs(paths: Sequence[str | Location]) -> list[Location]:
@@ -123,6 +89,35 @@ def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any
     return {"file": path.name, "sha256": whole.hexdigest()}
 
 
+def _open_parts(
+    path: Path, topic: str | None, size: tuple[int, int], *, salvage: bool
+) -> ImageStream:
+    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
+
+    Raises:
+        UsageError: no part has images on the topic, or they have several topics.
+        LogDamagedError: a part is damaged.
+    """
+    parts: list[ImageStream] = []
+    refusal: UsageError | None = None
+    try:
+        for file in sorted(path.glob("*.mcap"), key=by_number):
+            try:
+                parts.append(McapImages(file, topic, size, salvage=salvage))
+            except UsageError as error:
+                refusal = refusal or error
+        if refusal is not None and (topic is None or not parts):
+            raise refusal
+        topics = {part.topic for part in parts}
+        if len(topics) > 1:
+            raise UsageError(f"{path}: name one --topic; it has images on: {sorted(topics)}")
+    except BaseException:
+        for part in parts:
+            part.close()
+        raise
+    return JoinedImages(path, parts)
+
+
 def _is_bag(path: Path) -> bool:
     """A ROS bag that is not in MCAP files."""
     if path.is_dir():
@@ -141,8 +136,3 @@ def _is_picture_folder(path: Path) -> bool:
 def _is_split(path: Path) -> bool:
     """Whether a folder is a rosbag2 of MCAP files, which are parts of one log."""
     return (path / "metadata.yaml").is_file() and any(path.glob("*.mcap"))
-
-
-def _parts_of(folder: Path) -> list[Path]:
-    """The parts of a rosbag2, in order."""
-    return sorted(folder.glob("*.mcap"), key=by_number)

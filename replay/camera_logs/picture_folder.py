@@ -29,10 +29,12 @@ class FolderImages:
     """
 
     recipe = RECIPE
+    warnings: Sequence[str] = ()
 
     def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
         self.path = path
         self._size = size
+        self.topic = path.resolve().name
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a folder of pictures has no topics, leave {topic} out")
         self._files = sorted(
@@ -40,16 +42,6 @@ class FolderImages:
         )
         self.count = len(self._files)
         self.times = np.empty(0, np.uint64)
-
-    @property
-    def topic(self) -> str:
-        """The folder's name."""
-        return self.path.resolve().name
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Nothing: a picture is there or not."""
-        return ()
 
     def frame(self, row: int) -> Bytes:
         """Decode a picture into a frame, (height, width) uint8.

@@ -102,15 +102,8 @@ class ForeignSource(SeekableSource):
             self.close()
             raise
         self._count = len(self._aligned[0].rows)
-        self._spec = SourceSpec(
-            stream_names(self._streams),
-            size,
-            "uint8",
-            (),
-            self._fps,
-            start_ns,
-            None if loop else self._count,
-        )
+        names, length = stream_names(self._streams), None if loop else self._count
+        self._spec = SourceSpec(names, size, "uint8", (), self._fps, start_ns, length)
         self.alignment = {
             name: {
                 "messages": aligned.messages,

@@ -28,24 +28,20 @@ class ImageStream(Protocol):
         times: (n,) uint64, when each was taken, in nanoseconds; empty where nobody knows,
             in which case they are `count` images at any even rate.
         count: how many there are.
+        topic: the topic, or what stands for it.
         recipe: how an image becomes a frame, for the record.
+        warnings: what the user should know: what was cut or left out.
     """
 
     recipe: str
     times: NDArray[np.uint64]
     count: int
+    topic: str
+    warnings: Sequence[str]
 
     @property
     def path(self) -> Location:
         """The log or the folder they are in."""
-
-    @property
-    def topic(self) -> str:
-        """The topic, or what stands for it."""
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """What the user should know: what was cut or left out."""
 
     def frame(self, row: int) -> Bytes:
         """Decode an image into a frame, (height, width) uint8.

@@ -49,6 +49,7 @@ class VideoImages:
 
     def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
         self.path = path
+        self.topic = path.stem
         self._size = size
         self._av = _pyav(path)
         self._next = _NOWHERE
@@ -63,20 +64,10 @@ class VideoImages:
         except BaseException:
             self.close()
             raise
-
-    @property
-    def topic(self) -> str:
-        """The file's name without its ending."""
-        return self.path.stem
-
-    @property
-    def warnings(self) -> Sequence[str]:
-        """Videos have no checksums; and one may have lost its end."""
-        found = [f"{self.path}: a video has no checksums, damaged pixels may go unnoticed"]
+        unsure = f"{path}: a video has no checksums, damaged pixels may go unnoticed"
         last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
-        if stated > last + 1:
-            found.append(f"{self.path}: it states {stated:g} s, its last frame is at {last:g} s")
-        return found
+        short = f"{path}: it states {stated:g} s, its last frame is at {last:g} s"
+        self.warnings: Sequence[str] = [unsure, short] if stated > last + 1 else [unsure]
 
     def frame(self, row: int) -> Bytes:
         """Decode a frame, (height, width) uint8.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -172,16 +173,10 @@ def confirm(file: RandomFile, segment: Segment) -> None:
     if opcode != Opcode.CHUNK:
         raise MalformedRecord("the summary points to something that is no chunk")
     header = chunk_header(head[RECORD_HEADER.size :])
-    data = segment.offset + RECORD_HEADER.size + header.length
-    stated = (data, header.stored, header.size, header.compression, header.start, header.end)
-    if length != header.length + header.stored or stated != (
-        segment.data_offset,
-        segment.stored,
-        segment.size,
-        segment.compression,
-        segment.start,
-        segment.end,
-    ):
+    found = Segment.of_chunk(segment.offset, header)
+    found.indexes = segment.indexes
+    stated = replace(segment, crc=header.crc, stated=False)
+    if length != header.length + header.stored or found != stated:
         raise MalformedRecord("it is not the chunk that the summary names")
     for part in segment.indexes:
         raw = Fields(file.read(part.offset - INDEX_HEADER, INDEX_HEADER), "a message index")

@@ -7,10 +7,8 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Self
 
 import numpy as np
@@ -19,32 +17,13 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.chunks import Chunks
 from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema, Statistics
-from replay.mcap.segments import Attachment, Metadata, Segment
-from replay.mcap.tables import MessageTable, merged, overlapping, within
+from replay.mcap.segments import Attachment, Message, Metadata, Problem, Segment
+from replay.mcap.tables import MessageTable, in_order, within
 from replay.mcap.walk import Structure
 from replay.storage.location import Location, Url, location
 from replay.storage.store import RandomFile
 
 Crc = Literal["ok", "absent", "bad", "unchecked"]
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """A damage: where it is, and what it is."""
-
-    where: str
-    what: str
-
-
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message of a log; times in nanoseconds."""
-
-    channel: Channel
-    sequence: int
-    log_time: int
-    publish_time: int
-    data: bytes
 
 
 class LogReader:
@@ -220,40 +199,25 @@ class LogReader:
 
         Args:
             topics: only these; None for all.
-            start: from this log time on, in nanoseconds.
-            stop: up to before this log time.
+            start: only with log times in [start, stop), in nanoseconds; None for all.
+            stop: see start.
             ordered: by log time; otherwise in file order.
 
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
+        fields = ["channel", "sequence", "log_time", "publish_time"]
         tables = self.tables(start=start, stop=stop, ordered=ordered, topics=topics)
         for segment, table in tables:
-            numbers = np.unique(table.channel)
-            known = {int(c): self._channel(int(c), segment) for c in numbers}
-            wanted = {
-                c: k
-                for c, k in known.items()
-                if k is not None and (topics is None or k.topic in topics)
-            }
-            data = memoryview(table.data.data)
-            for number, sequence, log_time, publish_time, at, size in zip(
-                table.channel.tolist(),
-                table.headers["sequence"].tolist(),
-                table.log_time.tolist(),
-                table.headers["publish_time"].tolist(),
-                table.at.tolist(),
-                table.size.tolist(),
-                strict=True,
-            ):
-                if number in wanted:
-                    yield Message(
-                        wanted[number],
-                        sequence,
-                        log_time,
-                        publish_time,
-                        bytes(data[at : at + size]),
-                    )
+            known = {c: self._channel(c, segment) for c in np.unique(table.channel).tolist()}
+            data = table.data.data
+            headers, places = table.headers[fields].tolist(), table.at.tolist()
+            for header, at, size in zip(headers, places, table.size.tolist(), strict=True):
+                number, sequence, log_time, publish_time = header
+                channel = known[number]
+                if channel is not None and (topics is None or channel.topic in topics):
+                    payload = bytes(data[at : at + size])
+                    yield Message(channel, sequence, log_time, publish_time, payload)
 
     def tables(
         self,
@@ -278,17 +242,9 @@ class LogReader:
             numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
             chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
         self.expect([s for _, s in chosen])
-        groups = overlapping(chosen) if ordered else [[pair] for pair in chosen]
-        for group in groups:
-            if len(group) > 1:
-                yield from self._merged(group, low, high)
-                continue
-            table = self.table(group[0][1])
-            if table is None:
-                continue
-            if ordered and (table.log_time[1:] < table.log_time[:-1]).any():
-                table = table.select(np.argsort(table.log_time, kind="stable"))
-            yield group[0][1], within(table, low, high)
+        in_file = ((s, t) for _, s in chosen if (t := self.table(s)) is not None)
+        for segment, table in in_order(chosen, self.table) if ordered else in_file:
+            yield segment, within(table, low, high)
 
     def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
         """Say which chunks will be read, one after the other, so that they come in time.
@@ -326,11 +282,6 @@ class LogReader:
         """Decompress the records of a chunk with message indexes; see `Chunks.unpack`."""
         return self._chunks.unpack(segment, out)
 
-    def check(self) -> None:
-        """Decode every chunk, so that every checksum and length is checked."""
-        for segment in self.segments:
-            self.table(segment)
-
     def is_at(self, path: Path) -> bool:
         """Whether a path leads to the very file that was opened."""
         return self._file.is_at(path)
@@ -350,8 +301,10 @@ class LogReader:
             kept = self._structure.resume()
         except MalformedRecord as error:
             raise LogDamagedError(f"{self.path}: {error}") from None
-        self._forget({segment.offset for segment in self._structure.segments[:kept]})
-        self._defined = min(self._defined, kept)
+        same = {segment.offset for segment in self._structure.segments[:kept]}
+        self._chunks.forget(same)
+        self._failed &= same
+        self._defined, self._searched = min(self._defined, kept), False
         self._time_tail()
         self._check_data_crc()
         return True
@@ -359,27 +312,15 @@ class LogReader:
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
         self._file.close()
-        self._forget()
+        self._chunks.forget()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # Inside
-
-    def _forget(self, but: Collection[int] = ()) -> None:
-        """Let go of the chunks that were decoded, but those at some places of the file."""
-        self._chunks.forget(but)
-        self._failed &= set(but)
-        self._defined = self._defined if but else 0
-        self._searched = False
 
     def _refuse(self, where: str, what: str) -> None:
         if not self.salvage:
@@ -409,23 +350,21 @@ class LogReader:
         if self._file.crc(0, structure.data_end) == structure.data_crc:
             return
         if not self.salvage:
-            self.check()
+            self._check()
         self._refuse("data section", "its CRC does not match: damaged")
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
-        definitions = self._structure.definitions
-        for look in (None, self._define, self._search):
-            if look is not None:
-                look()
-            channel = definitions.channels.get(number)
-            if channel and (not channel.schema_id or channel.schema_id in definitions.schemas):
+        known = self._structure.definitions
+        looks: list[Callable[[], None]] = [lambda: None, self._define, self._search]
+        for look in looks:
+            look()
+            channel = known.channels.get(number)
+            if channel and (not channel.schema_id or channel.schema_id in known.schemas):
                 return channel
-        if channel is None:
-            self._refuse(segment.name, f"it holds messages of channel {number}, never defined")
-        else:
-            self._refuse(
-                segment.name, f"schema {channel.schema_id} of {channel.topic!r} is never defined"
-            )
+        what = f"it holds messages of channel {number}, never defined"
+        if channel is not None:
+            what = f"schema {channel.schema_id} of {channel.topic!r} is never defined"
+        self._refuse(segment.name, what)
         return channel
 
     def _define(self) -> None:
@@ -446,20 +385,12 @@ class LogReader:
         if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
             self._search()
 
+    def _check(self) -> None:
+        for segment in self.segments:
+            self.table(segment)
+
     def _search(self) -> None:
         """Decode every chunk: a definition may stand in one that holds no message of it."""
         if not self._searched:
             self._searched = True
-            for segment in self.segments:
-                self.table(segment)
-
-    def _merged(
-        self, group: list[tuple[int, Segment]], low: int, high: int
-    ) -> Iterator[tuple[Segment, MessageTable]]:
-        tables = (self.table(segment) for _, segment in group)
-        none = np.empty(0, np.uint64)
-        for member, rows in merged([none if t is None else t.log_time for t in tables]):
-            segment = group[member][1]
-            table = self.table(segment)
-            if table is not None:
-                yield segment, within(table.select(rows), low, high)
+            self._check()

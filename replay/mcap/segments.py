@@ -7,7 +7,16 @@ from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
 
-from replay.mcap.records import MAX_DEFINITION, Channel, MalformedRecord, Schema, channel, schema
+from replay.mcap.records import (
+    MAX_DEFINITION,
+    RECORD_HEADER,
+    Channel,
+    ChunkHeader,
+    MalformedRecord,
+    Schema,
+    channel,
+    schema,
+)
 
 Refuse = Callable[[str, str], None]
 """Takes (where, what) of a damage: raises, or notes it where the caller wants to go on."""
@@ -54,6 +63,12 @@ class Segment:
     cut: bool = False
     stated: bool = False
 
+    @classmethod
+    def of_chunk(cls, offset: int, header: ChunkHeader) -> Segment:
+        """A chunk whose record stands at a place in the file, by what it says of itself."""
+        data, h = offset + RECORD_HEADER.size + header.length, header
+        return cls(offset, data, h.stored, h.size, h.compression, h.crc, h.start, h.end, True)
+
     @property
     def stop(self) -> int:
         """Place in the file after its message indexes."""
@@ -97,6 +112,25 @@ class Attachment:
     offset: int
     size: int
     crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A damage: where it is, and what it is."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a log; times in nanoseconds."""
+
+    channel: Channel
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
 
 
 class Definitions:

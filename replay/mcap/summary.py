@@ -212,15 +212,5 @@ def _segment(fields: Fields) -> Segment | None:
             return None
         parts.append(IndexPart(channel, place + INDEX_HEADER, count))
     return Segment(
-        offset,
-        data,
-        stored,
-        size,
-        compression,
-        0,
-        start,
-        end,
-        chunked=True,
-        indexes=parts,
-        stated=True,
+        offset, data, stored, size, compression, 0, start, end, True, indexes=parts, stated=True
     )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -19,6 +20,8 @@ from replay.mcap.records import (
     walk,
 )
 from replay.mcap.segments import Segment
+
+_NO_TIMES: Final = np.empty(0, np.uint64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,35 +187,40 @@ def within(table: MessageTable, low: int, high: int) -> MessageTable:
     return table.select(keep)
 
 
-def overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[tuple[int, Segment]]]:
+def in_order(
+    segments: list[tuple[int, Segment]], table_of: Callable[[Segment], MessageTable | None]
+) -> Iterator[tuple[Segment, MessageTable]]:
+    """The messages of chunks by log time, ties in file order; overlapping chunks come in pieces.
+
+    Args:
+        segments: chunks with their place among those of the file.
+        table_of: decodes a chunk; None where it is left out. Few are asked for at once.
+    """
+    for group in _overlapping(segments):
+        times = [t.log_time if (t := table_of(s)) is not None else _NO_TIMES for s in group]
+        order = np.argsort(np.concatenate(times), kind="stable")
+        counts = [len(each) for each in times]
+        chunk_of = np.repeat(np.arange(len(group)), counts)[order]
+        row_of = np.concatenate([np.arange(count) for count in counts])[order]
+        edges = [0, *(np.flatnonzero(np.diff(chunk_of)) + 1).tolist(), len(order)]
+        for low, high in itertools.pairwise(edges if len(order) else ()):
+            segment, rows = group[int(chunk_of[low])], row_of[low:high]
+            table = table_of(segment)
+            if table is not None:
+                whole = len(rows) == len(table) and not (rows[1:] < rows[:-1]).any()
+                yield segment, table if whole else table.select(rows)
+
+
+def _overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[Segment]]:
     """Group segments so that sorting within each group sorts all."""
     ordered = sorted(segments, key=lambda pair: (pair[1].start, pair[0]))
     group: list[tuple[int, Segment]] = []
     end, last = -1, -1
     for number, segment in ordered:
         if group and (segment.start > end or (segment.start == end and number > last)):
-            yield sorted(group, key=lambda pair: pair[0])
+            yield [s for _, s in sorted(group, key=lambda pair: pair[0])]
             group, end, last = [], -1, -1
         group.append((number, segment))
         end, last = max(end, segment.end), max(last, number)
     if group:
-        yield sorted(group, key=lambda pair: pair[0])
-
-
-def merged(times: Sequence[NDArray[np.uint64]]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    """Merge the messages of several chunks by log time, ties in file order.
-
-    Args:
-        times: log times of each chunk, in file order.
-
-    Yields:
-        Which of the chunks comes next, and with which rows.
-    """
-    order = np.argsort(np.concatenate(times), kind="stable")
-    counts = [len(each) for each in times]
-    chunk_of = np.repeat(np.arange(len(times)), counts)[order]
-    row_of = np.concatenate([np.arange(count) for count in counts])[order]
-    edges = [0, *(np.flatnonzero(np.diff(chunk_of)) + 1).tolist(), len(order)]
-    for low, high in itertools.pairwise(edges):
-        if low < high:
-            yield int(chunk_of[low]), row_of[low:high]
+        yield [s for _, s in sorted(group, key=lambda pair: pair[0])]

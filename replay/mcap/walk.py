@@ -237,17 +237,7 @@ class Structure:
         header = chunk_header(self._file.peek(content, min(length, _CHUNK_HEADER)))
         if header.length + header.stored > length:
             raise MalformedRecord("a chunk's length is not that of its data")
-        return Segment(
-            self._at,
-            content + header.length,
-            header.stored,
-            header.size,
-            header.compression,
-            header.crc,
-            header.start,
-            header.end,
-            chunked=True,
-        )
+        return Segment.of_chunk(self._at, header)
 
     def _cut_chunk(self, content: int, length: int, limit: int) -> None:
         try:
@@ -257,20 +247,10 @@ class Structure:
             return
         if length != _OPEN_LENGTH and header.length + header.stored > length:
             raise MalformedRecord("a chunk's length is not that of its data")
-        data = content + header.length
-        size = header.size if length != _OPEN_LENGTH else MAX_CHUNK
-        self.tail = Segment(
-            self._at,
-            data,
-            limit - data,
-            size,
-            header.compression,
-            header.crc if length != _OPEN_LENGTH else 0,
-            header.start,
-            header.end,
-            chunked=True,
-            cut=True,
-        )
+        self.tail = Segment.of_chunk(self._at, header)
+        self.tail.stored, self.tail.cut = limit - self.tail.data_offset, True
+        if length == _OPEN_LENGTH:
+            self.tail.size, self.tail.crc = MAX_CHUNK, 0
 
     def _message_index(self, content: int, length: int) -> None:
         chunk = self._last_chunk
