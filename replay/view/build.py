@@ -59,16 +59,14 @@ def build_view(
     out, path = Path(out), Path(path)
     if every < 1:
         raise UsageError(f"every {every} frames: it must be at least 1")
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     if is_run(path):
         log = run_log(path)
-        with recording_to(out, _name(log), log) as recording:
+        with recording_to(out, _name(log), log, force=force) as recording:
             _write_run(recording, log, every, all_views)
     elif all_views is not None:
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
-        with recording_to(out, path.resolve().stem, path) as recording:
+        with recording_to(out, path.resolve().stem, path, force=force) as recording:
             write_recording(recording, path, every)
 
 
@@ -87,18 +85,23 @@ def view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def recording_to(out: Path, name: str, source: Path) -> Iterator[rr.RecordingStream]:
+def recording_to(
+    out: Path, name: str, source: Path, *, force: bool
+) -> Iterator[rr.RecordingStream]:
     """A Rerun recording that becomes the file `out` once it is complete.
 
     Args:
-        out: the file; replaced.
+        out: the file.
         name: what the viewer calls the recording.
         source: what it is made from, so that others of the same name are not taken for it.
+        force: replace an existing file.
 
     Raises:
-        UsageError: its folder is not there.
+        UsageError: it exists and `force` is not set, or its folder is not there.
         CdmisfaError: the file cannot be written.
     """
+    if out.exists() and not force:
+        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
     recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))

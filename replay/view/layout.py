@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.outline import Outline
-from replay.view.columns import FRAME, TIMELINE_SIGNALS
+from replay.view.columns import FRAME, ITERATION, TIMELINE_SIGNALS
 from replay.view.heads import gaze
 from replay.view.labels import label, part
 
@@ -98,7 +98,7 @@ class RunLayout:
             contents=["/signals/**"],
             name="Table",
             query=rrb.archetypes.DataframeQuery(
-                timeline="iteration",
+                timeline=ITERATION,
                 apply_latest_at=True,
                 select=[FRAME, *(_values(entity) for entity in self._entities())],
                 entity_order=self._entities(),
@@ -265,7 +265,7 @@ class RunLayout:
             origin="/events",
             name="Events",
             columns=rrb.archetypes.TextLogColumns(
-                timeline_columns=["frame", "iteration"], text_log_columns=["loglevel", "body"]
+                timeline_columns=[FRAME, ITERATION], text_log_columns=["loglevel", "body"]
             ),
         )
         return rrb.Vertical(*rows, *truth, learned, name="Modules")

@@ -10,7 +10,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import UsageError
 from replay.palette import colour
 from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
@@ -44,7 +43,7 @@ def build_overlay(
 
     Args:
         runs: the runs.
-        rows: what `survey` says of them.
+        rows: what `side_by_side` says of them.
         out: the file.
         force: replace an existing file.
 
@@ -53,10 +52,8 @@ def build_overlay(
         LogDamagedError: a run cannot be read.
         CdmisfaError: the file cannot be written.
     """
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     names = [row.name for row in rows]
-    with recording_to(out, out.stem, out) as recording:
+    with recording_to(out, out.stem, out, force=force) as recording:
         text = rr.TextDocument(label(table_text(rows)), media_type=rr.MediaType.MARKDOWN)
         recording.log("summary", text, static=True)
         for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
