@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from benchmarks.report import interleaved, ratio, save
@@ -19,6 +18,7 @@ from cdmisfa.agents.gate import NOVEL
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.processes import Workers
 from recorder.world.oscillatory import OscillatorySource
 
 STREAMS = (10, 100, 1000, 10_000)
@@ -81,10 +81,12 @@ def apart(frames: int) -> tuple[float, float]:
 
 
 def trials(jobs: int, frames: int) -> Callable[[], int]:
-    """A call that learns 4 times that many frames in some processes."""
+    """A call that learns 4 times that many frames in some processes, which stay for the next."""
+    workers = Workers(jobs)
 
     def call() -> int:
-        Parallel(n_jobs=jobs)(delayed(learn_frames)(frames) for _ in range(4))
+        for future in [workers.submit(learn_frames, frames) for _ in range(4)]:
+            future.result()
         return 4
 
     return call

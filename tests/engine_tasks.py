@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 
 
@@ -16,3 +17,8 @@ def trace(task: tuple[str, int, str]) -> int:
     if mode == "always" or (mode == "once" and attempts.stat().st_size == 1):
         os.kill(os.getpid(), signal.SIGKILL)
     return number * number
+
+
+def sleep_for(seconds: float) -> None:
+    """A task that takes its time."""
+    time.sleep(seconds)

@@ -96,6 +96,22 @@ def jobs(command: Command) -> Command:
     )(command)
 
 
+def engine(command: Command) -> Command:
+    """`--engine` and `--scheduler`: where trials are computed."""
+    for option in (
+        click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler that runs."),
+        click.option(
+            "--engine",
+            type=click.Choice(["local", "dask"]),
+            default="local",
+            show_default=True,
+            help="Where to compute.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
 def path_argument(name: str) -> Callable[[Command], Command]:
     """A path; whether it exists is for the library to say, in its own words."""
     return click.argument(name, type=click.Path(path_type=Path))

@@ -1,4 +1,4 @@
-"""Where trials are computed: here, in local processes, on dask or on ray, by one loop.
+"""Where trials are computed: here, in local processes or on dask, by one loop.
 
 Every engine is something that turns a task into a future. The loop keeps the workers
 busy, hands back each result as it comes, and gives the task of a worker that died
@@ -13,17 +13,19 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.processes import Workers
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 Died = tuple[type[BaseException], ...]
 
-ENGINES = ("local", "dask", "ray")
+ENGINES = ("local", "dask")
 
 DEATHS = 3
 """A task whose worker died so often, the last time with nothing beside it, is given up."""
@@ -86,7 +88,7 @@ def run_all(
         tasks: picklable.
         jobs: local processes; with 1 everything is computed in this one.
         engine: one of `ENGINES`.
-        scheduler: address of a dask scheduler or a ray head; without it one is started here.
+        scheduler: address of a dask scheduler; without it one is started here.
 
     Yields:
         The task's index and its result, as they come.
@@ -98,7 +100,7 @@ def run_all(
     if engine not in ENGINES:
         raise UsageError(f"no engine {engine!r}: there are {', '.join(ENGINES)}")
     if scheduler is not None and engine == "local":
-        raise UsageError(f"--scheduler {scheduler} needs --engine dask or ray")
+        raise UsageError(f"--scheduler {scheduler} needs --engine dask")
     if not tasks:
         return
     if engine == "local" and jobs == 1:
@@ -156,42 +158,32 @@ def _line(error: BaseException) -> str:
 
 
 def _open(engine: str, jobs: int, scheduler: str | None) -> Pool:
-    match engine:
-        case "dask":
-            return DaskPool(jobs, scheduler)
-        case "ray":
-            return RayPool(jobs, scheduler)
-        case _:
-            return LocalPool(jobs)
+    return DaskPool(jobs, scheduler) if engine == "dask" else LocalPool(jobs)
 
 
 class LocalPool:
-    """Processes of this machine, through joblib's loky."""
+    """Processes of this machine."""
 
+    died: Died = (BrokenProcessPool,)
     gave_up = False
 
     def __init__(self, jobs: int) -> None:
-        from joblib.externals.loky.process_executor import BrokenProcessPool
-
-        self.died: Died = (BrokenProcessPool,)
         self.width = jobs + 1
         self._jobs = jobs
-        self.renew()
+        self._workers = Workers(jobs, environment=ONE_THREAD)
 
     def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
         """See `Pool`."""
-        future: Future[Result] = self._executor.submit(function, task)
-        return future
+        return self._workers.submit(function, task)
 
     def renew(self) -> None:
         """See `Pool`."""
-        from joblib.externals.loky import ProcessPoolExecutor
-
-        self._executor = ProcessPoolExecutor(self._jobs, env=ONE_THREAD)
+        self.close()
+        self._workers = Workers(self._jobs, environment=ONE_THREAD)
 
     def close(self) -> None:
         """See `Pool`."""
-        self._executor.shutdown(wait=True, kill_workers=True)
+        self._workers.close()
 
 
 class DaskPool:
@@ -203,7 +195,9 @@ class DaskPool:
         try:
             distributed: Any = importlib.import_module("distributed")
         except ImportError as error:
-            raise _missing("dask") from error
+            raise UsageError(
+                "--engine dask needs a package that is not installed: pip install 'cdmisfa[dask]'"
+            ) from error
         # It tells of every lost connection with a traceback; what matters is raised.
         logging.getLogger("distributed").setLevel(logging.CRITICAL)
         self.died: Died = (distributed.KilledWorker,)
@@ -253,48 +247,3 @@ class DaskPool:
     def close(self) -> None:
         """See `Pool`."""
         self._client.close()
-
-
-class RayPool:
-    """A ray cluster, or one started here for the while."""
-
-    gave_up = True
-
-    def __init__(self, jobs: int, scheduler: str | None) -> None:
-        try:
-            ray: Any = importlib.import_module("ray")
-        except ImportError as error:
-            raise _missing("ray") from error
-        self._ray = ray
-        self.died: Died = (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError)
-        try:
-            if scheduler is None:
-                ray.init(num_cpus=jobs, include_dashboard=False, log_to_driver=False)
-            else:
-                ray.init(address=scheduler, log_to_driver=False)
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            raise EngineError(f"no ray head answers at {scheduler}: {_line(error)}") from error
-
-    @property
-    def width(self) -> int:
-        """Two for each processor of the cluster."""
-        return max(2 * int(self._ray.cluster_resources().get("CPU", 1)), 1)
-
-    def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
-        """See `Pool`."""
-        remote = self._ray.remote(max_retries=DEATHS - 1)(function)
-        future: Future[Result] = remote.remote(task).future()
-        return future
-
-    def renew(self) -> None:
-        """Ray replaces workers itself."""
-
-    def close(self) -> None:
-        """See `Pool`."""
-        self._ray.shutdown()
-
-
-def _missing(engine: str) -> UsageError:
-    return UsageError(
-        f"--engine {engine} needs a package that is not installed: pip install 'cdmisfa[{engine}]'"
-    )

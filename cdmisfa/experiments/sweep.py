@@ -124,7 +124,7 @@ def sweep(
         max_modules: end each trial after so many.
         jobs: local processes.
         engine: where to compute, see `engines.ENGINES`.
-        scheduler: address of a dask scheduler or ray head.
+        scheduler: address of a dask scheduler.
         keep_logs: keep each trial's run folder in folder/trials; with workers on other
             machines it must be a shared one.
         retry_failed: compute trials again that failed before.

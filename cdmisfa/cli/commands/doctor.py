@@ -24,7 +24,6 @@ EXTRAS = {
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "sklearn": (("sklearn",), "the transformer for scikit-learn"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),
-    "ray": (("ray",), "sweep and reproduce --engine ray"),
 }
 """Optional parts of the package: the modules they bring, and what needs them."""
 

@@ -18,14 +18,7 @@ from cdmisfa.cli.progress import Bar, bar
 @options.out("Folder of the results [default: reproduction].")
 @click.option("--trials", type=click.IntRange(1), help="Trials per condition, not the paper's.")
 @options.jobs
-@click.option(
-    "--engine",
-    type=click.Choice(["local", "dask", "ray"]),
-    default="local",
-    show_default=True,
-    help="Where trials run.",
-)
-@click.option("--scheduler", metavar="ADDRESS", help="Of the dask scheduler or ray cluster.")
+@options.engine
 @click.option("--recording", type=click.Path(path_type=Path), help="Recording of the iCub scene.")
 @click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
 @click.option("--page", type=options.OUT, help="Write this Markdown page of all results.")

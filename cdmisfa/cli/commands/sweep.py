@@ -34,14 +34,7 @@ MOST_SEEDS = 1_000_000
 @click.option("--max-modules", type=click.IntRange(1), help="End each trial after so many.")
 @click.option("--loop", is_flag=True, help="Start a recording again at its end.")
 @options.jobs
-@click.option(
-    "--engine",
-    type=click.Choice(["local", "dask", "ray"]),
-    default="local",
-    show_default=True,
-    help="Where to compute.",
-)
-@click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler or ray head that runs.")
+@options.engine
 @click.option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
 @click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
 @options.as_json

@@ -1,0 +1,96 @@
+"""Worker processes: they end with who asked, and bring nothing of it with them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import psutil
+import pytest
+from engine_tasks import sleep_for, trace
+
+from cdmisfa.core.processes import Workers
+
+SCRIPT = """
+import contextlib, sys
+from engine_tasks import sleep_for, trace
+from cdmisfa.core.processes import Workers
+print("begun")
+with contextlib.closing(Workers(2)) as workers:
+    print(workers.submit(trace, (sys.argv[1], 3, "")).result(), flush=True)
+    futures = [workers.submit(sleep_for, 600) for _ in range(2)]
+    futures[0].result()
+"""
+"""A user's script, which does not ask whether it is the main module."""
+
+
+def begun(folder: Path) -> tuple[subprocess.Popen[str], list[psutil.Process]]:
+    """The script, with its two workers asleep."""
+    (folder / "script.py").write_text(SCRIPT)
+    here = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    process = subprocess.Popen(
+        [sys.executable, "script.py", str(folder)],
+        cwd=folder,
+        env=here,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+
+    def workers() -> list[psutil.Process]:
+        found = psutil.Process(process.pid).children()
+        return [child for child in found if "spawn_main" in " ".join(child.cmdline())]
+
+    wait_for(lambda: (folder / "3").exists() and len(workers()) == 2)
+    return process, workers()
+
+
+def wait_for(ready: Callable[[], bool], seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_they_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    process, workers = begun(tmp_path)
+    process.kill()
+    out, _ = process.communicate()
+    assert out.split() == ["begun", "9"]
+    assert psutil.wait_procs(workers, timeout=20)[1] == []
+
+
+def test_ctrl_c_of_a_terminal_is_for_their_parent_only(tmp_path: Path) -> None:
+    process, workers = begun(tmp_path)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert err.count("Traceback") == 1
+    assert err.rstrip().endswith("KeyboardInterrupt")
+    assert psutil.wait_procs(workers, timeout=20)[1] == []
+
+
+def test_closing_does_not_wait_for_what_they_are_doing() -> None:
+    workers = Workers(1)
+    future = workers.submit(sleep_for, 600)
+    wait_for(future.running)
+    start = time.monotonic()
+    workers.close()
+    workers.close()
+    assert time.monotonic() - start < 10
+    with pytest.raises(BrokenProcessPool):
+        future.result()
+
+
+def test_they_have_their_environment_before_anything_is_imported(tmp_path: Path) -> None:
+    workers = Workers(1, environment={"OPENBLAS_NUM_THREADS": "1"})
+    assert workers.submit(os.getenv, "OPENBLAS_NUM_THREADS").result() == "1"
+    workers.close()
+    assert trace((str(tmp_path), 2, "")) == 4
