@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
-import signal
-import threading
 from collections import deque
 from collections.abc import Generator, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.processes import Workers
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.scenes import SCENES, Opener, OpenScene
 
@@ -90,16 +85,10 @@ def render_in_processes(
         CdmisfaError: a process died, or could not open the scene.
     """
     pending: deque[Future[Block]] = deque()
-    pool = ProcessPoolExecutor(
-        jobs,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start,
-        initargs=(SCENES[scene.name].open, scene.config, scene.record),
-    )
+    workers = Workers(jobs, _start, (SCENES[scene.name].open, scene.config, scene.record))
     try:
         for request in requests(starts, frames):
-            with _interrupts_held():
-                pending.append(pool.submit(_render, request))
+            pending.append(workers.submit(_render, request))
             if len(pending) > _AHEAD * jobs:
                 yield pending.popleft().result()
         while pending:
@@ -109,37 +98,13 @@ def render_in_processes(
             "a rendering process ended: record with --jobs 1 to see why, or give it more memory"
         ) from error
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Deliver Ctrl-C afterwards, and never to processes started meanwhile.
-
-    They inherit the mask. A terminal sends Ctrl-C to all of them, but only the writer may
-    decide when to end.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        workers.close()
 
 
 def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
-    """Open a world in a rendering process, which ends with its parent."""
+    """Open a world in a rendering process."""
     global _source
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     _source = opener(config, record)
-
-
-def _end_with_parent() -> None:
-    # A parent that was killed cannot tell its children to end.
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        with contextlib.suppress(OSError):
-            wait([parent.sentinel])
-        os._exit(1)
 
 
 def _render(request: Request) -> Block:
