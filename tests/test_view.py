@@ -1,21 +1,15 @@
-"""The view of a run holds every signal of every iteration, and shows it without a report."""
+"""The view of a run holds every signal of every iteration, and what a person needs besides."""
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import re
-import subprocess
-import sys
-import time
 from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
-import rerun.blueprint as rrb
-from PIL import Image
 from rerun.chunk import RrdReader
 from run_data import DELTA, IMAGE, VECTOR, run_of, write_run
 
@@ -27,15 +21,11 @@ from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
-from replay.runs.stretches import read_signals
 from replay.view import layout
 from replay.view import run as run_view
-from replay.view.bindings import viewer_program
 from replay.view.build import build_view
 from replay.view.columns import TensorBatch
 from replay.view.summary import summary_text
-from replay.viewer import display, headless, window
-from replay.viewer.program import check_limit, environment, run_program
 
 REPLAY = Path(__file__).parents[1] / "replay"
 ITERATIONS = 24
@@ -223,23 +213,6 @@ def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     assert "It ended: nothing was left." in text
 
 
-def test_the_view_that_is_opened_has_no_name_to_be_left_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
-    (tmp_path / "temporary").mkdir()
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
-    given = []
-
-    def program(arguments, view):
-        assert list((tmp_path / "temporary").iterdir()) == []
-        given.append((arguments, view.read(4)))
-
-    monkeypatch.setattr(window, "run_program", program)
-    monkeypatch.setattr(window, "has_display", lambda: True)
-    window.open_window(tmp_path)
-    window.serve(tmp_path)
-    assert [("-" in arguments, head) for arguments, head in given] == [(True, b"RRF2")] * 2
-
-
 def test_the_file_has_a_layout_and_properties(shown):
     *_, folder = shown
     reader = RrdReader(str(folder / "run.rrd"))
@@ -331,141 +304,9 @@ def test_a_recording_has_a_view(tmp_path):
     assert len(rows["/world/truth"]["frame"]) == 120
 
 
-needs_driver = pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
-
-
-@needs_driver
-def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
-    """Opens the view, scrubs to two frames, and looks at the pixels."""
-    write_run(tmp_path / "run.mcap", IMAGE, ITERATIONS)
-    build_view(tmp_path, tmp_path / "run.rrd")
-    blocks = [block for _, block in run_of(IMAGE, ITERATIONS)]
-    with headless.headless_viewer() as opened:
-        opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
-        views = {view.name: view for view in opened.ask(all_views)}
-        assert "What happened" in views
-        assert [view.reports for view in views.values()] == [[]] * len(views)
-        for block in (blocks[3], next(b for b in blocks if b.stream != blocks[3].stream)):
-            opened.go_to(block.t)
-            grey = int(block.frames[0].min())
-            view = views["What it sees"].view_id
-            opened.ask(lambda client, v=view, g=grey: shows(client, v, g))
-
-
-@needs_driver
-def test_every_tab_shows_without_a_complaint_whatever_things_are_called(tmp_path, monkeypatch):
-    """All tabs at once; a name in letters that the viewer's font lacks would end it."""
-    spec = dataclasses.replace(IMAGE, streams=("左", "⟨b⟩/ c", "right"), truth=("x→", "y"))
-    write_run(tmp_path / "run.mcap", spec, ITERATIONS, saves=True)
-    tabs = []
-
-    def side_by_side(*views, name, timeline="frame"):
-        tabs.extend(views)
-        return rrb.Blueprint(rrb.Grid(*views), auto_views=False, auto_layout=False)
-
-    monkeypatch.setattr(layout, "blueprint", side_by_side)
-    build_view(tmp_path, tmp_path / "run.rrd")
-    assert len(tabs) == 6
-    with headless.headless_viewer("2400x1600") as opened:
-        opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
-        views = opened.ask(all_views)
-        assert len(views) > 25
-        for name in ("Rewards", "Change of weights ξ", "Output of module 1 on what was watched"):
-            (view,) = [v for v in views if v.name == name]
-            opened.ask(lambda client, v=view: client.take_screenshot(v.view_id))
-        state = opened.ask(lambda client: client.get_state())
-        assert [(v.name, v.reports) for v in state.views if v.reports] == []
-
-
-def all_views(client):
-    state = client.get_state()
-    found = [view for view in state.views if view.name == "What it sees"]
-    return state.views if found and not state.loading else None
-
-
-def shows(client, view, grey):
-    """Whether most of an image view's pixels of colour are this grey."""
-    picture = np.asarray(Image.open(io.BytesIO(client.take_screenshot(view))).convert("L"))
-    return np.mean(np.abs(picture.astype(int) - grey) < 6) > 0.2
-
-
-@needs_driver
-def test_a_screenshot_is_a_picture(tmp_path):
-    write_run(tmp_path / "run.mcap", VECTOR, 6)
-    headless.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
-    with Image.open(tmp_path / "s.png") as picture:
-        assert picture.size in ((800, 500), (1600, 1000))
-        assert len(np.unique(np.asarray(picture.convert("L")))) > 20
-    with pytest.raises(UsageError, match="--force"):
-        headless.screenshot(tmp_path, tmp_path / "s.png")
-
-
-def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
-    monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(CdmisfaError, match="mesa-vulkan-drivers"):
-        headless.screenshot(tmp_path, tmp_path / "s.png")
-
-
-def test_telemetry_is_off():
-    assert environment()["CI"] == "1"
-    assert viewer_program().is_file()
-
-
-def test_what_cannot_be_shown_is_refused_at_once(tmp_path, monkeypatch):
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(CdmisfaError, match=r"no display .* --web"):
-        window.open_window(tmp_path)
-    for limit in ("banana", "4", "GB", "-1GB"):
-        with pytest.raises(UsageError, match="4GB or 75%"):
-            window.open_window(tmp_path, memory_limit=limit)
-    assert [check_limit(limit) for limit in ("4GB", "75%", "512MiB")]
-    with pytest.raises(UsageError, match="at least 1"):
-        build_view(tmp_path, tmp_path / "v.rrd", every=0)
-    last = max(s.t + len(s.y) - 1 for s in read_signals(tmp_path))
-    with pytest.raises(UsageError, match=f"the last of .* is {last}$"):
-        headless.screenshot(tmp_path, tmp_path / "s.png", at=last + 1)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells a child")
-def test_the_program_ends_with_a_parent_that_is_killed(tmp_path):
-    told = tmp_path / "pid"
-    program = tmp_path / "program"
-    program.write_text(f"#!/bin/sh\necho $$ > {told}.part\nmv {told}.part {told}\nexec sleep 60\n")
-    program.chmod(0o755)
-    code = (
-        "import sys, pathlib, replay.viewer.program as v\n"
-        f"v.viewer_program = lambda: pathlib.Path({str(program)!r})\n"
-        "v.run_program([])\n"
-    )
-    with subprocess.Popen([sys.executable, "-c", code]) as parent:
-        while not told.exists():
-            assert parent.poll() is None
-            time.sleep(0.02)
-        parent.kill()
-    child = Path("/proc") / told.read_text().strip() / "cmdline"
-    for _ in range(100):
-        if not child.exists() or not child.read_bytes():
-            return
-        time.sleep(0.05)
-    pytest.fail("it runs on")
-
-
-def test_a_program_that_fails_is_quoted(tmp_path, monkeypatch, capfd):
-    script = tmp_path / "program"
-    script.write_text("#!/bin/sh\necho chatter >&2\necho 'no luck' >&2\nexit 3\n")
-    script.chmod(0o755)
-    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: script)
-    with pytest.raises(CdmisfaError, match="code 3: no luck"):
-        run_program([])
-    assert capfd.readouterr().err == ""
-
-
-def test_a_view_into_a_missing_folder_is_refused_by_its_name(tmp_path):
+def test_a_view_that_cannot_be_built_is_refused_with_the_reason(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 2)
     with pytest.raises(UsageError, match=r"there is no folder .*nowhere$"):
         build_view(tmp_path, tmp_path / "nowhere" / "v.rrd")
+    with pytest.raises(UsageError, match="at least 1"):
+        build_view(tmp_path, tmp_path / "v.rrd", every=0)
