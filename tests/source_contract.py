@@ -1,7 +1,9 @@
-"""What every `FrameSource` promises, as tests: import `SourceContract` and say what to open.
+"""What every `FrameSource` promises, as tests: say what to open.
+
+`ForwardContract` is for all sources, `SourceContract` for those that can go back, too.
 
 class TestOscillatory(SourceContract):
-def open(self) -> FrameSource:
+def open(self) -> SeekableSource:
 return OscillatorySource()
 """
 
@@ -12,7 +14,7 @@ import json
 import numpy as np
 import pytest
 
-from cdmisfa.core.blocks import Block, FrameSource
+from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.errors import LogExhaustedError
 
 
@@ -24,18 +26,16 @@ def same(a: Block, b: Block) -> None:
     assert a.truth.tobytes() == b.truth.tobytes()
 
 
-class SourceContract:
-    """The tests; a subclass opens a fresh source, at frame 0, in `open`.
+class ForwardContract:
+    """What all sources promise; a subclass opens a fresh source, at frame 0, in `open`.
 
     Attributes:
         long: frames that some tests take from one source.
         ends: the source has a length and refuses to go beyond it.
-        seekable: the clock can be moved backwards as well as forwards.
     """
 
     long = 40
     ends = False
-    seekable = True
 
     def open(self) -> FrameSource:
         """Open a fresh source of the kind under test."""
@@ -118,31 +118,27 @@ class SourceContract:
         np.testing.assert_array_equal(block.frames, frames)
         np.testing.assert_array_equal(block.truth, truth)
 
-    def test_seek_forwards_is_as_if_the_frames_had_been_taken(self, source: FrameSource) -> None:
-        source.take(0, 2)
-        source.seek(17)
-        assert source.t == 17
-        other = self.open()
-        other.take(0, 17)
-        same(source.take(0, 6), other.take(0, 6))
-        other.close()
-
-    def test_seek_backwards_shows_the_same_again(self, source: FrameSource) -> None:
-        if not self.seekable:
-            pytest.skip("this source only moves forwards")
-        first = source.take(0, 12)
-        source.seek(0)
-        same(source.take(0, 12), first)
-
-    def test_a_frame_before_the_first_is_refused(self, source: FrameSource) -> None:
-        with pytest.raises(ValueError, match="-1"):
-            source.seek(-1)
-        assert source.t == 0
+    def test_all_streams_together_are_each_of_them(self, source: FrameSource) -> None:
+        source.take(0, 5)
+        for n in (7, 1):
+            start = source.t
+            blocks = source.take_all(n)
+            assert source.t == start + n
+            assert [block.stream for block in blocks] == list(range(len(source.spec.streams)))
+            for block in blocks:
+                other = self.open()
+                other.take(0, start)
+                same(block, other.take(block.stream, n))
+                other.close()
+                with pytest.raises(ValueError, match="read-only"):
+                    block.frames[0] = 0
 
     @pytest.mark.parametrize("n", [0, -3])
     def test_an_empty_block_is_refused(self, source: FrameSource, n: int) -> None:
         with pytest.raises(ValueError, match="at least one frame"):
             source.take(0, n)
+        with pytest.raises(ValueError, match="at least one frame"):
+            source.take_all(n)
         assert source.t == 0
 
     def test_a_stream_that_does_not_exist_is_refused(self, source: FrameSource) -> None:
@@ -157,9 +153,11 @@ class SourceContract:
             assert length is None
             return
         assert length is not None
-        source.seek(length - 3)
+        source.take(0, length - 3)
         with pytest.raises(LogExhaustedError):
             source.take(0, 4)
+        with pytest.raises(LogExhaustedError):
+            source.take_all(4)
         assert source.t == length - 3
         assert len(source.take(0, 3)) == 3
         with pytest.raises(LogExhaustedError):
@@ -173,3 +171,29 @@ class SourceContract:
     def test_closing_twice_is_harmless(self, source: FrameSource) -> None:
         source.close()
         source.close()
+
+
+class SourceContract(ForwardContract):
+    """What sources promise that can show any frame again."""
+
+    def test_it_is_a_seekable_source(self, source: FrameSource) -> None:
+        assert isinstance(source, SeekableSource)
+
+    def test_seek_forwards_is_as_if_the_frames_had_been_taken(self, source: SeekableSource) -> None:
+        source.take(0, 2)
+        source.seek(17)
+        assert source.t == 17
+        other = self.open()
+        other.take(0, 17)
+        same(source.take(0, 6), other.take(0, 6))
+        other.close()
+
+    def test_seek_backwards_shows_the_same_again(self, source: SeekableSource) -> None:
+        first = source.take(0, 12)
+        source.seek(0)
+        same(source.take(0, 12), first)
+
+    def test_a_frame_before_the_first_is_refused(self, source: SeekableSource) -> None:
+        with pytest.raises(ValueError, match="-1"):
+            source.seek(-1)
+        assert source.t == 0

@@ -1,0 +1,183 @@
+"""Two cameras that cannot go back: recorded, learned from live and from the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from numpy.typing import NDArray
+from source_contract import ForwardContract, same
+
+from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.experiments.runs import run
+from recorder.log.split import Split
+from recorder.recording import RecordingStoppedError, record
+from replay.recordings.source import RecordedSource
+
+SHAPE = (12, 16)
+FRAMES = 700
+CONFIG = LearnerConfig(tau=20, components=3, expansion="none", warm_up=3)
+
+Picture = NDArray[np.uint8]
+
+
+def pictures(seed: int) -> Iterator[Picture]:
+    """What a camera delivers, one picture after the other: a bar that moves, and noise."""
+    rng = np.random.default_rng(seed)
+    t = 0
+    while True:
+        picture = rng.integers(0, 40, SHAPE, np.uint8)
+        picture[:, int(7.5 + 7 * np.sin((seed + 1) * t / 40))] += 200
+        yield picture
+        t += 1
+
+
+class Webcams:
+    """Two cameras on one clock; whatever is not looked at is gone."""
+
+    def __init__(self, streams: tuple[str, ...] = ("left", "right"), length: int | None = None):
+        self.spec = SourceSpec(streams, SHAPE, "uint8", fps=30, start_ns=10**18, length=length)
+        self.t = 0
+        self._cameras = [pictures(seed) for seed in range(len(streams))]
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        if n < 1:
+            raise ValueError("a block has at least one frame")
+        if self.spec.length is not None and self.t + n > self.spec.length:
+            raise LogExhaustedError("the cameras were unplugged")
+        blocks = []
+        for stream, camera in enumerate(self._cameras):
+            frames = np.stack([next(camera) for _ in range(n)])
+            frames.flags.writeable = False
+            truth = np.empty((n, 0))
+            truth.flags.writeable = False
+            blocks.append(Block(stream, self.t, frames, truth))
+        self.t += n
+        return tuple(blocks)
+
+    def take(self, stream: int, n: int) -> Block:
+        if not 0 <= stream < len(self._cameras):
+            raise ValueError(f"stream {stream} does not exist")
+        return self.take_all(n)[stream]
+
+    def describe(self) -> Mapping[str, Any]:
+        return {"kind": "webcams", "devices": [0, 1]}
+
+    def close(self) -> None:
+        pass
+
+
+class TestWebcams(ForwardContract):
+    def open(self) -> FrameSource:
+        return Webcams()
+
+
+class TestWebcamsThatAreUnplugged(ForwardContract):
+    ends = True
+
+    def open(self) -> FrameSource:
+        return Webcams(length=60)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("webcams") / "rec"
+    record(Webcams(), folder, frames=FRAMES)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_what_was_recorded_is_what_the_cameras_showed(cdmisfa: Cdmisfa, recording: Path) -> None:
+    assert not isinstance(Webcams(), SeekableSource)
+    assert sorted(contents(recording)) == ["left.mcap", "right.mcap"]
+    assert cdmisfa("verify", recording).code == 0
+    source = RecordedSource(recording)
+    assert source.spec == Webcams(length=FRAMES).spec
+    for one, two in zip(source.take_all(FRAMES), Webcams().take_all(FRAMES), strict=True):
+        same(one, two)
+
+
+def test_the_signals_are_the_same_live_and_from_the_recording(recording: Path) -> None:
+    live = run(Webcams(), CONFIG, seed=3, max_iterations=30)
+    recorded = run(RecordedSource(recording), CONFIG, seed=3, max_iterations=30)
+    assert live.iterations == 30
+    assert live.signals_sha256 == recorded.signals_sha256
+
+
+def test_a_run_of_them_is_logged_and_shown(tmp_path: Path) -> None:
+    result = run(Webcams(), CONFIG, tmp_path / "run", seed=3, max_iterations=5)
+    assert result.source == {"kind": "webcams", "devices": [0, 1]}
+    assert (tmp_path / "run" / "run.rrd").exists()
+
+
+def test_one_camera_alone_is_the_same_file(recording: Path, tmp_path: Path) -> None:
+    (file,) = record(Webcams(), tmp_path / "rec", frames=FRAMES, views=["right"])
+    assert file.file.read_bytes() == (recording / "right.mcap").read_bytes()
+
+
+@pytest.mark.parametrize("split", [None, Split(seconds=3), Split(size=12_000)])
+def test_a_resumed_recording_is_the_same_bytes(split: Split | None, tmp_path: Path) -> None:
+    """A source that has not come to the missing frames yet passes over those that are there."""
+    whole, folder = tmp_path / "whole", tmp_path / "rec"
+    record(Webcams(), whole, frames=FRAMES, split=split)
+    told: list[float] = []
+    with pytest.raises(RecordingStoppedError):
+        record(
+            Webcams(), folder, frames=FRAMES, split=split, progress=told.append,
+            stop=lambda: len(told) > 24,
+        )  # fmt: skip
+    late = Webcams()
+    late.take_all(700)
+    with pytest.raises(UsageError, match=r"at frame 700 and cannot go back to \d+: open it anew"):
+        record(late, folder, resume=True)
+    record(Webcams(), folder, resume=True)
+    assert contents(folder) == contents(whole)
+
+
+def test_a_camera_that_is_unplugged_leaves_readable_partials(tmp_path: Path) -> None:
+    class Unplugged(Webcams):
+        def take_all(self, n: int) -> tuple[Block, ...]:
+            if self.t >= 90:
+                raise LogExhaustedError("the cameras were unplugged")
+            return super().take_all(n)
+
+    with pytest.raises(LogExhaustedError, match="unplugged"):
+        record(Unplugged(), tmp_path / "rec")
+    assert len(RecordedSource(tmp_path / "rec").take(0, 90)) == 90
+
+
+def test_a_source_that_ends_is_recorded_to_its_end(tmp_path: Path) -> None:
+    files = record(Webcams(length=70), tmp_path / "rec")
+    assert [file.frames for file in files] == [70, 70]
+    with pytest.raises(UsageError, match=r"--frames is 71: .*no more than the 70"):
+        record(Webcams(length=70), tmp_path / "other", frames=71)
+
+
+def test_streams_that_cannot_name_files_take_other_names(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="'/dev/video0': give different names of files"):
+        record(Webcams(("/dev/video0", "b")), tmp_path / "rec", frames=9)
+    record(Webcams(("/dev/video0", "b")), tmp_path / "rec", frames=9, names=["a", "b"])
+    assert RecordedSource(tmp_path / "rec").spec.streams == ("a", "b")
+
+
+def test_what_no_recording_can_hold_is_refused(tmp_path: Path) -> None:
+    source = Webcams()
+    for spec, words in (
+        (SourceSpec(("a", "b"), (4, 6, 3), "uint8"), r"\(4, 6, 3\) uint8"),
+        (SourceSpec(("a", "b"), SHAPE, "uint8", fps=1e7), "give it an fps in"),
+    ):
+        source.spec = spec
+        with pytest.raises(UsageError, match=words):
+            record(source, tmp_path / "rec", frames=9)
+    with pytest.raises(UsageError, match="only a scene can be opened by several processes"):
+        record(Webcams(), tmp_path / "rec", frames=9, jobs=2)
+    assert not (tmp_path / "rec").exists()
