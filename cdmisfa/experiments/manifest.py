@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import json
-import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
@@ -16,7 +15,9 @@ from typing import Any
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION
+from recorder.log.manifest import Manifest, found_path, kept_path
 from recorder.log.whole import partial_path, whole
+from recorder.world.scenes import SCENES
 
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
@@ -53,8 +54,8 @@ def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> 
     kept = {name: options[name] for name in OPTIONS if name in options}
     preset = kept.get("preset")
     if preset is not None and preset.endswith(".toml"):
-        kept["preset"] = _relative(preset, run)
-    return {"source": [_relative(word, run) for word in source], **kept}
+        kept["preset"] = kept_path(preset, run)
+    return Manifest(tuple(source), kept).as_json(run, SCENES)
 
 
 def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -66,18 +67,18 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """
     from replay.runs.log import read_header
 
-    command = read_header(log_to_resume(run)).manifest.get(COMMAND)
-    if not isinstance(command, dict) or not isinstance(command.get("source"), list):
+    begun = Manifest.from_json(read_header(log_to_resume(run)).manifest.get(COMMAND), run)
+    if begun is None:
         raise UsageError(f"{run} does not say what it learns from: name its source")
     options = {
         name: tuple(value) if isinstance(value, list) else value
-        for name, value in command.items()
+        for name, value in begun.options.items()
         if name in OPTIONS
     }
     preset = options.get("preset")
     if preset is not None and str(preset).endswith(".toml"):
-        options["preset"] = _absolute(str(preset), run)
-    return tuple(_absolute(str(word), run) for word in command["source"]), options
+        options["preset"] = found_path(str(preset), run)
+    return begun.source, options
 
 
 def log_to_resume(run: Path) -> Path:
@@ -151,16 +152,3 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 def _json(value: Any) -> Any:
     return json.loads(json.dumps(value))
-
-
-def _relative(word: str, run: Path) -> str:
-    """A path seen from a run's folder; names of scenes and URLs stay."""
-    from recorder.world.scenes import SCENES
-
-    if word in SCENES or "://" in word:
-        return word
-    return os.path.join(os.curdir, os.path.relpath(word, run))
-
-
-def _absolute(word: str, run: Path) -> str:
-    return os.path.normpath(run / word) if word.startswith(os.curdir) else word

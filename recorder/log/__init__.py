@@ -6,8 +6,10 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "recorder.log.logfile": "LogFile",
-        "recorder.log.parts": "Split ViewParts",
-        "recorder.log.viewfacts": "ViewFacts",
-        "recorder.log.viewlog": "Identity ViewLog",
+        "recorder.log.manifest": "Manifest",
+        "recorder.log.parts": "ViewParts",
+        "recorder.log.split": "Split",
+        "recorder.log.viewfacts": "Identity ViewFacts",
+        "recorder.log.viewlog": "ViewLog",
     },
 )

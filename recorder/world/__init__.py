@@ -5,9 +5,10 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "recorder.world.oscillatory": "OscillatorySource",
+        "recorder.world.icub_config": "IcubConfig",
+        "recorder.world.oscillatory": "OscillatoryConfig OscillatorySource",
         "recorder.world.live": "LiveSource",
         "recorder.world.motions": "Motions",
-        "recorder.world.scenes": "SCENES open_scene",
+        "recorder.world.scenes": "SCENES Scene open_scene",
     },
 )

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import as_table
@@ -105,7 +105,7 @@ class OpenScene:
         return SCENES[self.name].open(self.config, self.record)
 
 
-_OPEN: WeakKeyDictionary[FrameSource, OpenScene] = WeakKeyDictionary()
+_OPEN: dict[int, OpenScene] = {}
 
 
 def prepare(
@@ -139,14 +139,12 @@ def open_scene(
     """
     scene = prepare(name, config, record)
     source = scene.open()
-    with contextlib.suppress(TypeError):  # a class without hashes or weak references
-        _OPEN[source] = scene
+    with contextlib.suppress(TypeError):  # a class without weak references
+        weakref.finalize(source, _OPEN.pop, id(source), None)
+        _OPEN[id(source)] = scene
     return source
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
     """The scene that `open_scene` opened a source of, where that is known."""
-    try:
-        return _OPEN.get(source)
-    except TypeError:
-        return None
+    return _OPEN.get(id(source))
