@@ -32,7 +32,8 @@ from replay.camera_logs.source import ForeignSource
 from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.storage.location import Url, location
-from replay.storage.remote import RemoteError, RemoteStore
+from replay.storage.remote import RemoteStore
+from replay.storage.servers import RemoteError
 
 pytest.importorskip("aiohttp")
 

@@ -65,7 +65,7 @@ def _use(patch: pytest.MonkeyPatch, endpoint: str) -> None:
 
 
 def _files() -> Any:
-    from replay.storage.remote import _s3
+    from replay.storage.servers import _s3
 
     return _s3()
 
@@ -109,7 +109,7 @@ def test_what_is_not_there_is_one_line(cdmisfa: Cdmisfa, s3: Any) -> None:
 
 def test_an_object_that_changes_is_refused(s3: Any, oscillatory_recording: Path) -> None:
     from replay.mcap.reader import LogReader
-    from replay.storage.remote import RemoteError
+    from replay.storage.servers import RemoteError
 
     data = (oscillatory_recording / "x1.mcap").read_bytes()
     s3.pipe("logs/changing.mcap", data)

@@ -137,9 +137,8 @@ class VideoImages:
 
     def _nanoseconds(self) -> NDArray[np.uint64]:
         """Times of the frames, from the video's beginning, or its first frame if that is before."""
-        tick = self._tick * NANOSECONDS
         first = min(int(self._stamps[0]), 0)
-        exact = [round((int(stamp) - first) * tick) for stamp in self._stamps]
+        exact = [round((int(stamp) - first) * self._tick * NANOSECONDS) for stamp in self._stamps]
         return sorted_times(f"{self.path}: it", exact)
 
     def _gray(self, frame: Any) -> Bytes:

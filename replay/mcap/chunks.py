@@ -25,7 +25,7 @@ from replay.mcap.records import (
 from replay.mcap.segments import Definitions, Segment
 from replay.mcap.tables import MessageTable, indexed_table, walked_table
 from replay.storage.checksum import crc32
-from replay.storage.store import RandomFile
+from replay.storage.store import Store
 
 CACHE_BYTES: Final = 32 * 1024 * 1024
 """Decoded chunks that are kept, unless told otherwise; one always is."""
@@ -43,7 +43,7 @@ class Chunks:
 
     def __init__(
         self,
-        file: RandomFile,
+        file: Store,
         definitions: Definitions,
         note: Callable[[str, str], None],
         cache_bytes: int | None,
@@ -162,7 +162,7 @@ class Chunks:
         return walked_table(raw)
 
 
-def confirm(file: RandomFile, segment: Segment) -> None:
+def confirm(file: Store, segment: Segment) -> None:
     """Compare a chunk, and its message indexes, with what the summary says of it.
 
     Raises:

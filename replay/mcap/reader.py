@@ -21,7 +21,7 @@ from replay.mcap.segments import Attachment, Message, Metadata, Problem, Segment
 from replay.mcap.tables import MessageTable, in_order, within
 from replay.mcap.walk import Structure
 from replay.storage.location import Location, Url, location
-from replay.storage.store import RandomFile
+from replay.storage.opening import open_store
 
 Crc = Literal["ok", "absent", "bad", "unchecked"]
 
@@ -51,7 +51,7 @@ class LogReader:
 
         Args:
             path: the file, or its URL.
-            salvage: go on over damage.
+            salvage: leave out what is damaged.
             cache_bytes: decoded chunks that are kept.
 
         Raises:
@@ -64,7 +64,7 @@ class LogReader:
         self._failed: set[int] = set()
         self._defined = 0
         self._searched = False
-        self._file = RandomFile(self.path)
+        self._file = open_store(self.path)
         try:
             by_index = isinstance(self.path, Url)
             self._structure = Structure(self._file, self._refuse, by_index=by_index)
@@ -127,7 +127,7 @@ class LogReader:
 
     @property
     def segments(self) -> list[Segment]:
-        """Chunks and runs of messages outside chunks, in file order."""
+        """Chunks, and messages outside chunks, in file order."""
         tail = self._structure.tail
         if tail is None or (tail.crc and not self.salvage):
             return self._structure.segments
@@ -180,7 +180,7 @@ class LogReader:
         return whole.hexdigest()
 
     def crc_absent(self) -> int:
-        """Count the chunks and runs of messages that no CRC protects."""
+        """Count the segments that no CRC protects."""
         if self._structure.data_crc:
             return 0
         return sum(1 for s in self.segments if s.crc == 0 and s.size)

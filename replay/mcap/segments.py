@@ -19,7 +19,7 @@ from replay.mcap.records import (
 )
 
 Refuse = Callable[[str, str], None]
-"""Takes (where, what) of a damage: raises, or notes it where the caller wants to go on."""
+"""Takes (where, what) of a damage: raises, or notes it where damage is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class IndexPart:
 
 @dataclass(slots=True)
 class Segment:
-    """A chunk, or a run of messages outside chunks.
+    """A chunk, or messages outside chunks that follow one another.
 
     Attributes:
         offset: place in the file of its first record.

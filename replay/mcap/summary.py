@@ -25,7 +25,7 @@ from replay.mcap.records import (
     statistics,
 )
 from replay.mcap.segments import Definitions, IndexPart, Refuse, Segment
-from replay.storage.store import RandomFile
+from replay.storage.store import Store
 
 _FIXED = RECORD_HEADER.size + 40
 """Bytes of a chunk before its records, without the name of its compression."""
@@ -54,7 +54,7 @@ class Summary:
     )
 
 
-def read_summary(file: RandomFile, definitions: Definitions, refuse: Refuse) -> Summary | None:
+def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summary | None:
     """Read the footer and the summary of a log.
 
     Args:
@@ -91,7 +91,7 @@ def read_summary(file: RandomFile, definitions: Definitions, refuse: Refuse) -> 
     return summary
 
 
-def _take_records(file: RandomFile, summary: Summary, stop: int, definitions: Definitions) -> None:
+def _take_records(file: Store, summary: Summary, stop: int, definitions: Definitions) -> None:
     at = summary.begin
     while at < stop:
         head = file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
@@ -114,7 +114,7 @@ def _take_records(file: RandomFile, summary: Summary, stop: int, definitions: De
         at = end
 
 
-def definition(file: RandomFile, content: int, length: int) -> bytes:
+def definition(file: Store, content: int, length: int) -> bytes:
     """Read a record that is kept in memory.
 
     Raises:
@@ -125,7 +125,7 @@ def definition(file: RandomFile, content: int, length: int) -> bytes:
     return file.read(content, length)
 
 
-def stated_segments(file: RandomFile, summary: Summary, known: set[int]) -> list[Segment] | None:
+def stated_segments(file: Store, summary: Summary, known: set[int]) -> list[Segment] | None:
     """The chunks that a summary names, in file order.
 
     Args:
@@ -164,7 +164,7 @@ def stated_segments(file: RandomFile, summary: Summary, known: set[int]) -> list
     return segments if accounted else None
 
 
-def stated_spans(file: RandomFile, summary: Summary, opcode: int) -> list[tuple[int, int]]:
+def stated_spans(file: Store, summary: Summary, opcode: int) -> list[tuple[int, int]]:
     """Where a summary says that attachments or metadata are, as spans [start, stop) of the file.
 
     Raises:
@@ -180,7 +180,7 @@ def stated_spans(file: RandomFile, summary: Summary, opcode: int) -> list[tuple[
     return spans
 
 
-def _index(file: RandomFile, content: int, length: int) -> Fields:
+def _index(file: Store, content: int, length: int) -> Fields:
     if length > MAX_CHUNK:
         raise MalformedRecord("an index is larger than any chunk")
     return Fields(file.read(content, length), "an index")

@@ -32,10 +32,10 @@ from replay.mcap.summary import (
     stated_segments,
     stated_spans,
 )
-from replay.storage.store import RandomFile
+from replay.storage.store import Store
 
-RUN_BYTES: Final = 1024 * 1024
-"""Messages outside chunks are read in runs of about this many bytes."""
+LOOSE_BYTES: Final = 1024 * 1024
+"""Messages outside chunks are read about this many bytes at once."""
 _CHUNK_HEADER: Final = 256
 _LOOSE: Final = struct.Struct("<HIQ")
 _INDEX: Final = struct.Struct("<HI")
@@ -54,7 +54,7 @@ class Structure:
 
     Attributes:
         by_index: the summary was believed.
-        segments: chunks and runs of loose messages, in file order.
+        segments: chunks and messages outside them, in file order.
         tail: the segment within which the file ends, or None.
         complete: the file has its end, and nothing is missing.
         missing: what a file that was cut lacks, in words; "" for a whole one.
@@ -62,7 +62,7 @@ class Structure:
         data_end: place where the data section ends.
     """
 
-    def __init__(self, file: RandomFile, refuse: Refuse, *, by_index: bool = False) -> None:
+    def __init__(self, file: Store, refuse: Refuse, *, by_index: bool = False) -> None:
         self._file = file
         self.by_index = False
         self._refuse = refuse
@@ -81,7 +81,7 @@ class Structure:
         self._limit: int | None = None
         self._attachment_spans: list[tuple[int, int]] = []
         self._metadata_bytes = 0
-        self._run: Segment | None = None
+        self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
         self._at = len(MAGIC)
         start = file.read(0, len(MAGIC))
@@ -164,7 +164,7 @@ class Structure:
                 if not self._resume_after(self._at):
                     self.missing = f"everything from byte {self._at} on is unreadable"
                     break
-        self._close_run()
+        self._close_loose()
         if self.data_crc is not None and self._limit is None and not self.missing:
             self.missing = "the summary at its end is cut, every message is there"
         self.complete = self._limit is not None and self.data_crc is not None
@@ -211,7 +211,7 @@ class Structure:
                 opcode, definition(self._file, content, length), f"byte {self._at}"
             )
             return
-        self._close_run()
+        self._close_loose()
         if opcode == Opcode.CHUNK:
             self._last_chunk = self._chunk(content, length)
             self.segments.append(self._last_chunk)
@@ -271,24 +271,24 @@ class Structure:
             raise MalformedRecord(f"a message of {length} bytes, above the limit of {MAX_CHUNK}")
         number, _, time = _LOOSE.unpack(self._file.peek(content, _LOOSE.size))
         end = content + length
-        run = self._run
-        if run is not None and end - run.offset > RUN_BYTES:
-            self._close_run()
-            run = None
-        if run is None:
-            run = self._run = Segment(
+        loose = self._loose
+        if loose is not None and end - loose.offset > LOOSE_BYTES:
+            self._close_loose()
+            loose = None
+        if loose is None:
+            loose = self._loose = Segment(
                 self._at, self._at, 0, 0, "", 0, time, time, chunked=False, counts={}
             )
             self._last_chunk = None
-        run.stored = run.size = end - run.offset
-        run.start, run.end = min(run.start, time), max(run.end, time)
-        assert run.counts is not None
-        run.counts[number] = run.counts.get(number, 0) + 1
+        loose.stored = loose.size = end - loose.offset
+        loose.start, loose.end = min(loose.start, time), max(loose.end, time)
+        assert loose.counts is not None
+        loose.counts[number] = loose.counts.get(number, 0) + 1
 
-    def _close_run(self) -> None:
-        if self._run is not None:
-            self.segments.append(self._run)
-            self._run = None
+    def _close_loose(self) -> None:
+        if self._loose is not None:
+            self.segments.append(self._loose)
+            self._loose = None
 
     def _take_metadata(self, content: bytes) -> None:
         self._metadata_bytes += len(content)
@@ -328,7 +328,7 @@ class Structure:
 
     def _resume_after(self, at: int) -> bool:
         """Continue at the next chunk that the summary names."""
-        self._close_run()
+        self._close_loose()
         self._last_chunk = None
         chunks = self.summary.chunks if self.summary else []
         place = bisect_right(chunks, at)

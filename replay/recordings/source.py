@@ -129,7 +129,7 @@ class RecordedSource(SeekableSource):
         return self._first
 
     def coverage(self) -> dict[str, list[tuple[int, int]]]:
-        """Give for each view the frames that are there, from and up to before."""
+        """The frames that are there of each view, as ranges [start, stop)."""
         return {
             parts[0].facts.view: [r for view in parts for r in view.ranges] for parts in self._views
         }

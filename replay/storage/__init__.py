@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = face(
     {
         "replay.storage.listing": "log_files",
         "replay.storage.location": "Location Url",
-        "replay.storage.store": "RandomFile Store open_store",
+        "replay.storage.opening": "open_store",
+        "replay.storage.store": "Store",
     },
 )

@@ -14,7 +14,7 @@ except ImportError:
 
 
 def crc32(data: bytes | memoryview, value: int = 0) -> int:
-    """CRC-32 of bytes, going on from the `value` of those before."""
+    """CRC-32 of bytes, continued from the `value` of those before."""
     return int(_crc32(data, value))
 
 

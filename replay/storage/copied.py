@@ -10,7 +10,7 @@ from pathlib import Path
 from cdmisfa.core.errors import CdmisfaError
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url
-from replay.storage.store import RandomFile
+from replay.storage.opening import open_store
 
 
 @contextlib.contextmanager
@@ -34,7 +34,7 @@ def fetched(place: Location) -> Iterator[Path]:
 
 
 def _copy(log: Location, target: Path) -> None:
-    with contextlib.closing(RandomFile(log)) as source:
+    with contextlib.closing(open_store(log)) as source:
         try:
             with target.open("xb") as copy:
                 for block in source.blocks(0, source.size):

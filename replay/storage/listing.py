@@ -45,7 +45,7 @@ def _listed(url: Url) -> list[Location]:
     """An S3 prefix as its logs, as in a folder; any other URL as itself."""
     if not url.folder:
         return [url]
-    from replay.storage.remote import listed
+    from replay.storage.servers import listed
 
     found = listed(url)
     whole = {log.name for log in found}

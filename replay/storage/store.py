@@ -1,11 +1,12 @@
-"""Where the bytes of a log lie: a file, or an object behind a URL."""
+"""Where the bytes of a log lie: a file, or what else can be read at any place."""
 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.storage.checksum import crc32
@@ -14,15 +15,25 @@ from replay.storage.location import Location
 _PEEK: Final = 4096
 
 
-class Store(Protocol):
-    """Bytes that are read at any place.
+class Store(ABC):
+    """Bytes read at any place, short pieces through one small window; never past their end.
+
+    Args:
+        path: where they lie.
 
     Attributes:
+        path: as given.
         size: how many there are.
     """
 
     size: int
 
+    def __init__(self, path: Location) -> None:
+        self.path = path
+        self._window = b""
+        self._window_at = 0
+
+    @abstractmethod
     def read_at(self, offset: int, count: int) -> bytes:
         """Read up to `count` bytes from `offset` on; none at the end.
 
@@ -30,17 +41,53 @@ class Store(Protocol):
             LogDamagedError: they cannot be read.
         """
 
-    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
-        """Hear which spans, from and up to before, will be read, one after the other."""
-
-    def grow(self) -> bool:
-        """Look at the size again; whether it grew."""
-
+    @abstractmethod
     def close(self) -> None:
         """Let go; harmless when called twice."""
 
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:  # noqa: B027 - a hint
+        """Hear which spans [start, stop) will be read, one after the other."""
 
-class FileStore:
+    def grow(self) -> bool:
+        """Look at the size again; whether it grew."""
+        return False
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return False
+
+    def peek(self, offset: int, count: int) -> bytes:
+        """Up to `count` (few) bytes, read ahead for the peeks that follow."""
+        at = offset - self._window_at
+        if at < 0 or at + count > len(self._window):
+            self._window = self.read(offset, max(count, _PEEK))
+            self._window_at, at = offset, 0
+        return self._window[at : at + count]
+
+    def read(self, offset: int, count: int) -> bytes:
+        """`count` bytes, fewer only where the file ends."""
+        count = max(min(count, self.size - offset), 0)
+        parts: list[bytes] = []
+        while count and (part := self.read_at(offset, count)):
+            parts.append(part)
+            offset, count = offset + len(part), count - len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def blocks(self, offset: int, stop: int) -> Iterator[bytes]:
+        """Give the bytes [offset, stop), 1 MiB at a time."""
+        while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
+            yield part
+            offset += len(part)
+
+    def crc(self, offset: int, stop: int) -> int:
+        """CRC-32 of the bytes [offset, stop)."""
+        value = 0
+        for block in self.blocks(offset, stop):
+            value = crc32(block, value)
+        return value
+
+
+class FileStore(Store):
     """A file of this machine."""
 
     def __init__(self, path: Path) -> None:
@@ -49,7 +96,7 @@ class FileStore:
         Raises:
             UsageError: it cannot be opened.
         """
-        self._path = path
+        super().__init__(path)
         try:
             self._fd: int | None = os.open(path, os.O_RDONLY)
             self.size = os.fstat(self._fd).st_size
@@ -68,10 +115,7 @@ class FileStore:
         try:
             return os.pread(self._descriptor(), min(count, 1 << 30), offset)
         except OSError as error:
-            raise LogDamagedError(f"{self._path}: {error.strerror}") from None
-
-    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
-        """Leave reading ahead to the operating system."""
+            raise LogDamagedError(f"{self.path}: {error.strerror}") from None
 
     def is_at(self, path: Path) -> bool:
         """Whether a path leads to the very file that was opened."""
@@ -81,8 +125,9 @@ class FileStore:
             return False
 
     def grow(self) -> bool:
-        """Look at the file's size again; whether it grew."""
+        """Look at the size again; whether it grew."""
         before, self.size = self.size, os.fstat(self._descriptor()).st_size
+        self._window = b""
         return self.size > before
 
     def close(self) -> None:
@@ -93,86 +138,5 @@ class FileStore:
 
     def _descriptor(self) -> int:
         if self._fd is None:
-            raise ValueError(f"{self._path} is closed")
+            raise ValueError(f"{self.path} is closed")
         return self._fd
-
-
-def open_store(place: Location) -> Store:
-    """Open a file, or an object behind a URL.
-
-    Raises:
-        UsageError: there is no such file.
-        LogDamagedError: the server does not give it.
-        CdmisfaError: what reads URLs is not installed.
-    """
-    if isinstance(place, Path):
-        return FileStore(place)
-    from replay.storage.remote import RemoteStore
-
-    return RemoteStore(place)
-
-
-class RandomFile:
-    """A file read at any place through one small window; never past its end."""
-
-    def __init__(self, path: Location) -> None:
-        """Open the file.
-
-        Raises:
-            UsageError: it cannot be opened.
-            LogDamagedError: a server does not give it.
-        """
-        self.path = path
-        self._store = open_store(path)
-        self.size = self._store.size
-        self._window = b""
-        self._window_at = 0
-
-    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
-        """Say which spans, from and up to before, will be read, one after the other."""
-        self._store.expect(spans)
-
-    def is_at(self, path: Path) -> bool:
-        """Whether a path leads to the very file that was opened."""
-        return isinstance(self._store, FileStore) and self._store.is_at(path)
-
-    def grow(self) -> bool:
-        """Look at the file's size again; whether it grew."""
-        grew = self._store.grow()
-        self.size = self._store.size
-        self._window = b""
-        return grew
-
-    def peek(self, offset: int, count: int) -> bytes:
-        """Up to `count` (few) bytes, read ahead for the peeks that follow."""
-        at = offset - self._window_at
-        if at < 0 or at + count > len(self._window):
-            self._window = self.read(offset, max(count, _PEEK))
-            self._window_at, at = offset, 0
-        return self._window[at : at + count]
-
-    def read(self, offset: int, count: int) -> bytes:
-        """`count` bytes, fewer only where the file ends."""
-        count = max(min(count, self.size - offset), 0)
-        parts: list[bytes] = []
-        while count and (part := self._store.read_at(offset, count)):
-            parts.append(part)
-            offset, count = offset + len(part), count - len(part)
-        return parts[0] if len(parts) == 1 else b"".join(parts)
-
-    def blocks(self, offset: int, stop: int) -> Iterator[bytes]:
-        """Give the bytes from `offset` to `stop`, 1 MiB at a time."""
-        while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
-            yield part
-            offset += len(part)
-
-    def crc(self, offset: int, stop: int) -> int:
-        """CRC-32 of the bytes from `offset` to `stop`."""
-        value = 0
-        for block in self.blocks(offset, stop):
-            value = crc32(block, value)
-        return value
-
-    def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
-        self._store.close()
