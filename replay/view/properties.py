@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from cdmisfa.core.errors import CdmisfaError
-from replay.runs.folders import run_log
+from replay.runs.folders import read_manifest, run_log
 from replay.view.bindings import Chunk, ChunkStore, ComponentDescriptor
 from replay.view.labels import label
 
@@ -62,7 +62,7 @@ def properties_of(outline: Outline, folder: Path) -> Sections:
     """
     began, learned = outline.header.manifest, [outline.names()[s.stream] for s in outline.saved]
     counts = began.get("seed", 0), outline.iterations, outline.frames
-    return {**_configuration(began), "result": _result(counts, learned, _manifest(folder))}
+    return {**_configuration(began), "result": _result(counts, learned, read_manifest(folder))}
 
 
 def read_properties(run: Path) -> Sections:
@@ -74,7 +74,7 @@ def read_properties(run: Path) -> Sections:
         UsageError: there is no such run.
         LogDamagedError: it cannot be read.
     """
-    manifest = _manifest(run)
+    manifest = read_manifest(run)
     try:
         found = manifest["result"]
         learned = [str(module["stream"]) for module in found["modules"]]
@@ -162,15 +162,6 @@ def _configuration(manifest: Mapping[str, Any]) -> Sections:
     tables = config.items() if isinstance(config, Mapping) else ()
     sections = {str(name): _flat(table) for name, table in tables if isinstance(table, Mapping)}
     return {name: values for name, values in sections.items() if values}
-
-
-def _manifest(folder: Path) -> Mapping[str, Any]:
-    """A run's manifest; empty where there is none that can be read."""
-    try:
-        document = json.loads((folder / "run.json").read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return document if isinstance(document, Mapping) else {}
 
 
 def _result(
