@@ -15,7 +15,13 @@ from replay.runs import messages as codec
 from replay.runs import stretches as stretch
 from replay.runs.columns import columns_of_messages, columns_of_records
 from replay.runs.log import read_header
-from replay.runs.messages import decode_signals, encode_matrix, encode_signals
+from replay.runs.messages import (
+    decode_matrices,
+    decode_matrix,
+    decode_signals,
+    encode_matrix,
+    encode_signals,
+)
 from replay.runs.outline import read_outline
 from replay.runs.stretches import read_stretches
 from replay.runs.wire import alike, spans
@@ -142,3 +148,19 @@ def test_a_torn_log_that_says_it_is_whole_is_refused(tmp_path):
     path.write_bytes(path.read_bytes()[:-40])
     with pytest.raises(LogDamagedError):
         build_view(tmp_path, tmp_path / "run.rrd")
+
+
+def test_matrices_of_one_size_are_read_bit_for_bit_however_they_are_laid_out():
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((4, 5, 3))
+    rows[1, 2] = np.array([0x7FF8_0000_0000_0001, 1 << 63, 0], np.uint64).view(np.float64)
+    ours = [encode_matrix(5 * i, values) for i, values in enumerate(rows)]
+    plain = [codec._MATRIX.FromString(data).SerializeToString() for data in ours]
+    for messages, pieces in ((ours, 1), (plain[1:], 3), ([encode_matrix(7, rows[0, :0])] * 2, 1)):
+        found = list(decode_matrices(messages))
+        expected = [decode_matrix(data) for data in messages]
+        assert len(found) == pieces
+        frames = np.concatenate([t + np.arange(len(values)) for t, values in expected])
+        np.testing.assert_array_equal(np.concatenate([t for t, _ in found]), frames)
+        values = np.concatenate([values for _, values in found])
+        assert values.tobytes() == b"".join(values.tobytes() for _, values in expected)

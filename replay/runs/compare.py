@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,6 @@ from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header
 from replay.runs.outline import Outline, read_outline
 from replay.runs.stretches import read_columns
-
-Pair = tuple[SignalColumns | None, SignalColumns | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,40 +84,30 @@ def first_difference(
     """
     a, b = headers or (read_header(first), read_header(second))
     versions = a.schema, b.schema
-    pieces = _together(read_columns(first, a), read_columns(second, b))
-    found = next(_differences(pieces, min(versions)), None)
+    found = _first_of(read_columns(first, a), read_columns(second, b), min(versions))
     if versions[0] == versions[1]:
         return found
     found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
     return replace(found, versions=versions)
 
 
-def _together(first: Iterator[SignalColumns], second: Iterator[SignalColumns]) -> Iterator[Pair]:
-    """The records of two runs in pieces of one length; None where one has ended."""
-    a = b = None
-    while True:
-        a, b = a or next(first, None), b or next(second, None)
-        if a is None or b is None:
-            yield a, b
-            return
+def _first_of(
+    first: Iterator[SignalColumns], second: Iterator[SignalColumns], version: int
+) -> Difference | None:
+    """The first difference among the signals of a version of the record."""
+    at, a, b = 0, next(first, None), next(second, None)
+    while a is not None and b is not None:
         n = min(len(a), len(b))
-        yield a.rows(0, n), b.rows(0, n)
-        a, b = a.rows(n, len(a)), b.rows(n, len(b))
-
-
-def _differences(pieces: Iterable[Pair], version: int) -> Iterator[Difference]:
-    """The first difference in each pair among the signals of a version of the record."""
-    iteration = 0
-    for a, b in pieces:
-        if a is not None and b is not None:
-            if (found := _difference(iteration, a, b, version)) is not None:
-                yield found
-            iteration += len(a)
-        elif a is not None or b is not None:
-            ended, more = f"ended after {iteration} iterations", "goes on"
-            yield Difference(
-                iteration, "", (), ended if a is None else more, ended if b is None else more
-            )
+        found = _difference(at, a.rows(0, n), b.rows(0, n), version)
+        if found is not None:
+            return found
+        at += n
+        a = a.rows(n, len(a)) or next(first, None)
+        b = b.rows(n, len(b)) or next(second, None)
+    if a is b:
+        return None
+    ended, more = f"ended after {at} iterations", "goes on"
+    return Difference(at, "", (), ended if a is None else more, ended if b is None else more)
 
 
 def _difference(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
 from recorder.log.messages import varint
+from replay.runs.wire import alike, column
 
 SIGNALS_SCHEMA = "cdmisfa.BlockSignals"
 MATRIX_SCHEMA = "cdmisfa.Matrix"
@@ -135,6 +136,27 @@ def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.f
         raise LogDamagedError(f"{where}: {values.size} values in rows of {decoded.columns}")
     rows = values.size // decoded.columns if decoded.columns else 0
     return decoded.t, values.reshape(rows, decoded.columns)
+
+
+def decode_matrices(
+    messages: Sequence[bytes], where: str = "record"
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Frames and rows of matrix messages of one size, at once where `encode_matrix` made them.
+
+    Raises:
+        LogDamagedError: one of them is no such message.
+    """
+    t, first = decode_matrix(messages[0], where)
+    values = _HEAD.size + 1, len(messages[0])
+    known = encode_matrix(t, first) == messages[0]
+    table = alike(messages, [(1, 9), values]) if known else None
+    if table is None:
+        for data in messages:
+            t, rows = decode_matrix(data, where)
+            yield t + np.arange(len(rows)), rows
+        return
+    frames = column(table, (1, 9), "<i8") + np.arange(len(first))
+    yield frames.reshape(-1), column(table, values, "<f8").reshape(frames.size, first.shape[1])
 
 
 def missing(version: int) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -18,7 +18,6 @@ from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import BlockSignals
 from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
-from replay.mcap.records import MalformedRecord
 from replay.runs.columns import SignalColumns, columns_of_messages
 from replay.runs.folders import run_log
 from replay.runs.log import (
@@ -31,8 +30,7 @@ from replay.runs.log import (
     RunHeader,
     read_header,
 )
-from replay.runs.messages import decode_matrix, decode_signals
-from replay.runs.wire import alike, column, spans
+from replay.runs.messages import decode_matrices, decode_matrix, decode_signals
 
 ITERATIONS = 500
 """Most iterations of a stretch."""
@@ -45,7 +43,6 @@ TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 Frames = tuple[NDArray[np.int64], NDArray[Any]]
 """(n,) frames and (n, ...) what belongs to them."""
 
-_T, _VALUES = 1, 3  # fields of a matrix message
 _ITERATION = re.compile(r"iteration (\d{1,18})")
 
 
@@ -183,14 +180,10 @@ class _Waiting:
 
     def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
         """Rows of matrix messages with a frame each, all of one size together."""
-
-        def decode(entry: bytes) -> tuple[int, NDArray[np.float64]]:
-            return decode_matrix(entry, f"{self._log} {topic}")
-
         return tuple(
             (frames, _reshaped(values, (-1, *shape), self._log))
             for _, group in groupby(self._data[topic], key=len)
-            for frames, values in _rows(list(group), decode)
+            for frames, values in decode_matrices(list(group), f"{self._log} {topic}")
         )
 
 
@@ -210,27 +203,6 @@ def _checked(columns: SignalColumns, streams: int, where: str) -> SignalColumns:
     ):
         raise LogDamagedError(f"{where}: a record is about other streams than the run's")
     return columns
-
-
-def _rows(
-    messages: list[bytes], decode: Callable[[bytes], tuple[int, NDArray[np.float64]]]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Frames and rows of matrix messages of one size."""
-    _, first = decode(messages[0])
-    try:
-        places = spans(messages[0])
-        known = [places[_T], places[_VALUES]]
-    except (MalformedRecord, KeyError):
-        known = []
-    table = alike(messages, known) if known else None
-    if table is not None and known[1][1] - known[1][0] == 8 * first.size:
-        begins = column(table, known[0], "<i8")
-        values = column(table, known[1], "<f8").reshape(-1, *first.shape)
-        yield (begins + np.arange(len(first))).reshape(-1), values.reshape(-1, first.shape[1])
-        return
-    for data in messages:
-        t, rows = decode(data)
-        yield t + np.arange(len(rows)), rows
 
 
 def _event(data: bytes, t: int, log: Path) -> Event:
