@@ -267,7 +267,7 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(film.Film, "add", full)
+    monkeypatch.setattr(film, "_pictures", full)
     for form in ("mp4", "lerobot"):
         with pytest.raises(CdmisfaError, match="No space left on device"):
             export(tmp_path / "r", tmp_path / "out", form)
