@@ -50,6 +50,12 @@ class RunHeader:
         """Signals that this log lacks, being older: they are read as NaN."""
         return missing(self.schema)
 
+    @property
+    def delta(self) -> float | None:
+        """Threshold of eta-dot, where the configuration names it."""
+        value = self.setting("learner", "delta")
+        return float(value) if isinstance(value, int | float) else None
+
     def setting(self, section: str, key: str, default: Any = None) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`."""
         config = self.manifest.get("config")

@@ -82,7 +82,7 @@ class Outline:
     @property
     def delta(self) -> float | None:
         """Threshold of eta-dot, where the configuration names it."""
-        return delta_of(self.header)
+        return self.header.delta
 
     def streams(self, most: int) -> list[int]:
         """The most watched streams, at most so many, in their own order."""
@@ -108,12 +108,6 @@ class Outline:
         lower = lower if low is None else low
         margin = 0.1 * (upper - lower) or 0.1 * abs(upper) or 1.0
         return (lower - margin if low is None else lower), upper + margin
-
-
-def delta_of(header: RunHeader) -> float | None:
-    """Threshold of eta-dot, where a run's configuration names it."""
-    value = header.setting("learner", "delta")
-    return float(value) if isinstance(value, int | float) else None
 
 
 class Tally:

@@ -20,7 +20,7 @@ from cdmisfa.core.signals import SIGNALS, Signal
 from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, shade
 from replay.runs.columns import SignalColumns
 from replay.runs.log import RunHeader
-from replay.runs.outline import Outline, delta_of
+from replay.runs.outline import Outline
 from replay.runs.stretches import Stretch
 from replay.view.columns import (
     FRAME,
@@ -74,7 +74,7 @@ class RunView:
         every: int,
     ) -> None:
         self._recording = recording
-        self._delta = delta_of(header)
+        self._delta = header.delta
         self._every = every
         self._spec = header.spec
         self._columns: dict[str, Column] = {}
