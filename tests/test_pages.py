@@ -1,4 +1,4 @@
-"""Pages show pictures that are there, small enough, and accounted for."""
+"""Pages name files that are there, and show pictures that are small enough and accounted for."""
 
 from __future__ import annotations
 
@@ -10,13 +10,22 @@ import pytest
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"
 MOST_BYTES = 400_000
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md"), IMAGES / "README.md"])
+PAGES = sorted(
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")],
+)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\((?!https?://)([^)#\s]+)", page.read_text("utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_files_that_a_page_names_are_there(page: Path) -> None:
+    text = page.read_text("utf-8")
+    named = re.findall(r"\b(?:cdmisfa|recorder|replay|benchmarks|tests|docs)/[\w/.-]*\w", text)
+    assert [file for file in named if not (ROOT / file).exists()] == []
 
 
 def test_every_picture_is_small_accounted_for_and_shown() -> None:
