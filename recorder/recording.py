@@ -16,22 +16,15 @@ from cdmisfa.core.blocks import FrameSource, HeadPose, SourceSpec
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.folder import (
-    REMEDY,
-    held,
-    make_folder,
-    refuse_existing,
-    remove_views,
-    view_logs,
-)
-from recorder.log.manifest import Manifest, forget_views, keep_recording, read_recording
+from recorder.log.folder import cleared, refuse_existing, view_logs
+from recorder.log.manifest import Manifest, keep_recording, read_recording
 from recorder.log.parts import ViewParts
 from recorder.log.resume import FramesHeld, Resume, frames_held, resume_view
 from recorder.log.split import Split
 from recorder.log.viewfacts import FASTEST, SLOWEST, Identity
 from recorder.log.whole import whole
 from recorder.world.rendering import render_in_processes, take_here
-from recorder.world.scenes import SCENES, OpenScene, prepare, scene_of
+from recorder.world.scenes import SCENES, OpenScene, open_scene, scene_of
 
 MAX_JOBS = 256
 
@@ -87,7 +80,6 @@ def record(
     resume: bool = False,
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
-    scene: OpenScene | None = None,
 ) -> list[ViewRecording]:
     """Record the first frames of a source into a folder.
 
@@ -110,7 +102,6 @@ def record(
         resume: continue where an earlier attempt with the same arguments ended.
         stop: asked after every block; true ends the recording with an error.
         progress: called after every block; never where there was nothing left to record.
-        scene: what the source was opened from; known of those of `open_scene`.
 
     Raises:
         UsageError: the folder exists, or an argument is wrong.
@@ -118,7 +109,7 @@ def record(
         LogExhaustedError: the source has fewer frames.
         RecordingStoppedError: it was stopped.
     """
-    scene = scene or scene_of(source)
+    scene = scene_of(source)
     settings = settings or (RecordConfig() if scene is None else scene.record)
     folder = Path(folder)
     length = source.spec.length
@@ -132,14 +123,11 @@ def record(
     if force and resume:
         raise UsageError("--force starts anew and --resume goes on: use one of them")
     if not resume:
-        refuse_existing(folder, force=force, remedy=REMEDY)
+        refuse_existing(folder, force=force)
     identity = _identity(source, names, settings, scene)
     chosen = _chosen(identity.spec, views)
-    make_folder(folder)
     with ExitStack() as open_logs:
-        open_logs.enter_context(held(folder))
-        if force:
-            remove_views(folder, chosen)
+        open_logs.enter_context(cleared(folder, chosen if force else ()))
         places = dict.fromkeys(chosen, Resume())
         if resume:
             split = _as_begun(folder, identity, chosen, split)
@@ -162,7 +150,7 @@ def record(
             lengths = dict.fromkeys(unfinished, frames)
             limits = {} if split is None else dict.fromkeys(unfinished, str(split))
             options = {"seed": identity.seed, "frames": lengths, "split": limits}
-            keep_recording(folder, Manifest((identity.kind,), options))
+            keep_recording(folder, unfinished, Manifest((identity.kind,), options))
         for log in logs:
             open_logs.callback(log.abandon)
             log.open()
@@ -182,7 +170,7 @@ def record(
                     raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
         for log in logs:
             log.finish()
-        forget_views(folder, chosen)
+        keep_recording(folder, chosen)
     return [written(log.view, path, n) for log in logs for path, n in log.parts]
 
 
@@ -205,9 +193,8 @@ def record_scene(
     Raises:
         CdmisfaError: the scene cannot be opened, or as for `record`.
     """
-    scene = prepare(name, config, settings)
-    with contextlib.closing(scene.open()) as source:
-        return record(source, folder, scene=scene, **options)
+    with contextlib.closing(open_scene(name, config, settings)) as source:
+        return record(source, folder, **options)
 
 
 def written(view: str, path: Path, frames: int) -> ViewRecording:
@@ -312,7 +299,7 @@ def _as_begun(
     return split if split is not None or not limit else Split.parse(limit)
 
 
-def save_picture(scene: OpenScene, path: Path, *, force: bool = False) -> None:
+def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = False) -> None:
     """Draw a scene from outside into a PNG file.
 
     Raises:
@@ -320,10 +307,10 @@ def save_picture(scene: OpenScene, path: Path, *, force: bool = False) -> None:
         LogWriteError: the file or its folder cannot be written.
         CdmisfaError: the simulator is not installed.
     """
-    draw = SCENES[scene.name].picture
+    draw = SCENES[name].picture
     if draw is None:
-        able = " or ".join(name for name, entry in SCENES.items() if entry.picture)
-        raise UsageError(f"the scene {scene.name} has no picture: --scene-picture is for {able}")
+        able = " or ".join(able for able, entry in SCENES.items() if entry.picture)
+        raise UsageError(f"the scene {name} has no picture: --scene-picture is for {able}")
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise UsageError(f"{path}: the picture is a PNG, name it .png")
@@ -333,6 +320,6 @@ def save_picture(scene: OpenScene, path: Path, *, force: bool = False) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LogWriteError(f"{path.parent} cannot be made: {error.strerror}") from error
-    image = draw(scene.config)
+    image = draw(config)
     with whole(path) as partial:
         image.save(partial, format="PNG", optimize=True)

@@ -141,6 +141,9 @@ def test_a_resumed_recording_is_the_same_bytes(split: Split | None, tmp_path: Pa
         record(late, folder, resume=True)
     record(Webcams(), folder, resume=True)
     assert contents(folder) == contents(whole)
+    untouched = Webcams()
+    record(untouched, folder, split=split, resume=True)
+    assert untouched.t == 0
 
 
 def test_a_camera_that_is_unplugged_leaves_readable_partials(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.manifest import (
     RECORDING,
     Manifest,
-    forget_views,
     keep_recording,
     read_recording,
 )
@@ -47,14 +46,15 @@ def test_other_options_are_refused_and_unknown_ones_are_not_compared() -> None:
 
 def test_a_recording_keeps_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:
     first = {"seed": 1, "frames": {"a": 5, "b": 5}, "split": {"a": "5s", "b": "5s"}}
-    keep_recording(tmp_path, Manifest(("icub",), first))
-    keep_recording(tmp_path, Manifest(("icub",), {"seed": 1, "frames": {"a": 9}, "split": {}}))
+    keep_recording(tmp_path, ["a", "b"], Manifest(("icub",), first))
+    longer = Manifest(("icub",), {"seed": 1, "frames": {"a": 9}, "split": {}})
+    keep_recording(tmp_path, ["a"], longer)
     begun = read_recording(tmp_path)
     assert begun.source == ("icub",)
     assert begun.options == {"seed": 1, "frames": {"a": 9, "b": 5}, "split": {"b": "5s"}}
-    forget_views(tmp_path, ["a"])
+    keep_recording(tmp_path, ["a"])
     assert read_recording(tmp_path).options["frames"] == {"b": 5}
-    forget_views(tmp_path, ["b"])
+    keep_recording(tmp_path, ["b"])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -78,4 +78,4 @@ def test_what_makes_no_sense_in_it_is_passed_over(tmp_path: Path, noted: str) ->
 def test_a_disk_that_does_not_take_it_is_named(tmp_path: Path) -> None:
     values: dict[str, Any] = {"frames": {"a": 1}, "split": {}}
     with pytest.raises(LogWriteError, match=r"nowhere/recording\.json cannot be written"):
-        keep_recording(tmp_path / "nowhere", Manifest((), values))
+        keep_recording(tmp_path / "nowhere", ["a"], Manifest((), values))

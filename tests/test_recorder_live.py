@@ -16,7 +16,7 @@ from recorder.recording import save_picture
 from recorder.world.eyes import LUMA, eye_matrix, grey, look, perspective
 from recorder.world.icub_config import EyesConfig, IcubConfig, SphereConfig
 from recorder.world.motions import Motions
-from recorder.world.scenes import SCENES, open_scene, prepare
+from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")
 
@@ -201,7 +201,7 @@ def test_the_picture_shows_the_robot_the_table_and_the_objects(tmp_path):
     from PIL import Image
 
     path = tmp_path / "scene.png"
-    save_picture(prepare("icub"), path)
+    save_picture("icub", IcubConfig(), path)
     with Image.open(path) as image:
         assert image.size == SIZE
         pixels = np.asarray(image).astype(int)
@@ -211,6 +211,6 @@ def test_the_picture_shows_the_robot_the_table_and_the_objects(tmp_path):
     assert np.ptp(np.nonzero(red)[0]) > 300
     assert dark.sum() > 3_000
     with pytest.raises(UsageError, match="exists"):
-        save_picture(prepare("icub"), path)
+        save_picture("icub", IcubConfig(), path)
     with pytest.raises(UsageError, match=r"\.png"):
-        save_picture(prepare("icub"), tmp_path / "scene.jpg")
+        save_picture("icub", IcubConfig(), tmp_path / "scene.jpg")

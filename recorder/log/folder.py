@@ -8,12 +8,8 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-
-REMEDY: Final = "go on with --resume or overwrite with --force"
-"""What to do where a recording is there already."""
 
 
 @contextlib.contextmanager
@@ -65,37 +61,39 @@ def view_logs(folder: Path, view: str, *, split: bool | None = None) -> list[Pat
     return sorted(p for p in folder.iterdir() if pattern.fullmatch(p.name))
 
 
-def refuse_existing(folder: Path, *, force: bool, remedy: str = REMEDY) -> None:
+def refuse_existing(folder: Path, *, force: bool) -> None:
     """Refuse to write a recording where there is something.
 
     Raises:
         UsageError: the folder is not empty, or no folder, and `force` is not set.
     """
     if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder} exists: choose another folder, {remedy}")
+        raise UsageError(
+            f"{folder} exists: choose another folder, go on with --resume or overwrite with --force"
+        )
 
 
-def make_folder(folder: Path) -> None:
-    """Make a recording's folder.
+@contextlib.contextmanager
+def cleared(folder: Path, views: Sequence[str]) -> Iterator[None]:
+    """Make and hold a recording's folder, and remove what it has of some views.
 
     Raises:
-        LogWriteError: it cannot be made.
+        UsageError: another process holds it.
+        LogWriteError: it cannot be made, or they cannot be removed.
     """
-    try:
+    with _naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
+    with held(folder):
+        with _naming(folder):
+            for view in views:
+                for old in view_logs(folder, view):
+                    old.unlink()
+        yield
 
 
-def remove_views(folder: Path, names: Sequence[str]) -> None:
-    """Remove what a recording holds of some views.
-
-    Raises:
-        LogWriteError: it cannot be removed.
-    """
+@contextlib.contextmanager
+def _naming(folder: Path) -> Iterator[None]:
     try:
-        for name in names:
-            for old in view_logs(folder, name):
-                old.unlink()
+        yield
     except OSError as error:
         raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Literal, Self
@@ -261,37 +261,34 @@ class _LatchedStream:
             raise LogWriteError(f"{self._path}: this log is closed, nothing more can be written")
 
     def write(self, data: bytes) -> int:
-        self.check()
-        try:
+        with self._latching():
             return self._file.write(data)
-        except OSError as error:
-            raise self._latch(error) from error
 
     def tell(self) -> int:
         return self._file.tell()
 
     def flush(self) -> None:
-        self.check()
-        try:
+        with self._latching():
             self._file.flush()
-        except OSError as error:
-            raise self._latch(error) from error
 
     def sync(self) -> None:
-        self.flush()
-        try:
+        with self._latching():
+            self._file.flush()
             os.fsync(self._file.fileno())
-        except OSError as error:
-            raise self._latch(error) from error
 
     def close(self) -> None:
         # Closing flushes again; an error in it is the one already told.
         with contextlib.suppress(OSError):
             self._file.close()
 
-    def _latch(self, error: OSError) -> LogWriteError:
-        self._error = self._error or error
-        return _write_error(self._path, self._error)
+    @contextlib.contextmanager
+    def _latching(self) -> Iterator[None]:
+        self.check()
+        try:
+            yield
+        except OSError as error:
+            self._error = error
+            raise _write_error(self._path, error) from error
 
 
 def _write_error(path: Path, error: OSError) -> LogWriteError:

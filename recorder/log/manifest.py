@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.errors import UsageError
 from recorder.log.whole import whole
 
 RECORDING = "recording.json"
@@ -109,57 +109,37 @@ def read_recording(folder: Path) -> Manifest:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return Manifest((), {"frames": {}, "split": {}})
     known = {"seed": seed} if _is_count(seed) and 0 <= seed < 2**63 else {}
-    return Manifest(
-        (scene,) if scene and isinstance(scene, str) else (),
-        {"frames": frames, "split": split, **known},
+    source = (scene,) if scene and isinstance(scene, str) else ()
+    return Manifest(source, {"frames": frames, "split": split, **known})
+
+
+def keep_recording(folder: Path, views: Sequence[str], manifest: Manifest | None = None) -> None:
+    """Keep how some views of a recording are begun, beside what is known of the others.
+
+    Args:
+        folder: of the recording.
+        views: the views.
+        manifest: of these views; None where they are finished.
+
+    Raises:
+        LogWriteError: the disk does not take it.
+    """
+    known = read_recording(folder)
+    manifest = manifest or replace(known, options={**known.options, "frames": {}, "split": {}})
+    frames, split = (
+        {v: value for v, value in known.options[name].items() if v not in views}
+        | manifest.options[name]
+        for name in ("frames", "split")
     )
-
-
-def keep_recording(folder: Path, manifest: Manifest) -> None:
-    """Keep the manifest of a recording, beside what is known of its other views.
-
-    Raises:
-        LogWriteError: the disk does not take it.
-    """
-    others = _without(read_recording(folder), list(manifest.options["frames"]))
-    views = {
-        option: {**others.options[option], **manifest.options[option]}
-        for option in ("frames", "split")
-    }
-    _write_recording(folder, replace(manifest, options={**manifest.options, **views}))
-
-
-def forget_views(folder: Path, views: Sequence[str]) -> None:
-    """Take views that are finished out of the manifest of a recording.
-
-    Raises:
-        LogWriteError: the disk does not take it.
-    """
-    _write_recording(folder, _without(read_recording(folder), views))
-
-
-def _without(manifest: Manifest, views: Sequence[str]) -> Manifest:
-    left = {
-        option: {v: value for v, value in manifest.options[option].items() if v not in views}
-        for option in ("frames", "split")
-    }
-    return replace(manifest, options={**manifest.options, **left})
+    scene, seed = "".join(manifest.source), manifest.options.get("seed")
+    path = folder / RECORDING
+    if not frames:
+        path.unlink(missing_ok=True)
+        return
+    with whole(path) as partial:
+        values = {"frames": frames, "split": split, "scene": scene, "seed": seed}
+        partial.write_text(json.dumps(values) + "\n", "utf-8")
 
 
 def _is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _write_recording(folder: Path, manifest: Manifest) -> None:
-    path = folder / RECORDING
-    options = manifest.options
-    if options["frames"]:
-        scene = {"scene": "".join(manifest.source), "seed": options.get("seed")}
-        values = {"frames": options["frames"], "split": options["split"], **scene}
-        with whole(path) as partial:
-            partial.write_text(json.dumps(values) + "\n", "utf-8")
-        return
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

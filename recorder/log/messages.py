@@ -87,7 +87,24 @@ def truth_tags(names: Sequence[str]) -> list[bytes]:
     return [varint((_FIRST_TRUTH_FIELD + i) << 3 | 1) for i in range(len(names))]
 
 
-class ImageEncoder:
+class _Encoder:
+    """Encodes one kind of message; every one has a timestamp."""
+
+    schema: str
+
+    def __init__(self, message: Any) -> None:
+        self._message = message
+
+    def schema_data(self) -> bytes:
+        """The FileDescriptorSet that describes the message."""
+        return descriptor_set(self._message.DESCRIPTOR)
+
+    def _encoded(self, time_ns: int) -> bytes:
+        self._message.timestamp.FromNanoseconds(time_ns)
+        return bytes(self._message.SerializeToString())
+
+
+class ImageEncoder(_Encoder):
     """Frames of a view as `foxglove.RawImage`, mono8.
 
     Args:
@@ -99,41 +116,33 @@ class ImageEncoder:
     schema = IMAGE_SCHEMA
 
     def __init__(self, height: int, width: int, frame_id: str) -> None:
-        self._message = RawImage_pb2.RawImage(
-            width=width, height=height, step=width, encoding=IMAGE_ENCODING, frame_id=frame_id
+        super().__init__(
+            RawImage_pb2.RawImage(
+                width=width, height=height, step=width, encoding=IMAGE_ENCODING, frame_id=frame_id
+            )
         )
-
-    def schema_data(self) -> bytes:
-        """The FileDescriptorSet that describes the message."""
-        return descriptor_set(self._message.DESCRIPTOR)
 
     def __call__(self, time_ns: int, frame: NDArray[np.uint8]) -> bytes:
         """Encode one frame, (height, width) uint8."""
-        self._message.timestamp.FromNanoseconds(time_ns)
         self._message.data = frame.tobytes()
-        return bytes(self._message.SerializeToString())
+        return self._encoded(time_ns)
 
 
-class VectorEncoder:
+class VectorEncoder(_Encoder):
     """Values of a stream as `cdmisfa.Vector`, exact to the bit."""
 
     schema = VECTOR_SCHEMA
 
     def __init__(self) -> None:
-        self._message = _vector_class()()
-
-    def schema_data(self) -> bytes:
-        """The FileDescriptorSet that describes the message."""
-        return descriptor_set(self._message.DESCRIPTOR)
+        super().__init__(_vector_class()())
 
     def __call__(self, time_ns: int, frame: NDArray[np.float64]) -> bytes:
         """Encode one frame, (I,) float64."""
-        self._message.timestamp.FromNanoseconds(time_ns)
         self._message.values[:] = frame.tolist()
-        return bytes(self._message.SerializeToString())
+        return self._encoded(time_ns)
 
 
-class TruthEncoder:
+class TruthEncoder(_Encoder):
     """What the world knows, as `cdmisfa.GroundTruth`: one double a name.
 
     Args:
@@ -147,41 +156,31 @@ class TruthEncoder:
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        self._message = _truth_class(self._names)()
-
-    def schema_data(self) -> bytes:
-        """The FileDescriptorSet that describes the message."""
-        return descriptor_set(self._message.DESCRIPTOR)
+        super().__init__(_truth_class(self._names)())
 
     def __call__(self, time_ns: int, values: NDArray[np.float64]) -> bytes:
         """Encode one row of ground truth, (D,) float64."""
-        self._message.timestamp.FromNanoseconds(time_ns)
         for name, value in zip(self._names, values.tolist(), strict=True):
             setattr(self._message, name, value)
-        return bytes(self._message.SerializeToString())
+        return self._encoded(time_ns)
 
 
-class PoseEncoder:
+class PoseEncoder(_Encoder):
     """A pose in a frame as `foxglove.PoseInFrame`."""
 
     schema = POSE_SCHEMA
 
     def __init__(self, frame_id: str) -> None:
-        self._message = PoseInFrame_pb2.PoseInFrame(frame_id=frame_id)
-
-    def schema_data(self) -> bytes:
-        """The FileDescriptorSet that describes the message."""
-        return descriptor_set(self._message.DESCRIPTOR)
+        super().__init__(PoseInFrame_pb2.PoseInFrame(frame_id=frame_id))
 
     def __call__(
         self, time_ns: int, position: Sequence[float], quaternion: Sequence[float]
     ) -> bytes:
         """Encode a position (x, y, z) in metres and an orientation (x, y, z, w)."""
-        self._message.timestamp.FromNanoseconds(time_ns)
         place, turn = self._message.pose.position, self._message.pose.orientation
         place.x, place.y, place.z = position
         turn.x, turn.y, turn.z, turn.w = quaternion
-        return bytes(self._message.SerializeToString())
+        return self._encoded(time_ns)
 
 
 def descriptor_set(descriptor: Any) -> bytes:

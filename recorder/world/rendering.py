@@ -58,8 +58,10 @@ def take_here(
         for request in requests(starts, frames):
             yield _take(source, request)
         return
-    first = min(starts.values(), default=frames)
-    if source.t > min(first, frames):
+    first = min(starts.values())
+    if first >= frames:
+        return
+    if source.t > first:
         raise UsageError(
             f"the source is at frame {source.t} and cannot go back to {first}: open it anew"
         )

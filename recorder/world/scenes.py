@@ -47,7 +47,7 @@ class Scene:
 
 
 def _open_icub(config: IcubConfig, record: RecordConfig) -> SeekableSource:
-    from recorder.world.live import LiveSource
+    from recorder.world.live import LiveSource  # which imports the simulator
 
     return LiveSource(config, record)
 
@@ -74,7 +74,7 @@ SCENES: Registry[Scene] = Registry(
 
 @dataclass(frozen=True, slots=True)
 class OpenScene:
-    """A scene and what it is told, from which sources of it are opened.
+    """What a scene's source was opened from.
 
     Attributes:
         name: of the scene.
@@ -95,23 +95,14 @@ class OpenScene:
         tables = [as_table(config()) for config in first] if type(self.config) in first else []
         return {key: v for table in (*tables, as_table(self.config)) for key, v in table.items()}
 
-    def open(self) -> SeekableSource:
-        """A source of it.
-
-        Raises:
-            UsageError: a scene that cannot be built.
-            CdmisfaError: the scene needs a simulator that is not installed.
-        """
-        return SCENES[self.name].open(self.config, self.record)
-
 
 _OPEN: dict[int, OpenScene] = {}
 
 
-def prepare(
+def open_scene(
     name: str, config: SceneConfig | None = None, record: RecordConfig | None = None
-) -> OpenScene:
-    """A scene that is ready to be opened.
+) -> SeekableSource:
+    """A live source of a scene's streams.
 
     Args:
         name: one of `SCENES`.
@@ -119,26 +110,15 @@ def prepare(
         record: the clock of the frames.
 
     Raises:
-        UsageError: no such scene, or the configuration of another one.
+        UsageError: no such scene, the configuration of another, or one that cannot be built.
+        CdmisfaError: the scene needs a simulator that is not installed.
     """
     kind = SCENES[name].config
     config = config if config is not None else kind()
     if not isinstance(config, kind):
         raise UsageError(f"the scene {name} takes {kind.__name__}, not {type(config).__name__}")
-    return OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
-
-
-def open_scene(
-    name: str, config: SceneConfig | None = None, record: RecordConfig | None = None
-) -> SeekableSource:
-    """A live source of a scene's streams; see `prepare`.
-
-    Raises:
-        UsageError: no such scene, or a scene that cannot be built.
-        CdmisfaError: the scene needs a simulator that is not installed.
-    """
-    scene = prepare(name, config, record)
-    source = scene.open()
+    scene = OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
+    source = SCENES[name].open(scene.config, scene.record)
     with contextlib.suppress(TypeError):  # a class without weak references
         weakref.finalize(source, _OPEN.pop, id(source), None)
         _OPEN[id(source)] = scene
@@ -146,5 +126,5 @@ def open_scene(
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
-    """The scene that `open_scene` opened a source of, where that is known."""
+    """What `open_scene` opened a source from; None for any other source."""
     return _OPEN.get(id(source))

@@ -47,7 +47,7 @@ def convert_command(
     """
     from cdmisfa.experiments.convert import convert
     from cdmisfa.experiments.sources import CameraOptions, open_cameras
-    from recorder.log.folder import REMEDY, refuse_existing
+    from recorder.log.folder import refuse_existing
     from replay.storage.location import Url, location
 
     places = [location(word) for word in source]
@@ -55,7 +55,7 @@ def convert_command(
         if not isinstance(place, Url) and not place.exists():
             raise UsageError(f"{place}: no such file or folder")
     if not resume:
-        refuse_existing(out, force=force, remedy=REMEDY)
+        refuse_existing(out, force=force)
     cameras = CameraOptions(topics, size, align, rate)
     goal = ("convert", str(out))
     with contextlib.closing(open_cameras(places, cameras, salvage=salvage, goal=goal)) as frames:

@@ -70,7 +70,7 @@ def record_command(
     """
     from cdmisfa.experiments.sources import configure
     from recorder.log.manifest import Manifest, read_recording
-    from recorder.world.scenes import SCENES, prepare
+    from recorder.world.scenes import SCENES
 
     begun = read_recording(out) if resume and out is not None else Manifest()
     scene = scene or "".join(begun.source)
@@ -83,7 +83,7 @@ def record_command(
     if scene_picture is not None:
         from recorder.recording import save_picture
 
-        save_picture(prepare(scene, configuration.scene), scene_picture, force=force)
+        save_picture(scene, configuration.scene, scene_picture, force=force)
         click.echo(f"picture {scene_picture}", err=True)
         if out is None:
             if as_json:
