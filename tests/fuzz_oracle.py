@@ -25,7 +25,7 @@ from replay.mcap.reader import LogReader, Message
 from replay.mcap.records import MAX_CHUNK
 from replay.recordings.channel_rows import own_messages
 from replay.recordings.source import RecordedSource
-from replay.recordings.view_file import ViewFile, _row
+from replay.recordings.view_file import ViewFile
 
 MEMORY = MAX_CHUNK + 32 * 1024 * 1024
 """Most bytes that a small file may make us ask for: a chunk at the limit, and ourselves."""
@@ -160,11 +160,9 @@ def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
 def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarray) -> None:
     """As `ViewFile.take`, by the tables of chunks alone and with nothing compiled."""
     outs = (frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8))
-    spans = (view._frame_spans, view._truth_spans)
-    channels = zip((view._frames, view._truth), view._layouts, outs, strict=False)
+    channels = zip(view._channels, view._layouts, outs, strict=False)
     for which, (rows, layout, out) in enumerate(channels):
-        assert rows is not None
-        for piece in rows.pieces(_row(spans[which], start), len(out), which):
+        for piece in rows.pieces(start, len(out), which):
             own = own_messages(view.reader, piece.segment, rows.channel)
             ends = layout.checked_ends(view.path, piece.segment, own)
             ends = ends[piece.low : piece.low + piece.n]

@@ -38,15 +38,13 @@ class Piece(NamedTuple):
     """Messages of one channel that stand in one chunk.
 
     Attributes:
-        offset: place of the chunk in the file.
         segment: the chunk.
         which: the channel: 0 frames, 1 ground truth.
         low: the first of them among the channel's messages in the chunk.
         n: how many.
-        at: the first of them among the messages asked for.
+        at: the first of them among the messages wanted.
     """
 
-    offset: int
     segment: Segment
     which: int
     low: int
@@ -55,44 +53,50 @@ class Piece(NamedTuple):
 
 
 class ChannelRows:
-    """The messages of one channel, numbered through all chunks of a file.
+    """The messages of one channel, numbered through all chunks of a file by their log time.
 
     Args:
         reader: the file.
         channel: the channel.
+        facts: the clock of the recording.
+
+    Attributes:
+        channel: as given.
+        spans: the frames that are there; one, except where gaps and damage are left out.
+
+    Raises:
+        LogDamagedError: a log time that is no frame's, a frame twice or out of order, and
+            without `salvage` a frame that is missing.
     """
 
-    def __init__(self, reader: LogReader, channel: Channel) -> None:
+    def __init__(self, reader: LogReader, channel: Channel, facts: ViewFacts) -> None:
         self.channel = channel
         self._reader = reader
+        self._facts = facts
         self._segments: list[Segment] = []
-        self._to_confirm: dict[int, ViewFacts] = {}
+        self._to_confirm: set[int] = set()
         self._starts = [0]
         self._taken: list[Segment] = []
         self._take_segments()
+        if reader.by_index and not reader.salvage:
+            # Each chunk's log times are compared with the summary when it is read.
+            self._to_confirm = set(range(len(self._segments)))
+            self.spans = self._unbroken(self._starts[-1])
+        else:
+            self.spans = self._spans_from(0)
 
-    def spans(self, facts: ViewFacts, *, salvage: bool) -> list[Span]:
-        """Number the messages by their log time.
-
-        Args:
-            facts: the clock of the recording.
-            salvage: take gaps and damaged chunks as several spans.
-
-        Raises:
-            LogDamagedError: a log time that is no frame's, a frame twice or out of order,
-                and without `salvage` a frame that is missing.
-        """
-        if self._reader.by_index and not salvage:
-            return self._stated_spans(facts)
-        return self._spans_from(0, facts, salvage)
-
-    def extended(self, facts: ViewFacts) -> list[Span]:
-        """Number the messages of a file that its recorder has made longer; as `spans`.
+    def extend(self) -> None:
+        """Take in what its recorder has added to the file.
 
         Raises:
-            LogDamagedError: as `spans`, without `salvage`.
+            LogDamagedError: what was added is damaged.
         """
-        return self._spans_from(self._take_segments(), facts, False)
+        self.spans = self._spans_from(self._take_segments())
+
+    @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """The frames that are there, as ranges [start, stop)."""
+        return [(span.start, span.stop) for span in self.spans]
 
     def _take_segments(self) -> int:
         """Take in the chunks that hold messages; how many of those before are as they were."""
@@ -111,63 +115,42 @@ class ChannelRows:
         self._taken = segments[:]
         return kept
 
-    def _spans_from(self, first: int, facts: ViewFacts, salvage: bool) -> list[Span]:
+    def _unbroken(self, count: int) -> list[Span]:
+        first = self._facts.first_frame
+        return [Span(first, first + count, 0)] if count else []
+
+    def _spans_from(self, first: int) -> list[Span]:
         """Number the messages, those in the chunks before the `first`th without a look at them."""
-        row = self._starts[first]
-        found = [Span(facts.first_frame, facts.first_frame + row, 0)] if row else []
+        row, salvage = self._starts[first], self._reader.salvage
+        found = self._unbroken(row)
         batch: list[NDArray[np.uint64]] = []
         for number in range(first, len(self._segments)):
             damaged = salvage and self._reader.table(self._segments[number]) is None
             if damaged or len(batch) >= _BATCH:
-                self._number(batch, row, facts, found, salvage)
+                self._number(batch, row, found)
                 row, batch = self._starts[number + damaged], []
             if not damaged:
-                try:
-                    batch.append(self._times(number))
-                except MalformedRecord as error:
-                    raise LogDamagedError(f"{self._reader.path}: {error}") from None
-        self._number(batch, row, facts, found, salvage)
+                batch.append(self._times(number))
+        self._number(batch, row, found)
         return found
-
-    def _stated_spans(self, facts: ViewFacts) -> list[Span]:
-        """Number the messages by how many the summary says each chunk has.
-
-        Each chunk's log times are compared with this when it is read.
-        """
-        self._to_confirm = dict.fromkeys(range(len(self._segments)), facts)
-        count = self._starts[-1]
-        return [Span(facts.first_frame, facts.first_frame + count, 0)] if count else []
 
     def _confirm(self, number: int) -> None:
         """Check the log times of a chunk whose frames were numbered by the summary."""
-        facts = self._to_confirm.get(number)
-        if facts is None:
-            return
-        start = facts.first_frame + self._starts[number]
-        before = [Span(facts.first_frame, start, 0)] if self._starts[number] else []
-        try:
-            self._number([self._times(number)], self._starts[number], facts, before, False)
-        except MalformedRecord as error:
-            raise LogDamagedError(f"{self._reader.path}: {error}") from None
-        del self._to_confirm[number]
+        if number in self._to_confirm:
+            row = self._starts[number]
+            self._number([self._times(number)], row, self._unbroken(row))
+            self._to_confirm.remove(number)
 
-    def _number(
-        self,
-        batch: list[NDArray[np.uint64]],
-        row: int,
-        facts: ViewFacts,
-        found: list[Span],
-        salvage: bool,
-    ) -> None:
+    def _number(self, batch: list[NDArray[np.uint64]], row: int, found: list[Span]) -> None:
         """Add the frames of messages from `row` on to the spans found."""
         if not batch:
             return
         times = np.concatenate(batch)
-        frames = facts.frames_at(times)
-        exact = facts.times(frames) == times
-        before = found[-1].stop if found else facts.first_frame
+        frames = self._facts.frames_at(times)
+        exact = self._facts.times(frames) == times
+        before = found[-1].stop if found else self._facts.first_frame
         steps = np.diff(frames, prepend=before - 1)
-        wrong = np.flatnonzero(~exact | (steps < 1 if salvage else steps != 1))
+        wrong = np.flatnonzero(~exact | (steps < 1 if self._reader.salvage else steps != 1))
         if len(wrong):
             at = int(wrong[0])
             raise LogDamagedError(
@@ -187,13 +170,17 @@ class ChannelRows:
     def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the messages in the `number`th chunk that holds any."""
         segment = self._segments[number]
-        if segment.indexes:
+        if not segment.indexes:
+            return self._table(number).log_time
+        try:
             own = [p[:, 0] for c, p in self._reader.index(segment) if c == self.channel.id]
-            return own[0] if len(own) == 1 else np.concatenate(own)
-        return self._table(number).log_time
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self._reader.path}: {error}") from None
+        return own[0] if len(own) == 1 else np.concatenate(own)
 
-    def payload(self, row: int) -> bytes:
-        """Copy the payload of one message."""
+    def payload(self, frame: int) -> bytes:
+        """Copy the payload of a frame's message."""
+        row = self._row(frame)
         number = bisect.bisect_right(self._starts, row) - 1
         return self._table(number).payload(row - self._starts[number])
 
@@ -207,18 +194,23 @@ class ChannelRows:
             if self._reader.table(segment) is not None:
                 yield segment, own_messages(self._reader, segment, self.channel)
 
-    def pieces(self, row: int, count: int, which: int) -> list[Piece]:
-        """The chunks that hold `count` messages from `row` on."""
+    def pieces(self, frame: int, count: int, which: int) -> list[Piece]:
+        """The chunks that hold the messages of `count` frames from one on, of the same span."""
+        row = self._row(frame)
         number, at = bisect.bisect_right(self._starts, row) - 1, 0
         found = []
         while at < count:
             low = row + at - self._starts[number]
             here = min(self._starts[number + 1] - row, count) - at
-            segment = self._segments[number]
-            found.append(Piece(segment.offset, segment, which, low, here, at))
+            found.append(Piece(self._segments[number], which, low, here, at))
             self._confirm(number)
             at, number = at + here, number + 1
         return found
+
+    def _row(self, frame: int) -> int:
+        """Number of a frame's message."""
+        place = bisect.bisect_right(self.spans, frame, key=lambda span: span.start) - 1
+        return self.spans[place].row_of(frame)
 
     def _count(self, segment: Segment) -> int:
         counts = segment.channel_counts()

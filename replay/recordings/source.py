@@ -257,14 +257,10 @@ class RecordedSource(SeekableSource):
                 f"{self._name()}: {left_out} frames are missing in a view and left out in all"
             )
         self.warnings = tuple(warnings)
+        names, one = tuple(f.view for f in facts), facts[0]
+        length = None if self._loop else self._count
         self._spec = SourceSpec(
-            tuple(f.view for f in facts),
-            facts[0].frame_shape,
-            facts[0].dtype,
-            facts[0].truth,
-            facts[0].fps,
-            facts[0].start_ns,
-            None if self._loop else self._count,
+            names, one.frame_shape, one.dtype, one.truth, one.fps, one.start_ns, length
         )
 
     def _place(self, stream: int, played: int, wanted: int) -> tuple[ViewFile, int, int]:

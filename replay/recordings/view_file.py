@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
-import operator
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from recorder.log.messages import (
 )
 from recorder.log.viewfacts import ViewFacts
 from replay.mcap.reader import LogReader
-from replay.recordings.channel_rows import ChannelRows, Span
+from replay.recordings.channel_rows import ChannelRows
 from replay.recordings.scanner import ChunkScanner, RowLayout
 from replay.storage.location import Location
 
@@ -59,34 +58,29 @@ class ViewFile:
         self._scanner: ChunkScanner | None = None
         self.reader = LogReader(path, salvage=salvage, cache_bytes=cache_bytes)
         try:
-            self._open(salvage)
+            self._open()
         except BaseException:
             self.reader.close()
             raise
 
-    def _open(self, salvage: bool) -> None:
+    def _open(self) -> None:
         records = [m for m in self.reader.metadata if m.name == METADATA]
         if len(records) != 1:
             raise NoRecordingError(
                 f"{self.path}: no recording of cdmisfa ({len(records)} {METADATA} records); "
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
-        self.facts = ViewFacts.from_metadata(self.path, records[0].values)
+        self.facts = facts = ViewFacts.from_metadata(self.path, records[0].values)
         self.reader.expect(self.reader.segments)
-        image = self.facts.dtype == "uint8"
-        self._frames = self._channel(
-            view_topic(self.facts.view), IMAGE_SCHEMA if image else VECTOR_SCHEMA
-        )
-        self._truth = self._channel(TRUTH_TOPIC, TRUTH_SCHEMA) if self.facts.truth else None
-        truth = self._truth.spans(self.facts, salvage=salvage) if self._truth is not None else []
-        self._number(self._frames.spans(self.facts, salvage=salvage), truth)
+        schema = IMAGE_SCHEMA if len(facts.frame_shape) == 2 else VECTOR_SCHEMA
+        self._channels = [self._channel(view_topic(facts.view), schema)]
+        if facts.truth:
+            self._channels.append(self._channel(TRUTH_TOPIC, TRUTH_SCHEMA))
+        self._find_ranges()
 
-    def _number(self, frames: list[Span], truth: list[Span]) -> None:
+    def _find_ranges(self) -> None:
         """Find the frames that have their ground truth."""
-        self._frame_spans, self._truth_spans = frames, truth
-        self.ranges = [(span.start, span.stop) for span in frames]
-        if self._truth is not None:
-            self.ranges = intersection(self.ranges, [(span.start, span.stop) for span in truth])
+        self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))
         self._layouts = self._find_layouts() if self.ranges else []
 
     def is_at(self, path: Path) -> bool:
@@ -102,8 +96,9 @@ class ViewFile:
         self.path = self.reader.path = path
         if self.reader.refresh():
             self._scanner = None
-            truth = self._truth.extended(self.facts) if self._truth is not None else []
-            self._number(self._frames.extended(self.facts), truth)
+            for rows in self._channels:
+                rows.extend()
+            self._find_ranges()
 
     @property
     def count(self) -> int:
@@ -123,13 +118,11 @@ class ViewFile:
         """
         if self._scanner is None:
             self._scanner = ChunkScanner(self.reader, self._layouts)
-        outs = [frames.reshape(len(frames), -1).view(np.uint8)]
-        pieces = self._frames.pieces(_row(self._frame_spans, start), len(frames), 0)
-        if self._truth is not None:
-            outs.append(truth.view(np.uint8))
-            pieces += self._truth.pieces(_row(self._truth_spans, start), len(truth), 1)
-            # In the order of the file, so that each chunk is decoded once.
-            pieces.sort(key=operator.itemgetter(0))
+        outs = [frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8)]
+        count, channels = len(frames), enumerate(self._channels)
+        pieces = [piece for c, rows in channels for piece in rows.pieces(start, count, c)]
+        # In the order of the file, so that each chunk is decoded once.
+        pieces.sort(key=lambda piece: piece.segment.offset)
         for piece in pieces:
             chunk = self._scanner.chunk(piece.segment)
             out = outs[piece.which][piece.at : piece.at + piece.n]
@@ -141,8 +134,8 @@ class ViewFile:
         Raises:
             LogDamagedError: a message in it is damaged, or a chunk that was not passed over.
         """
-        for rows, layout in zip((self._frames, self._truth), self._layouts, strict=False):
-            for segment, table in rows.tables() if rows is not None else ():
+        for rows, layout in zip(self._channels, self._layouts, strict=False):
+            for segment, table in rows.tables():
                 layout.checked_ends(self.path, segment, table)
 
     def close(self) -> None:
@@ -156,18 +149,17 @@ class ViewFile:
         marks = np.frombuffer(payload.before, np.uint8)
         least = place + len(marks)
         places, values = least - np.arange(len(marks)), np.array([place])
-        found = [
-            RowLayout(self._frames.channel, "a frame", least, places, marks, values, payload.size)
-        ]
-        if self._truth is not None:
+        size, channels = payload.size, [rows.channel for rows in self._channels]
+        found = [RowLayout(channels[0], "a frame", least, places, marks, values, size)]
+        if self.facts.truth:
             tags = truth_tags(self.facts.truth)
             marks = np.frombuffer(b"".join(tags), np.uint8)
             # Each value of 8 bytes stands behind its tag.
             sizes = np.array([len(tag) for tag in tags])
             after = np.cumsum((sizes + 8)[::-1])[::-1]
             places = np.concatenate([at - np.arange(n) for at, n in zip(after, sizes, strict=True)])
-            channel, least = self._truth.channel, int(after[0])
-            found.append(RowLayout(channel, "ground truth", least, places, marks, after - sizes, 8))
+            least, values = int(after[0]), after - sizes
+            found.append(RowLayout(channels[1], "ground truth", least, places, marks, values, 8))
         return found
 
     def _channel(self, topic: str, schema: str) -> ChannelRows:
@@ -179,13 +171,13 @@ class ViewFile:
         known = self.reader.schemas.get(channels[0].schema_id)
         if known is None or known.name != schema or channels[0].encoding != "protobuf":
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
-        return ChannelRows(self.reader, channels[0])
+        return ChannelRows(self.reader, channels[0], self.facts)
 
     def _find_payload(self) -> Payload:
         shape = self.facts.frame_shape
-        if self.facts.dtype == "float64":
+        if len(shape) == 1:
             return vector_payload(shape[0])
-        first = self._frames.payload(_row(self._frame_spans, self.ranges[0][0]))
+        first = self._channels[0].payload(self.ranges[0][0])
         try:
             image = RawImage.FromString(first)
         except DecodeError:
@@ -213,8 +205,3 @@ def intersection(one: list[tuple[int, int]], two: list[tuple[int, int]]) -> list
         else:
             j += 1
     return found
-
-
-def _row(spans: list[Span], frame: int) -> int:
-    place = bisect.bisect_right(spans, frame, key=lambda span: span.start) - 1
-    return spans[place].row_of(frame)
