@@ -67,11 +67,7 @@ class RunView:
     """
 
     def __init__(
-        self,
-        recording: rr.RecordingStream,
-        header: RunHeader,
-        streams: Sequence[int],
-        every: int,
+        self, recording: rr.RecordingStream, header: RunHeader, streams: Sequence[int], every: int
     ) -> None:
         self._recording = recording
         self._delta = header.delta
@@ -86,11 +82,11 @@ class RunView:
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
         for columns in stretch.signals:
-            self.add(columns)
+            self._add(columns)
         for frames, watched in stretch.watched:
-            self.watched(frames, watched)
+            self._watched(frames, watched)
         for frames, truth in stretch.truth:
-            self.truth(frames, truth)
+            self._truth(frames, truth)
         for t, phi in stretch.phi:
             self.weights("abstraction/phi", t, phi)
         for event in stretch.events:
@@ -112,7 +108,7 @@ class RunView:
         self._lanes.end(outline.frames)
         self.flush()
 
-    def add(self, columns: SignalColumns) -> None:
+    def _add(self, columns: SignalColumns) -> None:
         """Take the records of consecutive iterations."""
         self._tau = max(columns.tau, 1)
         self._signals(columns)
@@ -122,7 +118,7 @@ class RunView:
         self._saved(columns)
         self._lanes.add(columns)
 
-    def watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
+    def _watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
         """Take (n, *frame_shape) of what the learner saw at n frames."""
         if self._spec.images:
             kept = at % self._every == 0
@@ -131,7 +127,7 @@ class RunView:
             column = self._column("world/watched", frames_column, WIDTH)
             column.add(at, self._iteration(at), frames)
 
-    def truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
+    def _truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Take (n, D) of what the world knows at n frames, and the learner does not."""
         if self._spec.truth:
             line = self._line("world/truth", self._spec.truth)
