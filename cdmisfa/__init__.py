@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
+    from replay.runs.run import Run as Run
 
 __getattr__, __dir__, __all__ = face(
     __name__,
@@ -26,5 +27,6 @@ __getattr__, __dir__, __all__ = face(
         "cdmisfa.core.modules": "Module",
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
         "recorder.world.oscillatory": "OscillatorySource",
+        "replay.runs.run": "Run",
     },
 )

@@ -1,6 +1,12 @@
 """Reading logs, and showing what happened."""
 
+from typing import TYPE_CHECKING
+
 from cdmisfa.core.faces import face
+
+if TYPE_CHECKING:
+    from replay.recordings.source import RecordedSource as RecordedSource
+    from replay.runs.run import Run as Run
 
 __getattr__, __dir__, __all__ = face(
     __name__,

@@ -65,3 +65,12 @@ def test_the_result_is_there_once_the_run_has_ended(folder):
 def test_what_is_no_run_is_refused_at_once(tmp_path):
     with pytest.raises(UsageError, match="holds no run"):
         replay.Run(tmp_path)
+
+
+def test_the_packages_hand_it_on():
+    import cdmisfa
+    from replay.recordings.source import RecordedSource
+
+    assert cdmisfa.Run is replay.Run is module.Run
+    assert replay.RecordedSource is RecordedSource
+    assert {"Run", "RecordedSource"} <= set(dir(replay))

@@ -207,11 +207,9 @@ def _compare(dst: Path, source: LogReader, tallies: dict[int, _Tally]) -> None:
     Raises:
         LogDamagedError: they differ.
     """
-    found: dict[int, _Tally] = {}
     with LogReader(dst) as reader:
+        found = {number: _Tally() for number in reader.channels}
         numbers = dict(zip(sorted(reader.channels), sorted(tallies), strict=True))
-        for number in reader.channels:
-            found[number] = _Tally()
         for _, table in reader.tables(ordered=False):
             _tally(found, table)
         if reader.missing or reader.problems or len(reader.metadata) != len(source.metadata):

@@ -47,13 +47,9 @@ class ChannelSurvey:
 
     def add(self, times: NDArray[Any]) -> None:
         """Take more log times in."""
-        self.messages += len(times)
-        self.widen(times)
-
-    def widen(self, times: NDArray[Any]) -> None:
-        """Take log times in of messages that are counted."""
         if len(times):
             low, high = int(times.min()), int(times.max())
+            self.messages += len(times)
             self.start = low if self.start is None else min(self.start, low)
             self.end = high if self.end is None else max(self.end, high)
 
@@ -123,22 +119,22 @@ def _survey_summary(reader: LogReader, found: dict[int, ChannelSurvey]) -> None:
 
     A channel begins in one of the chunks that begin before any message of it that is known.
     """
-    chunks: dict[int, list[Segment]] = {}
+    chunks: dict[int, list[tuple[Segment, int]]] = {}
     for segment in reader.segments:
         for number, count in (segment.channel_counts() or {}).items():
             if count:
-                found[number].messages += count
-                chunks.setdefault(number, []).append(segment)
-    for number, segments in chunks.items():
-        channel = found[number]
+                chunks.setdefault(number, []).append((segment, count))
+    for number, counted in chunks.items():
+        channel, segments = found[number], [segment for segment, _ in counted]
         for segment in sorted(segments, key=lambda s: s.start):
             if channel.start is not None and segment.start >= channel.start:
                 break
-            channel.widen(_times_of(reader, segment, number))
+            channel.add(_times_of(reader, segment, number))
         for segment in sorted(segments, key=lambda s: s.end, reverse=True):
             if channel.end is not None and segment.end <= channel.end:
                 break
-            channel.widen(_times_of(reader, segment, number))
+            channel.add(_times_of(reader, segment, number))
+        channel.messages = sum(count for _, count in counted)
 
 
 def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:

@@ -81,7 +81,10 @@ def read_header(path: Path) -> RunHeader:
         LogDamagedError: it cannot be read.
     """
     log = run_log(path)
-    found = _metadata(log)
+    with LogReader(log) as reader:
+        found = next((r.values for r in reader.metadata if r.name == METADATA), None)
+    if found is None:
+        raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
     schema = _schema(log, found)
     try:
         spec = json.loads(found["spec"])
@@ -117,11 +120,3 @@ def _schema(log: Path, found: Mapping[str, str]) -> int:
             f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
         )
     return version
-
-
-def _metadata(log: Path) -> Mapping[str, str]:
-    with LogReader(log) as reader:
-        for record in reader.metadata:
-            if record.name == METADATA:
-                return record.values
-    raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")

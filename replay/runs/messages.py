@@ -130,7 +130,7 @@ def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.f
     Raises:
         LogDamagedError: the bytes are not such a message.
     """
-    decoded = _parsed(_MATRIX, data, where)
+    decoded = parsed(_MATRIX, data, where)
     values = np.array(decoded.values, dtype=np.float64)
     if values.size and (decoded.columns == 0 or values.size % decoded.columns):
         raise LogDamagedError(f"{where}: {values.size} values in rows of {decoded.columns}")
@@ -177,7 +177,7 @@ def decode_signals(
     Raises:
         LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
     """
-    decoded = _parsed(_SIGNALS, data, where)
+    decoded = parsed(_SIGNALS, data, where)
     sizes = iter(getattr(decoded, SHAPES))
     fields: dict[str, Any] = {
         s.name: getattr(decoded, s.name) if s.since <= version else math.nan for s in _SCALARS
@@ -202,10 +202,15 @@ def iteration_of(data: bytes, where: str = "record") -> int:
     Raises:
         LogDamagedError: the bytes are not such a message.
     """
-    return int(_parsed(_SIGNALS, data, where).iteration)
+    return int(parsed(_SIGNALS, data, where).iteration)
 
 
-def _parsed(kind: Any, data: bytes, where: str) -> Any:
+def parsed(kind: Any, data: bytes, where: str) -> Any:
+    """A message of some kind in its bytes.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message.
+    """
     try:
         return kind.FromString(data)
     except message.DecodeError as error:

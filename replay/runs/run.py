@@ -49,9 +49,6 @@ class Run:
         """What it learned, in order."""
         return load_modules(self.log.parent)
 
-    def __repr__(self) -> str:
-        return f"Run({str(self.log.parent)!r})"
-
 
 class _Signals(Mapping[str, "NDArray[Any]"]):
     """A run's signals by name, (iterations, *dims) each; NaN for modules not yet there."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
-from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
@@ -30,7 +29,7 @@ from replay.runs.log import (
     RunHeader,
     read_header,
 )
-from replay.runs.messages import decode_matrices, decode_matrix, decode_signals
+from replay.runs.messages import decode_matrices, decode_matrix, decode_signals, parsed
 
 ITERATIONS = 500
 """Most iterations of a stretch."""
@@ -188,11 +187,7 @@ class _Waiting:
 
 
 def _checked(columns: SignalColumns, streams: int, where: str) -> SignalColumns:
-    """Records as they are, where they are about streams that there are.
-
-    Raises:
-        LogDamagedError: they are not.
-    """
+    """Records as they are, where they are about streams that there are."""
     watched, rewards = columns["stream"], columns["R"]
     if (
         watched.min() < 0
@@ -206,40 +201,21 @@ def _checked(columns: SignalColumns, streams: int, where: str) -> SignalColumns:
 
 
 def _event(data: bytes, t: int, log: Path) -> Event:
-    """What happened at frame t, in the bytes of its message.
-
-    Raises:
-        LogDamagedError: the bytes are not such a message.
-    """
-    try:
-        entry = Log_pb2.Log.FromString(data)
-    except DecodeError as error:
-        raise LogDamagedError(f"{log} {EVENT_TOPIC}: not a foxglove.Log message") from error
+    """What happened at frame t, in the bytes of its message."""
+    entry = parsed(Log_pb2.Log, data, f"{log} {EVENT_TOPIC}")
     match = _ITERATION.fullmatch(entry.name)
     level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
     return Event(t, int(match[1]) if match else -1, entry.message, level)
 
 
 def _image(data: bytes, shape: tuple[int, ...], log: Path) -> NDArray[np.uint8]:
-    """The watched (height, width) image in the bytes of its message.
-
-    Raises:
-        LogDamagedError: the bytes are not such a message, or of another size.
-    """
-    try:
-        pixels = RawImage_pb2.RawImage.FromString(data).data
-    except DecodeError as error:
-        raise LogDamagedError(f"{log} {WATCHED_TOPIC}: not a foxglove.RawImage") from error
+    """The watched (height, width) image in the bytes of its message."""
+    pixels = parsed(RawImage_pb2.RawImage, data, f"{log} {WATCHED_TOPIC}").data
     image: NDArray[np.uint8] = _reshaped(np.frombuffer(pixels, np.uint8), shape, log)
     return image
 
 
 def _reshaped(values: NDArray[Any], shape: tuple[int, ...], log: Path) -> NDArray[Any]:
-    """Values in another shape.
-
-    Raises:
-        LogDamagedError: they do not fill it.
-    """
     try:
         return values.reshape(shape)
     except ValueError as error:
