@@ -21,7 +21,8 @@ from cdmisfa.core.learning import Learner, LearnerState
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.sources import configure
-from cdmisfa.experiments.sweep import read_rows, sweep
+from cdmisfa.experiments.store import read_rows
+from cdmisfa.experiments.sweep import sweep
 
 
 @dataclass(frozen=True)

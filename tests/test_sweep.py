@@ -38,7 +38,8 @@ from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.runs import run
-from cdmisfa.experiments.sweep import ROWS, plan, read_rows, sweep
+from cdmisfa.experiments.store import ROWS, read_rows
+from cdmisfa.experiments.sweep import plan, sweep
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments.statistics import Summary, summary
-from cdmisfa.experiments.sweep import DONE, FAILED, REQUEST, read_rows
+from cdmisfa.experiments.store import DONE, FAILED, read_rows
+from cdmisfa.experiments.sweep import REQUEST
 
 SCHEMA = 1
 

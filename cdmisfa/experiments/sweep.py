@@ -1,42 +1,32 @@
 """Sweeps: many trials over a grid of settings and seeds, each computed once.
 
-A trial is named by a hash of everything it depends on. Finished trials are rows of
-DIR/rows.jsonl, one line of JSON each; a sweep that was stopped, or is asked for again
-with more seeds or a larger grid, computes what is missing.
+A sweep that was stopped, or is asked for again with more seeds or a larger grid, computes
+what is missing in its folder; see `store`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib import metadata
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 from cdmisfa.core.config import LearnerConfig, as_table
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.manifest import write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
-from recorder.log.folder import held
+from cdmisfa.experiments.store import DONE, FAILED, TrialStore, code, identity
+from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES, open_scene
 
-ROWS = "rows.jsonl"
-"""A line for each trial that ended; the last line of a trial counts."""
-
 REQUEST = "sweep.json"
 """What was asked for last."""
-
-DONE, FAILED = "done", "failed"
 
 UNKEPT = ("schema", "run", "source", "seed", "signals_sha256")
 """What of a run's result a trial's row has elsewhere, or not at all."""
@@ -148,34 +138,31 @@ def sweep(
         max_modules=max_modules,
         logs=folder / "trials" if keep_logs else None,
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    with _rows_file(folder) as file:
-        before = {row["id"]: row for row in read_rows(folder)}
-        write_json(folder / REQUEST, _request(source, grid or {}, trials))
-        open_trials = [t for t in trials if _is_open(t, before.get(t.id), retry_failed)]
-        rows = dict(before)
+    with contextlib.closing(TrialStore(folder)) as store:
+        write_json(folder / REQUEST, _request(grid or {}, trials))
+        open_trials = [t for t in trials if store.is_open(t.id, t.log, retry=retry_failed)]
+        outdated = _outdated(open_trials, store.rows.values())
         finished = len(trials) - len(open_trials)
         again = {trial.id for trial in open_trials}
-        failed = sum(_has_failed(rows.get(t.id)) for t in trials if t.id not in again)
+        failed = sum(_has_failed(store.rows[t.id]) for t in trials if t.id not in again)
         for index, result in run_all(
             run_trial, open_trials, jobs=jobs, engine=engine, scheduler=scheduler
         ):
             trial = open_trials[index]
             row = _row(trial, result)
-            _append(file, row)
-            rows[trial.id] = row
+            store.add(row)
             finished += 1
             failed += _has_failed(row)
             if progress is not None:
                 progress(finished, failed, len(trials))
-    mine = [rows[trial.id] for trial in trials]
+    rows = store.rows
     return SweepReport(
         folder=folder,
         trials=len(trials),
         skipped=len(trials) - len(open_trials),
         computed=sum(rows[t.id]["status"] == DONE for t in open_trials),
-        failed=tuple(row for row in mine if _has_failed(row)),
-        outdated=_outdated(open_trials, before.values()),
+        failed=tuple(rows[t.id] for t in trials if _has_failed(rows[t.id])),
+        outdated=outdated,
     )
 
 
@@ -197,7 +184,7 @@ def plan(
         UsageError: an unknown key, a value that does not fit, or no such source.
     """
     words = (source,) if isinstance(source, str | Path) else tuple(source)
-    kind, identity = _identify(words, preset, loop)
+    kind, recorded = _identify(words, preset, loop)
     points = [
         dict(zip(grid, map(str, values), strict=True))
         for values in itertools.product(*grid.values())
@@ -212,9 +199,10 @@ def plan(
         seeded = _seeded(kind, preset, chosen)
         for seed in each:
             configuration = seeded(seed)
-            depends = [_configuration(configuration, identity), seed, identity, limits, code()]
+            learned = _configuration(configuration, recorded)
+            name = identity(learned, seed, recorded, limits, code())
             trial = Trial(
-                id=_hash(depends),
+                id=name,
                 source=paths,
                 configuration=configuration,
                 point=point,
@@ -222,7 +210,7 @@ def plan(
                 loop=loop,
                 max_iterations=max_iterations,
                 max_modules=max_modules,
-                log=logs / _hash(depends) if logs is not None else None,
+                log=logs / name if logs is not None else None,
                 code=code(),
             )
             trials.setdefault(trial.id, trial)
@@ -255,27 +243,10 @@ def _is_live(words: Sequence[str | Path]) -> bool:
     return len(words) == 1 and words[0] in SCENES
 
 
-def _configuration(configuration: Configuration, identity: Any) -> Any:
+def _configuration(configuration: Configuration, recorded: Any) -> Any:
     """What of a configuration a trial depends on: the world's part only where it is live."""
     learner = as_table(configuration.learner)
-    return [learner] if identity is not None else [learner, configuration.tables()]
-
-
-def _hash(value: Any) -> str:
-    text = json.dumps(value, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-@cache
-def code() -> str:
-    """Version of what a trial computes: the package's, and a hash of learner and recorder."""
-    root = Path(__file__).parents[2]
-    rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")
-    files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    digest = hashlib.sha256()
-    for file in sorted([*files, root / "cdmisfa/experiments/trial.py"]):
-        digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
-    return f"{metadata.version('cdmisfa')}+{digest.hexdigest()[:12]}"
+    return [learner] if recorded is not None else [learner, configuration.tables()]
 
 
 def run_trial(trial: Trial) -> dict[str, Any]:
@@ -328,27 +299,21 @@ def _logged_trial(trial: Trial) -> dict[str, Any]:
         source = open_scene(trial.source[0], configuration.scene, configuration.record)
     else:
         source, _ = open_source(trial.source, loop=trial.loop)
-    unfinished = None
-    if trial.log is not None:
-        unfinished = trial.log.with_name(trial.log.name + ".partial")
-        unfinished.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with contextlib.closing(source), contextlib.ExitStack() as opened:
+        log = None
+        if trial.log is not None:
+            trial.log.parent.mkdir(parents=True, exist_ok=True)
+            log = opened.enter_context(whole(trial.log))
         result = run(
             source,
             configuration.learner,
-            unfinished,
+            log,
             seed=trial.seed,
             max_iterations=trial.max_iterations,
             max_modules=trial.max_modules,
             sections=configuration.tables(),
-            force=True,
             rerun=False,
         )
-    finally:
-        source.close()
-    if unfinished is not None and trial.log is not None:
-        shutil.rmtree(trial.log, ignore_errors=True)
-        os.replace(unfinished, trial.log)
     told = result.as_json()
     return {key: value for key, value in told.items() if key not in UNKEPT}
 
@@ -378,19 +343,11 @@ def _outdated(trials: Sequence[Trial], rows: Iterable[Mapping[str, Any]]) -> int
     return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)
 
 
-def _has_failed(row: Mapping[str, Any] | None) -> bool:
-    return row is not None and row["status"] == FAILED
+def _has_failed(row: Mapping[str, Any]) -> bool:
+    return bool(row["status"] == FAILED)
 
 
-def _is_open(trial: Trial, row: Mapping[str, Any] | None, retry_failed: bool) -> bool:
-    if row is None or (retry_failed and row["status"] == FAILED):
-        return True
-    return row["status"] == DONE and trial.log is not None and not trial.log.is_dir()
-
-
-def _request(
-    source: Sequence[str | Path], grid: Mapping[str, Sequence[Any]], trials: Sequence[Trial]
-) -> dict[str, Any]:
+def _request(grid: Mapping[str, Sequence[Any]], trials: Sequence[Trial]) -> dict[str, Any]:
     return {
         "schema": 1,
         "source": [str(word) for word in trials[0].source] if trials else [],
@@ -399,40 +356,3 @@ def _request(
         "code": code(),
         "trials": [{"id": trial.id, "point": dict(trial.point)} for trial in trials],
     }
-
-
-def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
-    """The last row of every trial in a sweep's folder, in the order of their first rows.
-
-    A last line that a kill cut short does not count.
-
-    Raises:
-        LogDamagedError: a line is not a row.
-    """
-    path = folder / ROWS
-    rows: dict[str, dict[str, Any]] = {}
-    data = path.read_bytes() if path.is_file() else b""
-    for number, line in enumerate(data[: data.rfind(b"\n") + 1].splitlines(), start=1):
-        try:
-            row = json.loads(line)
-            rows[row["id"]] = {**row, "status": row["status"], "point": dict(row["point"])}
-        except (ValueError, KeyError, TypeError) as error:
-            raise LogDamagedError(
-                f"{path} line {number} is no trial's row: remove the line"
-            ) from error
-    yield from rows.values()
-
-
-@contextlib.contextmanager
-def _rows_file(folder: Path) -> Iterator[BinaryIO]:
-    """The rows, to append to; held by one sweep at a time, a torn last line cut off."""
-    path = folder / ROWS
-    with held(folder), open(path, "a+b") as file:
-        file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)
-        yield file
-
-
-def _append(file: BinaryIO, row: Mapping[str, Any]) -> None:
-    file.write(json.dumps(row, separators=(",", ":")).encode() + b"\n")
-    file.flush()

@@ -1,18 +1,17 @@
 """The paper's experiments: plan trials, run what is missing, judge, tabulate and draw.
 
-DIR/NAME/trials/ one file per finished trial, rows.parquet, results.json, table.md, figures.
-A trial is known by its settings and the code that ran it, so a stopped reproduction goes on
-where it stopped and a change of the code starts it anew.
+DIR/NAME/rows.jsonl and trials/ hold each finished trial, its row and its curves; rows.parquet,
+results.json, table.md and the figures what all of them came to. A trial is known by its settings
+and the code that ran it, so a stopped reproduction is resumed where it stopped and a change of
+the code starts it anew.
 """
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import importlib
-import io
 import json
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +24,8 @@ from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.manifest import versions, write_json
 from cdmisfa.experiments.statistics import Summary
-from cdmisfa.experiments.sweep import code
+from cdmisfa.experiments.store import DONE, TrialStore, code, identity
+from recorder.log.whole import whole
 
 NAMES = ("oscillatory", "stability", "nonstationary", "icub", "difficulty")
 """The experiments, each a module of this package, in the order of the paper."""
@@ -172,27 +172,34 @@ def reproduce(
         CdmisfaError: a trial killed every process that ran it; the others are kept.
     """
     module = experiment(name)
-    store = request.folder / "trials"
-    store.mkdir(parents=True, exist_ok=True)
     planned = module.plan(request)
     if not request.force:
         _keep_results(request.folder, planned)
     version = code()
-    names = [trial_name(name, settings, version) for settings in planned]
-    missing = [i for i, n in enumerate(names) if not (store / f"{n}.npz").exists()]
-    done = len(planned) - len(missing)
-    if progress is not None:
-        progress(done, len(planned))
-    tasks = [(name, planned[i]) for i in missing]
-    for k, result in run_all(run_one, tasks, jobs=request.jobs, engine=engine, scheduler=scheduler):
-        i = missing[k]
-        if isinstance(result, WorkerDied):
-            raise CdmisfaError(f"{name} trial {planned[i]}: {result.what}; the others are kept")
-        write_trial(store / f"{names[i]}.npz", Trial(planned[i], *result))
-        done += 1
+    names = [identity(name, settings, version) for settings in planned]
+    (request.folder / "trials").mkdir(parents=True, exist_ok=True)
+    curves = [request.folder / "trials" / f"{n}.npz" for n in names]
+    with contextlib.closing(TrialStore(request.folder)) as store:
+        missing = [i for i, n in enumerate(names) if store.is_open(n, curves[i])]
+        tasks = [(name, planned[i]) for i in missing]
         if progress is not None:
-            progress(done, len(planned))
-    trials = [read_trial(store / f"{n}.npz") for n in names]
+            progress(len(planned) - len(missing), len(planned))
+        computed = run_all(run_one, tasks, jobs=request.jobs, engine=engine, scheduler=scheduler)
+        for done, (k, result) in enumerate(computed, len(planned) - len(missing) + 1):
+            i = missing[k]
+            if isinstance(result, WorkerDied):
+                raise CdmisfaError(f"{name} trial {planned[i]}: {result.what}; the others are kept")
+            row, arrays = result
+            point = {"id": names[i], "status": DONE, "point": planned[i], "code": version}
+            store.add({**point, "result": row})
+            write_arrays(curves[i], arrays)
+            if progress is not None:
+                progress(done, len(planned))
+        rows = [store.rows[n] for n in names]
+    trials = [
+        Trial(row["point"], row["result"], read_arrays(path))
+        for row, path in zip(rows, curves, strict=True)
+    ]
     findings = module.evaluate(trials)
     write_rows(request.folder / "rows.parquet", trials)
     figures = module.draw(trials, request.folder)
@@ -214,7 +221,8 @@ def reproduce(
         "versions": versions(),
     }
     write_json(request.folder / "results.json", document)
-    (request.folder / "table.md").write_text(markdown_table(table), encoding="utf-8")
+    with whole(request.folder / "table.md") as partial:
+        partial.write_text(markdown_table(table), encoding="utf-8")
     return document
 
 
@@ -236,34 +244,21 @@ def check(document: Mapping[str, Any]) -> None:
         raise NotReproducedError(f"{document['experiment']} did not come out: {words}")
 
 
-def trial_name(name: str, settings: Settings, version: str) -> str:
-    """Identity of a trial: a hash of what decides its result."""
-    text = json.dumps([name, settings, version], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write what figures show of a trial, whole or not at all."""
+    with whole(path, sync=False) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **cast(dict[str, Any], arrays))
 
 
-def write_trial(path: Path, trial: Trial) -> None:
-    """Write a finished trial; the file appears whole or not at all."""
-    buffer = io.BytesIO()
-    head = json.dumps({"settings": trial.settings, "row": trial.row})
-    arrays: dict[str, Any] = {"head": np.array(head), **trial.arrays}
-    np.savez_compressed(buffer, **arrays)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(buffer.getvalue())
-    os.replace(partial, path)
-
-
-def read_trial(path: Path) -> Trial:
-    """Read a finished trial.
+def read_arrays(path: Path) -> Arrays:
+    """Read them back.
 
     Raises:
-        UsageError: the file is not one.
+        UsageError: the file is damaged.
     """
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-        head = json.loads(str(arrays.pop("head")))
-        return Trial(head["settings"], head["row"], arrays)
+            return {key: stored[key] for key in stored.files}
     except Exception as error:
         raise UsageError(f"{path} is damaged: delete it, and the trial is run again") from error
 
@@ -274,9 +269,8 @@ def write_rows(path: Path, trials: Sequence[Trial]) -> None:
     from pyarrow import parquet
 
     rows = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
-    partial = path.with_name(path.name + ".partial")
-    parquet.write_table(pyarrow.Table.from_pylist(rows), partial)
-    os.replace(partial, path)
+    with whole(path) as partial:
+        parquet.write_table(pyarrow.Table.from_pylist(rows), partial)
 
 
 def _keep_results(folder: Path, planned: Sequence[Settings]) -> None:
