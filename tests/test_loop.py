@@ -15,8 +15,7 @@ from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.checkpoint import Checkpoints, checkpoints
-from cdmisfa.experiments.endings import ENDINGS
-from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.loop import ENDINGS, Digest, learn
 from cdmisfa.paper.demo import Shown
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter

@@ -16,7 +16,7 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.core.signals import SignalsHash
-from cdmisfa.experiments.endings import ENDINGS
+from cdmisfa.experiments.loop import ENDINGS
 from cdmisfa.experiments.manifest import write_json
 from cdmisfa.experiments.runs import RunResult
 from cdmisfa.experiments.runs import run as run_it

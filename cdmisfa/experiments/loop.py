@@ -1,14 +1,22 @@
-"""The loop that every run is: watch, learn, tell."""
+"""The loop that every run is: watch, learn, tell. And why it ends."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
-from cdmisfa.experiments.endings import ENDINGS, ending
+
+ENDINGS: Mapping[str, str] = {
+    "max_modules": "as many modules as asked for were learned",
+    "max_iterations": "the asked number of iterations is over",
+    "nothing_left": "exploration ended long ago and no further abstraction converged",
+    "log_exhausted": "the recording ended",
+    "interrupted": "it was interrupted",
+}
+"""Why a run ended, in words."""
 
 
 def learn(
@@ -24,7 +32,7 @@ def learn(
 
     Args:
         source: live or recorded; left open.
-        learner: goes on from where it is.
+        learner: learns on from where it is.
         sinks: told of everything, one after the other.
         stop: asked before every block; true ends the run.
         max_iterations: end after so many.
@@ -38,7 +46,10 @@ def learn(
     """
     exhausted: LogExhaustedError | None = None
     modules = len(source.spec.streams) if max_modules is None else max_modules
-    while not (ended := ending(learner, modules, max_iterations) or _asked(stop)):
+    while True:
+        ended = ending(learner, modules, max_iterations) or ("interrupted" if stop() else "")
+        if ended:
+            break
         try:
             block = source.take(learner.stream, learner.tau)
         except LogExhaustedError as error:
@@ -59,16 +70,27 @@ def learn(
     return ended
 
 
+def ending(learner: Learner, max_modules: int, max_iterations: int | None) -> str:
+    """The key of `ENDINGS` for which a learner is to stop now, or "" where it is to learn on.
+
+    Args:
+        learner: between two iterations.
+        max_modules: end after so many modules.
+        max_iterations: end after so many iterations; None never.
+    """
+    if len(learner.modules) >= max_modules:
+        return "max_modules"
+    if max_iterations is not None and learner.iteration >= max_iterations:
+        return "max_iterations"
+    return "nothing_left" if learner.over else ""
+
+
 class Digest(SignalsHash, Sink):
     """The hash of a run's signals; see `SignalsHash`."""
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self.add(signals)
-
-
-def _asked(stop: Callable[[], bool]) -> str:
-    return "interrupted" if stop() else ""
 
 
 def _saved(source: FrameSource, learner: Learner) -> str:

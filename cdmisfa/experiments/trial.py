@@ -21,7 +21,7 @@ from cdmisfa.core.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.endings import ending
+from cdmisfa.experiments.loop import ending
 from cdmisfa.features.incsfa import Params, State, project
 from cdmisfa.features.incsfa.strict import update
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period

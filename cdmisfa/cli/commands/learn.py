@@ -212,7 +212,7 @@ def show(result: RunResult, *, as_json: bool) -> None:
 
 def summary(result: RunResult) -> str:
     """What a run came to, in words for a person."""
-    from cdmisfa.experiments.endings import ENDINGS
+    from cdmisfa.experiments.loop import ENDINGS
 
     rows = [
         (
