@@ -50,9 +50,7 @@ class McapImages:
         except BaseException:
             self.reader.close()
             raise
-        problems = [f"{p.where}: {p.what}" for p in self.reader.problems]
-        found = (self.reader.missing, *problems)
-        self.warnings: Sequence[str] = [f"{path}: {text}" for text in found if text]
+        self.warnings: Sequence[str] = self.reader.warnings
 
     def frame(self, row: int) -> Bytes:
         """Decode a message into a frame, (height, width) uint8.

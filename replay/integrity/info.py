@@ -9,8 +9,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from replay.integrity.survey import SCHEMA, Kind, Problem, crc_state, kind_of, problems_of, survey
-from replay.mcap.reader import Crc, LogReader
+from replay.integrity.survey import (
+    SCHEMA,
+    Crc,
+    Kind,
+    Problem,
+    crc_state,
+    kind_of,
+    problems_of,
+    survey,
+)
+from replay.mcap.reader import LogReader
 from replay.runs.folders import METADATA, RUN_FILE, read_manifest
 from replay.runs.messages import missing
 from replay.storage.listing import log_files

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import METADATA as RECORDING
-from replay.mcap.reader import Crc, LogReader
+from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
 from replay.mcap.segments import Segment
 from replay.runs.folders import METADATA as RUN
@@ -22,6 +22,7 @@ SCHEMA: Final = 1
 """Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
 
 Kind = Literal["recording", "run", "foreign"]
+Crc = Literal["ok", "absent", "bad", "unchecked"]
 Times = NDArray[np.uint64]
 
 

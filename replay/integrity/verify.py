@@ -8,8 +8,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.integrity.survey import SCHEMA, Kind, Problem, crc_state, kind_of, problems_of, survey
-from replay.mcap.reader import Crc, LogReader
+from replay.integrity.survey import (
+    SCHEMA,
+    Crc,
+    Kind,
+    Problem,
+    crc_state,
+    kind_of,
+    problems_of,
+    survey,
+)
+from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.storage.copied import fetched

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,6 @@ from replay.mcap.tables import MessageTable, in_order, within
 from replay.mcap.walk import Structure
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import open_store
-
-Crc = Literal["ok", "absent", "bad", "unchecked"]
 
 
 class LogReader:
@@ -115,6 +113,12 @@ class LogReader:
         return structure.missing
 
     @property
+    def warnings(self) -> list[str]:
+        """What is missing and what was left out, a line each that names the file."""
+        problems = [f"{p.where}: {p.what}" for p in self.problems]
+        return [f"{self.path}: {text}" for text in (self.missing, *problems) if text]
+
+    @property
     def data_complete(self) -> bool:
         """Whether every message is there, if not the summary behind them."""
         return self._structure.data_crc is not None
@@ -174,10 +178,10 @@ class LogReader:
 
     def digest(self) -> str:
         """SHA-256 of the file; where only the summary was read, from its data's end on."""
-        whole = hashlib.sha256()
-        for block in self._file.blocks(self._structure.data_end if self.by_index else 0, self.size):
-            whole.update(block)
-        return whole.hexdigest()
+        sha256, start = hashlib.sha256(), self._structure.data_end if self.by_index else 0
+        for block in self._file.blocks(start, self.size):
+            sha256.update(block)
+        return sha256.hexdigest()
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects."""
@@ -369,19 +373,17 @@ class LogReader:
 
     def _define(self) -> None:
         """Decode chunks until every channel that has messages is known."""
-        known = self._structure.definitions.channels
-        segments = self.segments
+        definitions, segments = self._structure.definitions, self.segments
+        known, counted = definitions.channels, set[int]()
         if self._defined == len(segments):
             return
-        counted: set[int] = set()
-        while self._defined < len(segments):
-            segment = segments[self._defined]
+        for segment in segments[self._defined :]:
             counts = segment.channel_counts()
             if counts is None or not counts.keys() <= known.keys():
                 self.table(segment)
             counted.update(counts or ())
-            self._defined += 1
-        schemas = {0, *self._structure.definitions.schemas}
+        self._defined = len(segments)
+        schemas = {0, *definitions.schemas}
         if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
             self._search()
 

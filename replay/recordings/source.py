@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import functools
 import itertools
 import re
 from collections.abc import Iterable, Mapping
@@ -13,7 +14,6 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
-from recorder.log.viewfacts import ViewFacts
 from recorder.log.whole import PARTIAL
 from replay.mcap.identity import identity
 from replay.mcap.reader import LogReader
@@ -29,8 +29,8 @@ Few, because playing moves forward, and memory that is used again is still in th
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
 _SMALLEST: Final = 64
 """Bytes that no log of a recording has less of once its header is written."""
-_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns")
-_SAME_VALUES: Final = ("scene", "seed", "config_sha256")
+_SCENE: Final = ("scene", "seed", "config_sha256")
+_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", *_SCENE)
 
 
 class RecordedSource(SeekableSource):
@@ -86,7 +86,7 @@ class RecordedSource(SeekableSource):
             UsageError: no such recording any more.
             LogDamagedError: what was written is damaged.
         """
-        before = {view.path.name.removesuffix(PARTIAL): view for v in self._views for view in v}
+        before = {view.path.name.removesuffix(PARTIAL): view for view in self._all()}
         opened: list[ViewFile] = []
         added: list[ViewFile] = []
         try:
@@ -180,13 +180,8 @@ class RecordedSource(SeekableSource):
         """The recording's views with the SHA-256 of their files, and what was recorded."""
         if self._hashes is None:
             self._hashes = [
-                {
-                    "name": view.facts.view,
-                    "frames": view.count,
-                    **identity(view.path, view.reader),
-                }
-                for parts in self._views
-                for view in parts
+                {"name": v.facts.view, "frames": v.count, **identity(v.path, v.reader)}
+                for v in self._all()
             ]
         return {
             "kind": "recording",
@@ -207,20 +202,21 @@ class RecordedSource(SeekableSource):
                 "bytes": view.reader.size,
                 "sha256": view.reader.digest(),
             }
-            for parts in self._views
-            for view in parts
+            for view in self._all()
         ]
 
     def scene(self) -> Mapping[str, str]:
         """What was recorded: the scene, its seed and the checksum of its configuration."""
-        values = self._views[0][0].facts.values
-        return {k: values[k] for k in _SAME_VALUES if k in values}
+        facts = self._views[0][0].facts
+        return {name: getattr(facts, name) for name in _SCENE if name in facts.values}
 
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""
-        for parts in self._views:
-            for view in parts:
-                view.close()
+        for view in self._all():
+            view.close()
+
+    def _all(self) -> list[ViewFile]:
+        return [view for parts in self._views for view in parts]
 
     def _name(self) -> str:
         parents = {path.parent for path in self._files}
@@ -230,9 +226,7 @@ class RecordedSource(SeekableSource):
         """Find the frames that every view has, whole."""
         facts = [parts[0].facts for parts in self._views]
         covered = list(self.coverage().values())
-        common = covered[0]
-        for ranges in covered[1:]:
-            common = intersection(common, ranges)
+        common = functools.reduce(intersection, covered)
         if not common:
             raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
         self._ranges = _joined(common)
@@ -241,11 +235,7 @@ class RecordedSource(SeekableSource):
         )
         self._first = self._ranges[0][0]
         self._count = self._range_starts[-1]
-        warnings: list[str] = []
-        for view in itertools.chain.from_iterable(self._views):
-            if view.reader.missing:
-                warnings.append(f"{view.path}: {view.reader.missing}")
-            warnings += [f"{view.path}: {p.where}: {p.what}" for p in view.reader.problems]
+        warnings = [text for view in self._all() for text in view.reader.warnings]
         if len({ranges[-1][1] for ranges in covered}) > 1:
             warnings.append(
                 f"{self._name()}: its views end at different frames; it ends with the shortest, "
@@ -299,10 +289,11 @@ def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
         )
     first = opened[0]
     for view in opened[1:]:
-        key = _difference(first.facts, view.facts)
-        if key:
+        facts = [first.facts, view.facts]
+        differ = [k for k in _SAME if getattr(facts[0], k) != getattr(facts[1], k)]
+        if differ:
             raise LogDamagedError(
-                f"{view.path}: not of the same recording as {first.path.name}: {key} differs"
+                f"{view.path}: not of the same recording as {first.path.name}: {differ[0]} differs"
             )
     arranged = []
     for stream in sorted(by_view):
@@ -316,16 +307,6 @@ def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
                 )
         arranged.append(parts)
     return arranged
-
-
-def _difference(one: ViewFacts, two: ViewFacts) -> str:
-    for key in _SAME:
-        if getattr(one, key) != getattr(two, key):
-            return key
-    for key in _SAME_VALUES:
-        if one.values.get(key) != two.values.get(key):
-            return key
-    return ""
 
 
 def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
