@@ -29,8 +29,7 @@ from engine_tasks import trace
 from pyarrow import parquet
 
 from cdmisfa.cli.app import run as cdmisfa
-from cdmisfa.cli.commands.results import results_command
-from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, sweep_command
+from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, results_command, sweep_command
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments import engines
