@@ -47,7 +47,7 @@ class PointResult:
 
 
 def results(folder: Path) -> list[PointResult]:
-    """The points of what was asked of a sweep last, in the grid's order.
+    """The points of a sweep as it was requested last, in the grid's order.
 
     Raises:
         UsageError: the folder holds no sweep.
@@ -56,8 +56,8 @@ def results(folder: Path) -> list[PointResult]:
     folder = Path(folder)
     path = folder / REQUEST
     try:
-        asked = json.loads(path.read_text("utf-8"))
-        trials = [(str(t["id"]), dict(t["point"])) for t in asked["trials"]]
+        request = json.loads(path.read_text("utf-8"))
+        trials = [(str(t["id"]), dict(t["point"])) for t in request["trials"]]
     except OSError as error:
         raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep") from error
     except (ValueError, KeyError, TypeError) as error:

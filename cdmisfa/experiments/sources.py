@@ -152,7 +152,7 @@ def open_source(
         settings: `section.key=value` words.
         seed: of the scene, where `scene.seed` is not set.
         loop: start a recording again at its end.
-        salvage: go on over the damaged parts of a recording.
+        salvage: pass over the damaged parts of a recording.
         cameras: how images of others become frames; given, the paths are taken as such logs.
         follow: wait so many seconds for more frames of a recording that is being written.
 
@@ -216,7 +216,7 @@ def open_log(
     Args:
         paths: of one recording, or of the logs of others.
         loop: start again at the end.
-        salvage: go on over damaged parts.
+        salvage: pass over damaged parts.
         cameras: how images of others become frames; given, the paths are taken as such logs.
 
     Raises:

@@ -44,8 +44,8 @@ TICK = 0.1
     help="End after so many modules; by default as many as there are streams.",
 )
 @click.option("--loop", is_flag=True, help="Start a recording again at its end.")
-@click.option("--resume", is_flag=True, help="Go on with the run in -o where it was stopped.")
-@click.option("--salvage", is_flag=True, help="Go on over damaged parts of a recording.")
+@click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
+@click.option("--salvage", is_flag=True, help="Pass over damaged parts of a recording.")
 @click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 @click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
@@ -94,7 +94,7 @@ def learn_command(
     With --resume it is that of the run, and need not be given.
     """
     if resume and out is None:
-        raise click.UsageError("--resume needs -o RUN, the run to go on with")
+        raise click.UsageError("--resume needs -o RUN, the run to resume")
     if resume and force:
         raise click.UsageError("--force starts anew and --resume goes on: use one of them")
     if not source:

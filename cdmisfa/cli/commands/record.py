@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     metavar="F.png",
     help="Draw the scene from outside instead of recording it.",
 )
-@click.option("--resume", is_flag=True, help="Go on where an interrupted recording ended.")
+@click.option("--resume", is_flag=True, help="Resume an interrupted recording.")
 @click.option(
     "--split",
     metavar="LIMIT",
@@ -160,8 +160,8 @@ def print_recording(
 @click.argument("source", nargs=-1, required=True)
 @options.out("Folder of the recording.", required=True)
 @camera_options
-@click.option("--salvage", is_flag=True, help="Go on over damaged parts of a log.")
-@click.option("--resume", is_flag=True, help="Go on where an earlier attempt was stopped.")
+@click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")
+@click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
 @options.force
 @options.as_json
 @click.pass_context
@@ -181,7 +181,7 @@ def convert_command(
     """Write camera logs of others as a recording.
 
     SOURCE is MCAP files or their URLs, ROS bags, or a video or a folder of pictures for each
-    stream. Interrupted, it goes on with --resume.
+    stream. What was interrupted is resumed with --resume.
     """
     from cdmisfa.experiments.convert import convert
     from cdmisfa.experiments.sources import CameraOptions, open_cameras

@@ -59,7 +59,7 @@ def sweep_command(
 ) -> None:
     """Learn from a source many times, over a grid of settings and seeds.
 
-    SOURCE is what learn takes. A sweep that was stopped goes on when it is asked for
+    SOURCE is what learn takes. A sweep that was stopped is resumed when it is asked for
     again. Look at what it found with: cdmisfa results DIR
     """
     from cdmisfa.experiments.sweep import sweep
