@@ -1,6 +1,16 @@
-"""Curiosity-driven modular incremental slow feature analysis (CD-MISFA 2.0)."""
+"""Curiosity-driven modular incremental slow feature analysis (CD-MISFA 2.0).
 
-from typing import TYPE_CHECKING
+A learner learns from a source, and sinks are told of it:
+
+    source = OscillatorySource()
+    learner = CuriousLearner(LearnerConfig(), source.spec, seed=0)
+    learn(source, learner)
+
+What follows is the vocabulary; `cdmisfa.experiments` does whole runs and sweeps, `recorder`
+records sources, `replay` reads and shows what was logged.
+"""
+
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.faces import face
 
@@ -8,25 +18,41 @@ if TYPE_CHECKING:
     from cdmisfa.agents.learner import CuriousLearner as CuriousLearner
     from cdmisfa.core.blocks import Block as Block
     from cdmisfa.core.blocks import FrameSource as FrameSource
+    from cdmisfa.core.blocks import SeekableSource as SeekableSource
     from cdmisfa.core.blocks import SourceSpec as SourceSpec
     from cdmisfa.core.config import LearnerConfig as LearnerConfig
     from cdmisfa.core.errors import CdmisfaError as CdmisfaError
+    from cdmisfa.core.learning import Learner as Learner
+    from cdmisfa.core.learning import Sink as Sink
     from cdmisfa.core.modules import Module as Module
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
+    from cdmisfa.experiments.loop import learn as learn
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
     from replay.runs.run import Run as Run
 
-__getattr__, __dir__, __all__ = face(
+    __version__: str
+
+_load, __dir__, __all__ = face(
     __name__,
     {
         "cdmisfa.agents.learner": "CuriousLearner",
-        "cdmisfa.core.blocks": "Block FrameSource SourceSpec",
+        "cdmisfa.core.blocks": "Block FrameSource SeekableSource SourceSpec",
         "cdmisfa.core.config": "LearnerConfig",
         "cdmisfa.core.errors": "CdmisfaError",
+        "cdmisfa.core.learning": "Learner Sink",
         "cdmisfa.core.modules": "Module",
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
+        "cdmisfa.experiments.loop": "learn",
         "recorder.world.oscillatory": "OscillatorySource",
         "replay.runs.run": "Run",
     },
 )
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib import metadata
+
+        return metadata.version(__name__)
+    return _load(name)

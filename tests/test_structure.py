@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import click
@@ -111,6 +112,23 @@ def test_a_package_hands_on_names_that_exist() -> None:
     )
     done = python("-W", "ignore", "-c", code, *FORBIDDEN)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_library_shows_what_it_offers() -> None:
+    shown = python("-W", "ignore", "-c", "import cdmisfa; help(cdmisfa)").stdout
+    names = ["CuriousLearner", "Learner", "LearnerConfig", "SeekableSource", "Sink", "Run"]
+    assert [name for name in names if f"class {name}(" not in shown] == []
+    assert "learn(source: " in shown
+    assert f"VERSION\n    {metadata.version('cdmisfa')}" in shown
+    example = "\n".join(line for line in shown.splitlines() if line.startswith(" " * 8))
+    lines = [line.strip() for line in example.splitlines()[:3]]
+    code = ["from cdmisfa import *", *lines, "assert len(learner.modules) == 3"]
+    assert python("-W", "ignore", "-c", "\n".join(code)).returncode == 0, code
+
+
+def test_importing_the_library_imports_nothing_heavy() -> None:
+    code = f"import cdmisfa, sys; print(sorted(set({HEAVY!r}) & set(sys.modules)))"
+    assert python("-c", code).stdout.strip() == "[]"
 
 
 @pytest.mark.parametrize("package", PACKAGES)

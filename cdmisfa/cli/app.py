@@ -18,7 +18,7 @@ import click
 
 from cdmisfa.cli.interrupts import interruptible
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.core.names import did_you_mean
+from cdmisfa.core.registry import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene shows, one MCAP file per view."),

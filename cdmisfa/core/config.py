@@ -18,7 +18,7 @@ from importlib import resources
 from typing import Any, Literal, TypeVar
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.names import did_you_mean
+from cdmisfa.core.registry import did_you_mean
 
 Section = TypeVar("Section")
 

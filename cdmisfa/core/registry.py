@@ -1,12 +1,12 @@
-"""`Registry`: things of one kind by their names, to which anybody may add."""
+"""`Registry`: things of one kind by their names, to which anybody may add; and wrong names."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Generic, TypeVar
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.names import did_you_mean
 
 Entry = TypeVar("Entry")
 
@@ -65,3 +65,18 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+
+def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
+    """The end of an error about an unknown name: the nearest one, or all there are.
+
+    Args:
+        name: as it was written.
+        known: the names there are.
+        prefix: what stands before each of them.
+    """
+    names = list(known)
+    nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if nearest:
+        return f"did you mean {prefix}{nearest[0]}?"
+    return f"there are {', '.join(names)}"

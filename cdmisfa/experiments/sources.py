@@ -13,7 +13,7 @@ from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.names import did_you_mean
+from cdmisfa.core.registry import did_you_mean
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.scenes import SCENES
 
