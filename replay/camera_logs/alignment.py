@@ -54,8 +54,9 @@ def overlap(streams: Sequence[Times]) -> tuple[int, int]:
 
 
 def of_other_rate(times: Times, fps: float) -> bool:
-    """Whether images come at another rate, by more than a hundredth."""
-    return abs(step_of(times) * fps - 1) > _UNEVEN  # never of NaN
+    """Whether images tell a rate, and another one, by more than a hundredth."""
+    step = step_of(times)
+    return step > 0 and abs(step * fps - 1) > _UNEVEN
 
 
 def unlike(first: Times, times: Times) -> str:

@@ -1,0 +1,87 @@
+"""Streams on one clock: which image each frame shows, by times alone."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cdmisfa.core.clock import NANOSECONDS, time_of
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.camera_logs.alignment import (
+    Times,
+    by_index,
+    by_time,
+    even_times,
+    of_other_rate,
+    overlap,
+    step_of,
+    unlike,
+)
+from replay.camera_logs.stream import LAST_NS, sorted_times
+
+START = 1_700_000_000 * NANOSECONDS
+
+GAPS = st.lists(st.integers(0, 10**9), min_size=1, max_size=30)
+
+
+def times(*gaps: int) -> Times:
+    return np.array(list(accumulate(gaps, initial=START)), np.uint64)
+
+
+@given(GAPS, GAPS, st.floats(0.5, 100))
+def test_every_frame_shows_the_last_image_at_or_before_it(
+    left: list[int], right: list[int], fps: float
+) -> None:
+    streams = [times(*left), times(*right)]
+    start, stop = overlap(streams)
+    for stream, aligned in zip(streams, by_time(streams, start, stop, fps), strict=True):
+        clock = [time_of(t, fps, start) for t in range(len(aligned.rows))]
+        assert clock[0] == start
+        assert -1 <= stop - clock[-1] < NANOSECONDS / fps + 1
+        for at, row in zip(clock, aligned.rows.tolist(), strict=True):
+            assert stream[row] <= at
+            assert row + 1 == len(stream) or stream[row + 1] > at
+        shown = len(set(aligned.rows.tolist()))
+        assert (aligned.repeated, aligned.dropped) == (len(clock) - shown, len(stream) - shown)
+
+
+def test_the_shortest_stream_ends_all_by_index() -> None:
+    one, two = by_index([times(1, 1), times(1, 1, 1, 1)])
+    assert one.rows.tolist() == two.rows.tolist() == [0, 1, 2]
+    assert (one.dropped, two.dropped, two.messages) == (0, 2, 5)
+
+
+def test_a_rate_is_another_from_a_hundredth_on() -> None:
+    images = times(*[20_000_000] * 9)
+    assert step_of(images) == 0.02
+    assert not of_other_rate(images, 50.4)
+    assert of_other_rate(images, 51)
+    assert not of_other_rate(images[:1], 51)
+    assert not of_other_rate(times(0, 0, 0), 51)  # they tell no rate
+
+
+def test_images_at_even_times_have_the_clock_of_a_source() -> None:
+    assert even_times(4, 29.97).tolist() == [time_of(t, 29.97, 0) for t in range(4)]
+
+
+def test_streams_differ_by_more_than_half_a_step() -> None:
+    first = times(*[20_000_000] * 9)
+    assert unlike(first, first + np.uint64(10_000_000)) == ""
+    assert unlike(first, first + np.uint64(10_000_001)) == "images at different times"
+    assert unlike(first, first[1:]) == "10 and 9 images"
+
+
+def test_no_rate_makes_frames_without_end() -> None:
+    with pytest.raises(UsageError, match="choose a lower one"):
+        by_time([times(10**18)], START, START + 10**18, 1e6)
+
+
+@pytest.mark.parametrize("wrong", [[-1, 5], [5, LAST_NS], [0, 2**64]])
+def test_times_beyond_any_clock_are_damage(wrong: list[int]) -> None:
+    with pytest.raises(LogDamagedError, match=r"left\.db3 has times beyond any clock"):
+        sorted_times("left.db3", wrong)
+    assert sorted_times("left.db3", [0, LAST_NS - 1]).tolist() == [0, LAST_NS - 1]
