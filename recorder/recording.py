@@ -231,7 +231,9 @@ def _identity(
         )
     if scene is None:
         stated = dict(source.describe())
-        return Identity(str(stated["kind"]), int(stated.get("seed") or 0), spec, {"source": stated})
+        seed = stated.get("seed")
+        known = seed if isinstance(seed, int) else 0
+        return Identity(str(stated["kind"]), known, spec, {"source": stated})
     clock = replace(settings, fps=spec.fps, start_ns=spec.start_ns)
     return Identity(
         scene.name,
@@ -291,12 +293,19 @@ def _as_begun(
     """
     begun = read_recording(folder)
     splits = begun.options["split"]
-    limit = min((splits[view] for view in views if view in splits), default="")
-    now = {"": identity.kind, "seed": identity.seed}
-    if limit and split is not None:
-        now["split"] = str(split)
-    replace(begun, options={**begun.options, "split": limit}).refuse_other(folder, now)
-    return split if split is not None or not limit else Split.parse(limit)
+    limit = min((splits[view] for view in views if view in splits), default=None)
+    kind, seed = identity.kind, identity.seed
+    for option, before, now in (
+        ("", "".join(begun.source) or kind, kind),
+        ("--seed ", begun.options.get("seed", seed), seed),
+        ("--split ", limit, limit if split is None else str(split)),
+    ):
+        if before not in (None, now):
+            raise UsageError(
+                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
+                "same, or overwrite with --force"
+            )
+    return split if split is not None or limit is None else Split.parse(limit)
 
 
 def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = False) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.errors import LogWriteError
 from recorder.log.manifest import (
     RECORDING,
     Manifest,
@@ -30,18 +30,6 @@ def test_paths_move_with_the_folder_and_other_words_stay(tmp_path: Path) -> None
 @pytest.mark.parametrize("values", [None, [], "x", {}, {"source": "icub"}, {"source": None}])
 def test_what_is_no_manifest_is_none(values: object) -> None:
     assert Manifest.from_json(values, Path()) is None
-
-
-def test_other_options_are_refused_and_unknown_ones_are_not_compared() -> None:
-    begun = Manifest(("icub",), {"seed": 7})
-    begun.refuse_other(Path("rec"), {"": "icub", "seed": 7, "split": "5s"})
-    Manifest().refuse_other(Path("rec"), {"": "icub", "seed": 7})
-    for now, words in (
-        ({"": "oscillatory"}, "rec was begun with icub, not oscillatory"),
-        ({"seed": 8}, "begun with --seed 7, not --seed 8: .*--force"),
-    ):
-        with pytest.raises(UsageError, match=words):
-            begun.refuse_other(Path("rec"), now)
 
 
 def test_a_recording_keeps_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:

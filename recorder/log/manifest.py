@@ -22,7 +22,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import UsageError
 from recorder.log.whole import whole
 
 RECORDING = "recording.json"
@@ -60,26 +59,6 @@ class Manifest:
             return None
         options = {str(name): value for name, value in values.items() if name != "source"}
         return cls(tuple(found_path(str(word), folder) for word in values["source"]), options)
-
-    def refuse_other(self, folder: Path, now: Mapping[str, Any]) -> None:
-        """Refuse to resume what was begun with other options.
-
-        Args:
-            folder: what is resumed.
-            now: option and value; "" is the source. Options that nobody knows are not compared.
-
-        Raises:
-            UsageError: at the first that differs.
-        """
-        known = {"": " ".join(self.source), **self.options}
-        for option, value in now.items():
-            before = known.get(option, value)
-            if before not in ("", value):
-                name = f"--{option} " if option else ""
-                raise UsageError(
-                    f"{folder} was begun with {name}{before}, not {name}{value}: go on with the "
-                    "same, or overwrite with --force"
-                )
 
 
 def kept_path(word: str, folder: Path, names: Collection[str] = ()) -> str:

@@ -6,9 +6,9 @@ where an object is at frame t depends on the seed and t alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,69 +24,38 @@ _WORLD = 0x1C0B
 Float = NDArray[np.float64]
 
 
-class Motion(Protocol):
-    """Positions of one object, chunk after chunk."""
-
-    def draw(self) -> Float:
-        """The next CHUNK positions, (CHUNK, 2)."""
+Motion = Iterator[Float]
+"""Positions of one object, (CHUNK, 2), chunk after chunk."""
 
 
-class Toggling:
-    """x uniform and independent; y one of two places, changing every so many frames."""
-
-    def __init__(self, config: BoxConfig, generator: np.random.Generator) -> None:
-        self._config = config
-        self._generator = generator
-        self._t = 0
-
-    def draw(self) -> Float:
-        """See `Motion.draw`."""
-        x = _uniform(self._generator.random(CHUNK), self._config.x)
-        phase = (self._t + np.arange(CHUNK)) // self._config.toggle_every % 2
-        self._t += CHUNK
-        return np.stack([x, np.asarray(self._config.y)[phase]], axis=1)
+def toggling(config: BoxConfig, generator: np.random.Generator) -> Motion:
+    """X uniform and independent; y one of two places, changing every so many frames."""
+    for t in itertools.count(0, CHUNK):
+        x = _uniform(generator.random(CHUNK), config.x)
+        phase = (t + np.arange(CHUNK)) // config.toggle_every % 2
+        yield np.stack([x, np.asarray(config.y)[phase]], axis=1)
 
 
-class Uniform:
-    """x and y uniform and independent of the frame before."""
-
-    def __init__(self, config: CylinderConfig, generator: np.random.Generator) -> None:
-        self._config = config
-        self._generator = generator
-
-    def draw(self) -> Float:
-        """See `Motion.draw`."""
-        units = self._generator.random((CHUNK, 2))
-        return np.stack(
-            [_uniform(units[:, 0], self._config.x), _uniform(units[:, 1], self._config.y)], axis=1
-        )
+def uniform(config: CylinderConfig, generator: np.random.Generator) -> Motion:
+    """X and y uniform and independent of the frame before."""
+    while True:
+        units = generator.random((CHUNK, 2))
+        yield np.stack([_uniform(units[:, 0], config.x), _uniform(units[:, 1], config.y)], axis=1)
 
 
-class Walk:
+def walk(config: SphereConfig, generator: np.random.Generator) -> Motion:
     """A Gaussian random walk, reflected at the borders; starts anywhere within them."""
-
-    def __init__(self, config: SphereConfig, generator: np.random.Generator) -> None:
-        self._limits = (config.x, config.y)
-        self._steps = np.array([config.step_x, config.step_y])
-        self._generator = generator
-        self._last = np.stack(
-            [_uniform(generator.random(1), limits) for limits in self._limits], axis=1
-        )
-        self._started = False
-
-    def draw(self) -> Float:
-        """See `Motion.draw`."""
-        steps = self._generator.standard_normal((CHUNK, 2)) * self._steps
-        if not self._started:
+    borders = (config.x, config.y)
+    last = np.stack([_uniform(generator.random(1), limits) for limits in borders], axis=1)
+    for chunk in itertools.count():
+        steps = generator.standard_normal((CHUNK, 2)) * (config.step_x, config.step_y)
+        if chunk == 0:
             steps[0] = 0.0
-            self._started = True
-        steps[0] += self._last[0]
+        steps[0] += last[0]
         free = np.cumsum(steps, axis=0)
-        path = np.stack(
-            [reflect(free[:, i], limits) for i, limits in enumerate(self._limits)], axis=1
-        )
-        self._last = path[-1:]
-        return path
+        path = np.stack([reflect(free[:, i], limits) for i, limits in enumerate(borders)], axis=1)
+        last = path[-1:]
+        yield path
 
 
 def reflect(values: Float, limits: Range) -> Float:
@@ -108,9 +77,9 @@ class Motions:
 
     def __init__(self, scene: IcubConfig, seed: int) -> None:
         self._makers: list[Callable[[np.random.Generator], Motion]] = [
-            partial(Toggling, scene.object1),
-            partial(Uniform, scene.object2),
-            partial(Walk, scene.object3),
+            partial(toggling, scene.object1),
+            partial(uniform, scene.object2),
+            partial(walk, scene.object3),
         ]
         self._seed = seed
         self._restart()
@@ -160,7 +129,7 @@ class Motions:
         self._chunk = -1
 
     def _next_chunk(self) -> None:
-        self._positions = np.stack([motion.draw() for motion in self._motions], axis=1)
+        self._positions = np.stack([next(motion) for motion in self._motions], axis=1)
         self._chunk += 1
 
     def _generator_seed(self, index: int) -> np.random.SeedSequence:
