@@ -5,9 +5,11 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "cdmisfa.experiments.loop": "Digest learn",
-        "cdmisfa.experiments.runs": "RunResult run",
-        "cdmisfa.experiments.sources": "open_source",
+        "cdmisfa.experiments.loop": "ENDINGS Digest learn",
+        "cdmisfa.experiments.results": "PointResult",
+        "cdmisfa.experiments.runs": "RunExhaustedError RunResult run",
+        "cdmisfa.experiments.sources": "CameraOptions Configuration configure open_source",
+        "cdmisfa.experiments.store": "TrialStore",
         "cdmisfa.experiments.sweep": "SweepReport Trial",
         "cdmisfa.experiments.trial": "run_trial",
     },
