@@ -19,6 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.processes import Workers
+from cdmisfa.core.registry import did_you_mean
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -98,7 +99,7 @@ def run_all(
         EngineError: nobody answers at the scheduler's address, or it went away.
     """
     if engine not in ENGINES:
-        raise UsageError(f"no engine {engine!r}: there are {', '.join(ENGINES)}")
+        raise UsageError(f"no engine {engine!r}: {did_you_mean(engine, ENGINES)}")
     if scheduler is not None and engine == "local":
         raise UsageError(f"--scheduler {scheduler} needs --engine dask")
     if not tasks:

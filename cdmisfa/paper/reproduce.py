@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
+from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.manifest import versions, write_json
 from cdmisfa.experiments.statistics import Summary
@@ -142,7 +143,7 @@ def experiment(name: str) -> Experiment:
         UsageError: there is none of this name.
     """
     if name not in NAMES:
-        raise UsageError(f"no experiment {name!r}: there are {', '.join(NAMES)}, all")
+        raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*NAMES, 'all'))}")
     return cast(Experiment, importlib.import_module(f"cdmisfa.paper.{name}"))
 
 
