@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.blocks import FrameSource, HeadPose, SourceSpec
+from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
 from recorder.config import RecordConfig, SceneConfig
@@ -125,7 +125,12 @@ def record(
     if not resume:
         refuse_existing(folder, force=force)
     identity = _identity(source, names, settings, scene)
-    chosen = _chosen(identity.spec, views)
+    streams = identity.spec.streams
+    for view in views or ():
+        if view not in streams:
+            what = "source" if scene is None else "scene"
+            raise UsageError(f"no view {view!r}: the {what} has {', '.join(streams)}")
+    chosen = [name for name in streams if not views or name in views]
     with ExitStack() as open_logs:
         open_logs.enter_context(cleared(folder, chosen if force else ()))
         places = dict.fromkeys(chosen, Resume())
@@ -138,7 +143,7 @@ def record(
                 for view, there in earlier.items()
             }
         frames = frames or length or DEFAULT_FRAMES
-        poses = _poses(source, identity.spec)
+        poses = dict(zip(streams, getattr(source, "head_poses", ()), strict=False))
         logs = [
             ViewParts(
                 folder, view, identity, settings, split=split, pose=poses.get(view), resume=place
@@ -242,18 +247,6 @@ def _identity(
         {"scene": scene.table(), "record": as_table(clock)},
         SCENES[scene.name].packages,
     )
-
-
-def _chosen(spec: SourceSpec, views: Sequence[str] | None) -> list[str]:
-    for view in views or ():
-        if view not in spec.streams:
-            raise UsageError(f"no view {view!r}: the scene has {', '.join(spec.streams)}")
-    return [name for name in spec.streams if not views or name in views]
-
-
-def _poses(source: FrameSource, spec: SourceSpec) -> dict[str, HeadPose]:
-    poses: Sequence[HeadPose] = getattr(source, "head_poses", ())
-    return dict(zip(spec.streams, poses, strict=False))
 
 
 def _length(

@@ -1,5 +1,6 @@
 """The iCub scene: the contract of a source, what is seen where, and a silent simulator."""
 
+import contextlib
 import dataclasses
 import subprocess
 import sys
@@ -101,7 +102,7 @@ def test_drawing_over_the_table_is_drawing_the_table(seen):
     eyes, motions = SCENE.eyes, Motions(SCENE, 1)
     lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
     differing = 0
-    with World(SCENE) as world:
+    with contextlib.closing(World(SCENE)) as world:
         for t, places in enumerate(motions.take(30)):
             world.place(places)
             for view, yaw in enumerate(eyes.yaw):
@@ -116,7 +117,7 @@ def test_drawing_over_the_table_is_drawing_the_table(seen):
 def test_the_robot_does_not_see_itself(seen):
     eyes = SCENE.eyes
     lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
-    with World(SCENE, robot_seen=True) as world:
+    with contextlib.closing(World(SCENE, robot_seen=True)) as world:
         world.place(Motions(SCENE, 1).take(1)[0])
         for view, yaw in enumerate(eyes.yaw):
             world.turn_head(yaw)

@@ -9,7 +9,8 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.messages import (
     ImageEncoder,
     Payload,
@@ -20,6 +21,7 @@ from recorder.log.messages import (
     truth_tags,
     vector_payload,
 )
+from recorder.log.viewfacts import Identity, ViewFacts
 
 TIMES = st.integers(0, 2**62)
 DOUBLES = st.lists(st.floats(), min_size=1, max_size=20)
@@ -92,3 +94,25 @@ def test_poses():
 def test_names_that_protobuf_does_not_have_are_refused(names):
     with pytest.raises(UsageError, match="ground truth"):
         TruthEncoder(names)
+
+
+@given(
+    shape=st.one_of(
+        st.tuples(st.integers(1, 99)), st.tuples(st.integers(1, 99), st.integers(1, 99))
+    ),
+    fps=st.one_of(st.floats(1e-3, 1e6), st.integers(1, 1000)),
+    truth=st.lists(st.sampled_from(["x", "y", "angle"]), unique=True),
+    first=st.integers(0, 2**33),
+)
+def test_what_a_file_states_is_read_as_it_was_written(
+    shape: tuple[int, ...], fps: float, truth: list[str], first: int
+) -> None:
+    dtype = "uint8" if len(shape) == 2 else "float64"
+    spec = SourceSpec(("left", "right"), shape, dtype, tuple(truth), fps, 10**18)
+    facts = Identity("icub", 3, spec, {"scene": {}}, ("numba",)).facts("right", first)
+    values = facts.as_metadata()
+    assert list(values)[:4] == ["schema", "scene", "view", "stream_index"]
+    assert ViewFacts.from_metadata("x.mcap", values) == facts
+    for key in ("view", "stream_index", "frame_shape", "dtype", "fps", "start_ns"):
+        with pytest.raises(LogDamagedError, match=rf"x\.mcap: its recording metadata .* {key}"):
+            ViewFacts.from_metadata("x.mcap", {k: v for k, v in values.items() if k != key})

@@ -50,7 +50,7 @@ class ViewFacts:
         first_frame: number of the file's first frame.
         seed: of the scene's motions.
         config_sha256: checksum of the configuration that is attached.
-        versions: of packages that the bytes may depend on.
+        versions: of packages that the bytes may depend on, each a key, too.
         values: the record as it stands in the file, where it was read from one.
     """
 
@@ -81,8 +81,7 @@ class ViewFacts:
         """The file's metadata record."""
         names = [f.name for f in dataclasses.fields(self) if f.name not in ("versions", "values")]
         stated = {name: _text(getattr(self, name)) for name in names}
-        versions = {f"{_VERSION}{name}": version for name, version in self.versions.items()}
-        return {"schema": str(SCHEMA_VERSION), **stated, **versions}
+        return {"schema": str(SCHEMA_VERSION), **stated, **self.versions}
 
     @classmethod
     def from_metadata(cls, path: object, values: Mapping[str, str]) -> ViewFacts:
@@ -143,11 +142,7 @@ class ViewFacts:
             first_frame=number("first_frame", 0, MAX_FRAMES, "0"),
             seed=values.get("seed", ""),
             config_sha256=values.get("config_sha256", ""),
-            versions={
-                key.removeprefix(_VERSION): value
-                for key, value in values.items()
-                if key.startswith(_VERSION)
-            },
+            versions={key: v for key, v in values.items() if key.startswith(_VERSION)},
             values=dict(values),
         )
 
@@ -190,7 +185,7 @@ class Identity:
             first_frame=first_frame,
             seed=str(self.seed),
             config_sha256=hashlib.sha256(self.config_json()).hexdigest(),
-            versions={name: version(name) for name in (*PACKAGES, *self.packages)},
+            versions={_VERSION + name: version(name) for name in (*PACKAGES, *self.packages)},
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -34,7 +35,7 @@ def scene_picture(scene: IcubConfig) -> Image.Image:
         CdmisfaError: the simulator is not installed.
     """
     width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
-    with World(scene, robot_seen=True) as world:
+    with contextlib.closing(World(scene, robot_seen=True)) as world:
         _furnish(world, scene)
         world.place(Motions(scene, scene.seed or 0).take(1)[0])
         world.turn_head(scene.eyes.yaw[len(scene.eyes.yaw) // 2])

@@ -12,8 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,17 +145,6 @@ class World:
         if self._client >= 0:
             self._bullet.disconnect(physicsClientId=self._client)
             self._client = -1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _build(self, scene: IcubConfig, path: str, robot_seen: bool) -> None:
         bullet, client = self._bullet, self._client
