@@ -10,7 +10,7 @@ import contextlib
 import platform
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,7 +54,6 @@ class RunResult:
         modules: what was learned, in order.
         summary: what else the learner says of itself.
         ended: why, a key of `ENDINGS`.
-        truth: names of what the world knows.
     """
 
     run: str | None
@@ -67,7 +66,6 @@ class RunResult:
     modules: tuple[Module, ...]
     summary: Mapping[str, Any]
     ended: str
-    truth: tuple[str, ...] = field(default=())
 
     def as_json(self) -> dict[str, Any]:
         """The result as `learn --json` prints it."""
@@ -203,7 +201,6 @@ def run(
             modules=tuple(learner.modules),
             summary=learner.summary(),
             ended=ended,
-            truth=source.spec.truth,
         )
         if folder is not None:
             _write_run(folder, result, tables, begun, rerun=rerun)

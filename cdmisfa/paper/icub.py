@@ -12,13 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import LogExhaustedError
-from cdmisfa.experiments.statistics import correlation, summary, wilson
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.loop import learn
+from cdmisfa.experiments.statistics import correlation, summary
 from cdmisfa.paper import panels
-from cdmisfa.paper.oscillatory import summary_of
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Request, Settings, Trial
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Request, Settings, Trial, share
 
 TITLE = "Curiosity-driven, vision-enabled iCub"
 
@@ -100,46 +103,59 @@ def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         return watch(source, learner_config(), settings["seed"], ITERATIONS)
 
 
+class Curves(Sink):
+    """Keeps what the figures show: some signals, and each module's last outputs.
+
+    Attributes:
+        arrays: by name; of module i its outputs yi, and of its object the truthi.
+        encoded: of each module the correlation with its object.
+    """
+
+    def __init__(self, tau: int, truth: Sequence[str]) -> None:
+        self.arrays: dict[str, NDArray[Any]] = {}
+        self.encoded: list[float] = []
+        self._truth = truth
+        self._curves: dict[str, list[NDArray[Any]]] = {"eta_dot": [], "Q": [], "policy": []}
+        self._recent: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=-(-SHOWN // tau))
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        for name, values in self._curves.items():
+            values.append(np.asarray(getattr(signals, name), dtype=np.float32))
+        if signals.novel:
+            self._recent.append((signals.y[:, 0], block.truth))
+        if signals.saved:
+            number = len(learner.modules)
+            y, truth = (np.concatenate(r)[-SHOWN:] for r in zip(*self._recent, strict=True))
+            self.arrays[f"y{number}"] = y
+            if number <= len(OBJECTS) and OBJECTS[number - 1] in self._truth:
+                column = truth[:, self._truth.index(OBJECTS[number - 1])]
+                self.arrays[f"truth{number}"] = column
+                self.encoded.append(correlation(y, column))
+            self._recent.clear()
+
+    def finish(self) -> None:
+        """See `Sink`."""
+        self.arrays |= {name: np.stack(values) for name, values in self._curves.items()}
+
+
 def watch(
     source: FrameSource, config: LearnerConfig, seed: int, iterations: int
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Learn from a source, and keep the curves and each module's last outputs."""
-    from cdmisfa.agents.learner import CuriousLearner
-
-    learner = CuriousLearner(config, source.spec, seed)
-    curves: dict[str, list[NDArray[Any]]] = {"eta_dot": [], "Q": [], "policy": []}
-    recent: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=-(-SHOWN // config.tau))
-    arrays: dict[str, NDArray[Any]] = {}
-    encoded: list[float] = []
-    while learner.iteration < iterations:
-        try:
-            block = source.take(learner.stream, learner.tau)
-        except LogExhaustedError:
-            break
-        signals = learner.step(block)
-        for name, values in curves.items():
-            values.append(np.asarray(getattr(signals, name), dtype=np.float32))
-        if signals.novel:
-            recent.append((signals.y[:, 0], block.truth))
-        if signals.saved:
-            number = len(learner.modules)
-            y = np.concatenate([r[0] for r in recent])[-SHOWN:]
-            truth = np.concatenate([r[1] for r in recent])[-SHOWN:]
-            arrays[f"y{number}"] = y
-            if number <= len(OBJECTS) and OBJECTS[number - 1] in source.spec.truth:
-                column = truth[:, source.spec.truth.index(OBJECTS[number - 1])]
-                arrays[f"truth{number}"] = column
-                encoded.append(correlation(y, column))
-            recent.clear()
+    learner = open_learner(config, source.spec, seed)
+    curves = Curves(learner.tau, source.spec.truth)
+    with contextlib.suppress(LogExhaustedError):
+        learn(source, learner, (curves,), max_iterations=iterations, max_modules=iterations)
     modules = learner.modules
     row = {
         "streams": [m.stream for m in modules],
         "policies": ["".join(map(str, m.policy.tolist())) for m in modules],
         "saved_at": [m.iteration for m in modules],
-        "correlation": encoded,
+        "correlation": curves.encoded,
         "iterations": learner.iteration,
     }
-    return row, {**arrays, **{name: np.stack(values) for name, values in curves.items()}}
+    return row, curves.arrays
 
 
 def evaluate(trials: Sequence[Trial]) -> Findings:
@@ -149,13 +165,8 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     good = sum(f[:2] == OPTIMAL for f in found)
     ended = sum(len(f) == 2 for f in found)
     lines = [
-        Line(
-            "trials with both modules and policies optimal",
-            "10 of 10",
-            summary_of(good, n),
-            wilson(good, n),
-        ),
-        Line("trials without a third module", "10 of 10", summary_of(ended, n), wilson(ended, n)),
+        share("trials with both modules and policies optimal", "10 of 10", good, n),
+        share("trials without a third module", "10 of 10", ended, n),
         Line("iterations in all", "-", summary([t.row["iterations"] for t in trials]), digits=0),
     ]
     for i, name in enumerate(OBJECTS):

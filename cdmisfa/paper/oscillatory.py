@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.statistics import summary, wilson
+from cdmisfa.experiments.statistics import summary
 from cdmisfa.features.slowness import instantaneous_slowness
 from cdmisfa.paper import panels
-from cdmisfa.paper.reproduce import Arrays, Claim, Findings, Line, Request, Settings, Trial
+from cdmisfa.paper.reproduce import Arrays, Claim, Findings, Line, Request, Settings, Trial, share
 from recorder.world.oscillatory import one_period
 
 TITLE = "Oscillatory streams"
@@ -76,12 +76,7 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     """Every trial must learn x1, x2, x3 in this order with the optimal policies."""
     good, n = sum(bool(t.row["optimal"]) for t in trials), len(trials)
     lines = [
-        Line(
-            "trials with order and policies optimal",
-            "20 of 20",
-            summary_of(good, n),
-            wilson(good, n),
-        ),
+        share("trials with order and policies optimal", "20 of 20", good, n),
         Line(
             "iterations until the third module",
             "-",
@@ -107,11 +102,6 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
         f"{good} of {n} trials",
     )
     return Findings(lines, [claim])
-
-
-def summary_of(good: int, n: int) -> Any:
-    """A proportion as a summary of zeros and ones."""
-    return summary([1.0] * good + [0.0] * (n - good))
 
 
 def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:

@@ -24,7 +24,7 @@ from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.manifest import versions, write_json
-from cdmisfa.experiments.statistics import Summary
+from cdmisfa.experiments.statistics import Summary, summary, wilson
 from cdmisfa.experiments.store import DONE, TrialStore, code, identity
 from recorder.log.whole import whole
 
@@ -95,6 +95,11 @@ class Line:
     ours: Summary
     interval: tuple[float, float] | None = None
     digits: int = 3
+
+
+def share(quantity: str, paper: str, good: int, n: int) -> Line:
+    """The line about how many of n trials did what is named."""
+    return Line(quantity, paper, summary([1.0] * good + [0.0] * (n - good)), wilson(good, n))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.experiments.statistics import summary, wilson
+from cdmisfa.experiments.statistics import summary
 from cdmisfa.paper import panels
-from cdmisfa.paper.oscillatory import learner_config, summary_of
-from cdmisfa.paper.reproduce import Arrays, Claim, Findings, Line, Request, Settings, Trial
+from cdmisfa.paper.oscillatory import learner_config
+from cdmisfa.paper.reproduce import Arrays, Claim, Findings, Line, Request, Settings, Trial, share
 
 TITLE = "CD-MISFA 1.0 against 2.0"
 
@@ -64,22 +64,10 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     first = [t for t in trials if t.settings["algorithm"] == "2.0"]
     optimal = sum(t.row["after"] == "011" for t in first)
     lines = [
-        Line(
-            "2.0: trials without a change of policy",
-            "all",
-            summary_of(stable, n),
-            wilson(stable, n),
-        ),
-        Line(
-            "1.0: trials with a change of policy",
-            "all",
-            summary_of(unstable, n),
-            wilson(unstable, n),
-        ),
+        share("2.0: trials without a change of policy", "all", stable, n),
+        share("1.0: trials with a change of policy", "all", unstable, n),
         Line("1.0: changes of policy after epsilon = 0", ">= 1", summary(changes["1.0"]), digits=1),
-        Line(
-            "2.0: trials that end with [0,1,1]", "all", summary_of(optimal, n), wilson(optimal, n)
-        ),
+        share("2.0: trials that end with [0,1,1]", "all", optimal, n),
     ]
     claims = [
         Claim("2.0 keeps its policy after epsilon = 0", stable == n, f"{stable} of {n} trials"),
