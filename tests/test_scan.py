@@ -25,7 +25,7 @@ from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
 
 FRAMES = 200
-NOTHING = np.empty(0, np.uint8)
+BUFFER = np.empty(1 << 20, np.uint8)
 PICTURES = SourceSpec(("left",), (6, 8), "uint8", ("x", "y"), 50.0, 10**18)
 
 
@@ -81,7 +81,7 @@ def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
 def test_the_compiled_way_is_the_one_taken(pictures: dict[str, Path]) -> None:
     view = ViewFile(pictures["zstd"])
     scanner = ChunkScanner(view.reader, view._layouts)
-    taken = [scanner.scanned(s, NOTHING) is not None for s in view.reader.segments]
+    taken = [scanner.scanned(s, BUFFER) is not None for s in view.reader.segments]
     # The first chunk also defines the channels, and is left to the tables.
     assert taken == [False, True, True, True]
     view.close()
@@ -187,10 +187,10 @@ def test_a_flipped_bit_is_found(pictures: dict[str, Path], tmp_path: Path) -> No
     path.write_bytes(broken)
     view = ViewFile(path, salvage=True)
     scanner = ChunkScanner(view.reader, view._layouts)
-    assert scanner.scanned(view.reader.segments[2], NOTHING) is None
+    assert scanner.scanned(view.reader.segments[2], BUFFER) is None
     with pytest.raises(LogDamagedError, match="is damaged"):
         scanner.chunk(view.reader.segments[2])
-    assert scanner.scanned(view.reader.segments[1], NOTHING) is not None
+    assert scanner.scanned(view.reader.segments[1], BUFFER) is not None
     view.close()
 
 

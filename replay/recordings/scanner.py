@@ -102,6 +102,7 @@ class ChunkScanner:
             self._places[c, : len(layout.marks)] = layout.places
             self._marks[c, : len(layout.marks)] = layout.marks
         self._kept: OrderedDict[int, ScannedChunk] = OrderedDict()
+        self._tabled: set[int] = set()
 
     def chunk(self, segment: Segment) -> ScannedChunk:
         """Decode and check a chunk.
@@ -116,7 +117,11 @@ class ChunkScanner:
             buffer = np.empty(0, np.uint8)
             if len(self._kept) >= _KEPT:
                 buffer = self._kept.popitem(last=False)[1].buffer
-            self._kept[key] = self.scanned(segment, buffer) or self.tabled(segment)
+            found = None if key in self._tabled else self.scanned(segment, buffer)
+            if found is None:
+                found = self.tabled(segment, buffer)
+                self._tabled.add(key)
+            self._kept[key] = found
         return self._kept[key]
 
     def copy(self, chunk: ScannedChunk, which: int, low: int, out: NDArray[Any]) -> None:
@@ -126,7 +131,7 @@ class ChunkScanner:
         self._kernels.gather(chunk.buffer, ends, layout.distances, layout.width, out)
 
     def scanned(self, segment: Segment, buffer: Bytes) -> ScannedChunk | None:
-        """Decode a chunk into a buffer, where it is large enough, by compiled code.
+        """Decode a chunk by compiled code, into a buffer where it is large enough.
 
         Returns:
             None where the chunk is not in order, or not written as our recorder does it.
@@ -134,14 +139,13 @@ class ChunkScanner:
         size, counts = segment.size, segment.channel_counts()
         if counts is None or segment.cut or not segment.indexes or not 0 < size <= MAX_CHUNK:
             return None
-        if len(buffer) < size:
-            buffer = np.empty(size + size // 8, np.uint8)
+        buffer = _fitting(buffer, size)
         data = buffer[:size]
         try:
             index = self._reader.unpack(segment, data)
         except MalformedRecord:
             return None
-        wanted = [counts.get(int(channel), 0) for channel in self._channels]
+        wanted = [counts.get(layout.channel.id, 0) for layout in self._layouts]
         ends = np.empty((len(wanted), max(wanted)), np.int64)
         if max(segment.start, segment.end) >= 2**63 or not self._kernels.scan(
             data,
@@ -158,8 +162,8 @@ class ChunkScanner:
             return None
         return ScannedChunk(buffer, ends)
 
-    def tabled(self, segment: Segment) -> ScannedChunk:
-        """Decode a chunk by its tables.
+    def tabled(self, segment: Segment, buffer: Bytes) -> ScannedChunk:
+        """Decode a chunk by its tables, into a buffer where it is large enough.
 
         Raises:
             LogDamagedError: it is damaged, or a message of the view is not laid out like others.
@@ -168,4 +172,12 @@ class ChunkScanner:
         ends = np.zeros((len(tables), max(map(len, tables))), np.int64)
         for which, (layout, table) in enumerate(zip(self._layouts, tables, strict=True)):
             ends[which, : len(table)] = layout.checked_ends(self._reader.path, segment, table)
-        return ScannedChunk(tables[0].data.copy(), ends)
+        data = tables[0].data
+        buffer = _fitting(buffer, len(data))
+        buffer[: len(data)] = data
+        return ScannedChunk(buffer, ends)
+
+
+def _fitting(buffer: Bytes, size: int) -> Bytes:
+    """A buffer where it is large enough, or else a new one with room for chunks that follow."""
+    return buffer if len(buffer) >= size else np.empty(size + size // 8, np.uint8)

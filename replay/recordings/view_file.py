@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +123,7 @@ class ViewFile:
         count, channels = len(frames), enumerate(self._channels)
         pieces = [piece for c, rows in channels for piece in rows.pieces(start, count, c)]
         # In the order of the file, so that each chunk is decoded once.
-        pieces.sort(key=lambda piece: piece.segment.offset)
+        pieces.sort(key=operator.attrgetter("segment.offset"))
         for piece in pieces:
             chunk = self._scanner.chunk(piece.segment)
             out = outs[piece.which][piece.at : piece.at + piece.n]
