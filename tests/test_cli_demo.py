@@ -5,21 +5,10 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import Cdmisfa
 
-from cdmisfa.paper.demo import correlations
-
 HAS_SIMULATOR = importlib.util.find_spec("pybullet") is not None
-
-
-def test_correlations_have_known_answers() -> None:
-    t = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
-    truth = np.stack([np.cos(t), -3 * np.sin(t) + 7, np.full(1000, 4.0), t], axis=1)
-    r = correlations(2 * np.sin(t) + 5, truth)
-    assert r[:3] == pytest.approx([0, 1, 0], abs=1e-12)
-    assert r[3] == pytest.approx(abs(np.corrcoef(np.sin(t), t)[0, 1]))
 
 
 @pytest.mark.skipif(not HAS_SIMULATOR, reason="PyBullet is missing: pip install pybullet")

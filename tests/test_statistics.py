@@ -89,3 +89,11 @@ def test_correlation_ignores_sign_and_survives_a_constant() -> None:
     a = np.arange(10.0)
     assert statistics.correlation(a, 3 - 2 * a) == pytest.approx(1.0)
     assert statistics.correlation(a, np.ones(10)) == 0.0
+
+
+def test_correlation_has_known_answers() -> None:
+    t = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    truth = np.stack([np.cos(t), -3 * np.sin(t) + 7, np.full(1000, 4.0), t], axis=1)
+    r = [statistics.correlation(2 * np.sin(t) + 5, column) for column in truth.T]
+    assert r[:3] == pytest.approx([0, 1, 0], abs=1e-12)
+    assert r[3] == pytest.approx(abs(np.corrcoef(np.sin(t), t)[0, 1]))

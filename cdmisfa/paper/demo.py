@@ -19,6 +19,7 @@ from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.runs import RunResult, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source
+from cdmisfa.experiments.statistics import correlation
 
 SCENE = "icub"
 MODULES = 2
@@ -183,7 +184,7 @@ def _check(
 def _score(module: Module, source: SeekableSource) -> Learned:
     """Find the true quantity that a module's first output follows best."""
     y, truth = _outputs(module, source)
-    r = correlations(y[:, 0], truth)
+    r = [correlation(y[:, 0], column) for column in truth.T]
     best = int(np.argmax(r))
     return Learned(
         module.index,
@@ -191,7 +192,7 @@ def _score(module: Module, source: SeekableSource) -> Learned:
         tuple(("stay", "switch")[action] for action in module.policy),
         module.iteration,
         source.spec.truth[best],
-        float(r[best]),
+        r[best],
     )
 
 
@@ -205,10 +206,3 @@ def _outputs(
     block = source.take(module.stream, SCORED_FRAMES)
     y = project(module.phi, module.phi @ module.mean, block.frames.reshape(len(block), -1))
     return y, block.truth
-
-
-def correlations(y: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Absolute Pearson correlation of y (n,) with each column of truth (n, D); 0 if constant."""
-    y, truth = y - y.mean(), truth - truth.mean(axis=0)
-    norm = np.sqrt((y @ y) * (truth * truth).sum(axis=0))
-    return np.abs(y @ truth) / np.where(norm > 0, norm, np.inf)
