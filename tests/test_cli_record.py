@@ -9,11 +9,14 @@ import time
 from pathlib import Path
 
 import pytest
+from camera_files import write_cameras
 from conftest import Cdmisfa
 
+from cdmisfa.experiments.convert import convert
 from recorder.log.split import Split
-from recorder.recording import record_scene
+from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
+from replay.camera_logs.source import ForeignSource
 
 PNG = b"\x89PNG"
 
@@ -86,6 +89,20 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     assert contents[0] == contents[1]
     nothing = cdmisfa("record", "--resume", "-o", tmp_path / "new")
     assert (nothing.code, "name the SCENE" in nothing.err) == (2, True)
+
+
+def test_a_conversion_is_resumed_by_convert(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log, folder = tmp_path / "a.mcap", tmp_path / "rec"
+    write_cameras(log, {"/left": (200, 20)})
+    with pytest.raises(RecordingStoppedError):
+        convert(ForeignSource([log], size=(12, 16)), folder, stop=lambda: True)
+    for scene in ((), ("oscillatory",)):
+        refused = cdmisfa("record", *scene, "--resume", "-o", folder)
+        remedy = f"resume it with cdmisfa convert SOURCE -o {folder} --resume"
+        line = f"cdmisfa: {folder} is an unfinished conversion: {remedy}\n"
+        assert (refused.code, refused.err) == (2, line)
+    done = cdmisfa("convert", log, "-o", folder, "--resume", "--size", "16x12")
+    assert done.code == 0, done.err
 
 
 class TestScenePicture:

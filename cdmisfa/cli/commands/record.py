@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,6 +77,9 @@ def record_command(
     from recorder.world.scenes import SCENES
 
     begun = read_recording(out) if resume and out is not None else Manifest()
+    if begun.source == ("foreign",):  # the kind of camera logs
+        command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
+        raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
     scene = scene or "".join(begun.source)
     if not scene:
         where = f"{out} does not say of what it is: " if resume and out is not None else ""
