@@ -51,7 +51,7 @@ def test_a_run_without_iterations_or_modules_is_drawn(tmp_path):
 def test_the_history_is_that_of_the_log(tmp_path):
     records = write_run(tmp_path / "run.mcap", IMAGE, 30, saves=True)
     history = read_history(tmp_path / "run.mcap")
-    assert history.iterations == 30
+    assert history.outline.iterations == 30
     np.testing.assert_array_equal(history.stream, [s.stream for s in records])
     np.testing.assert_array_equal(history.eta_dot, [s.eta_dot for s in records])
     np.testing.assert_array_equal(history.stay_reward[:, 2], [s.R[2, 0, 2] for s in records])

@@ -26,7 +26,8 @@ def partial_path(path: Path) -> Path:
 def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
     """A path to write a file or a folder at, which takes its own name once it is complete.
 
-    What was there under that name is replaced. On an error what was written is removed.
+    Its folder is made; what was there under that name is replaced. On an error what was written
+    is removed.
 
     Args:
         path: the name.
@@ -42,6 +43,7 @@ def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
     partial = partial_path(path)
     try:
         _remove(partial)
+        partial.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         if sync and partial.is_file():
             with open(partial, "rb") as file:

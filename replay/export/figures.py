@@ -19,9 +19,6 @@ from replay.export.history import History, read_history
 from replay.palette import GREY, VERMILLION, Rgb, colour
 from replay.runs.folders import run_log
 
-FOLDER = "figures"
-"""Where the figures of a run go, within its folder."""
-
 INCHES = 7.0
 """Width of a figure."""
 
@@ -48,15 +45,12 @@ STYLE: dict[Any, Any] = {
 
 
 def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) -> list[Path]:
-    """Draw every figure of a run, as PNG and as SVG.
+    """Draw every figure of a run, as PNG and as SVG, and return their paths.
 
     Args:
         path: the run.
         out: folder of the figures; by default `figures` in the run's folder.
         force: replace existing figures.
-
-    Returns:
-        The files.
 
     Raises:
         UsageError: there is no such run, or a figure exists and `force` is not set.
@@ -64,42 +58,41 @@ def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) ->
         LogWriteError: a figure cannot be written.
     """
     log = run_log(path)
-    folder = Path(out) if out is not None else log.parent / FOLDER
+    folder = log.parent / "figures" if out is None else Path(out)
     history = read_history(log)
     files: list[Path] = []
     for name, draw in FIGURES.items():
-        targets = [folder / f"{name}.png", folder / f"{name}.svg"]
+        targets = [folder / f"{name}{ending}" for ending in (".png", ".svg")]
         for target in targets:
             if target.exists() and not force:
                 raise UsageError(f"{target} exists: choose another folder or say --force")
         with matplotlib.rc_context(STYLE):
-            figure = draw(history)
-            if figure is None:
-                continue
-            for target in targets:
-                _write(figure, target)
-                files.append(target)
+            if (figure := draw(history)) is not None:
+                for target in targets:
+                    _write(figure, target)
+                files += targets
     return files
 
 
 def convergence(history: History) -> Figure | None:
     """Slowness, its change against delta, and where modules were saved."""
-    if not history.iterations:
+    outline, delta = history.outline, history.outline.header.delta
+    if not outline.iterations:
         return None
-    figure, (top, bottom) = _panels(2, heights=(1.0, 1.4))
-    k = np.arange(history.iterations)
+    figure, (top, bottom) = _panels(1.0, 1.4)
+    k = np.arange(outline.iterations)
     for j in range(history.eta.shape[1]):
         label = f" of output {j + 1}" if history.eta.shape[1] > 1 else ""
         top.plot(k, history.eta[:, j], color=_css(colour(j)), label=f"η{label}")
         bottom.plot(k, history.eta_dot[:, j], color=_css(colour(j)), label=f"η̇{label}")
-    if history.delta is not None:
-        bottom.axhline(history.delta, color=_css(GREY), linestyle="--", label="δ")
+    if delta is not None:
+        bottom.axhline(delta, color=_css(GREY), linestyle="--", label="δ")
         settled = history.eta_dot[np.isfinite(history.eta_dot)]
         if settled.size:
-            bottom.set_ylim(0, max(2.5 * history.delta, float(np.percentile(settled, 95))))
-    for save in history.saved:
+            bottom.set_ylim(0, max(2.5 * delta, float(np.percentile(settled, 95))))
+    for save in outline.saved:
         bottom.plot(save.iteration, save.eta_dot[0], "D", color=_css(VERMILLION), markersize=5)
-        name = f"{save.module}: {history.streams[save.stream]}"
+        name = f"{save.module}: {outline.names()[save.stream]}"
         where = {"xy": (save.iteration, save.eta_dot[0]), "xytext": (-4, 8)}
         bottom.annotate(name, textcoords="offset points", ha="right", **where)
     top.set_ylabel("slowness η\n[cycles/frame]")
@@ -110,35 +103,34 @@ def convergence(history: History) -> Figure | None:
 
 def decision(history: History) -> Figure | None:
     """What was watched, what staying was worth, the policy, and exploration."""
-    if not history.iterations:
+    outline, names, shown = history.outline, history.outline.names(), history.shown
+    if not outline.iterations:
         return None
-    heights = (1.0, 1.2, 0.4 + 0.2 * len(history.shown), 0.6)
-    figure, (watched, reward, policy, epsilon) = _panels(4, heights=heights)
-    k = np.arange(history.iterations)
-    window = max(min(50, history.iterations // 4), 1)
-    for s in history.shown:
+    figure, (watched, reward, policy, epsilon) = _panels(1.0, 1.2, 0.4 + 0.2 * len(shown), 0.6)
+    k = np.arange(outline.iterations)
+    window = max(min(50, outline.iterations // 4), 1)
+    for s in shown:
         share = np.convolve(history.stream == s, np.ones(window) / window, mode="same")
-        watched.plot(k, share, color=_css(colour(s)), label=history.streams[s])
-    for row, s in enumerate(history.shown):
-        reward.plot(k, history.stay_reward[:, row], color=_css(colour(s)), label=history.streams[s])
+        watched.plot(k, share, color=_css(colour(s)), label=names[s])
+    for row, s in enumerate(shown):
+        reward.plot(k, history.stay_reward[:, row], color=_css(colour(s)), label=names[s])
         stays = history.policy[:, row] == 0
-        policy.fill_between(
-            k, row - 0.4, row + 0.4, where=stays, step="mid", color=_css(colour(s)), linewidth=0
-        )
+        lane = {"where": stays, "step": "mid", "linewidth": 0, "color": _css(colour(s))}
+        policy.fill_between(k, row - 0.4, row + 0.4, **lane)
     finite = history.stay_reward[np.isfinite(history.stay_reward)]
     if finite.size:
         low, high = np.percentile(finite, (0.5, 99.0))
         reward.set_ylim(low - 0.1 * (high - low) - 1e-12, high + 0.2 * (high - low) + 1e-12)
-    epsilon.plot(k, np.minimum(history.epsilon, 1.0), color=_css(GREY))
+    epsilon.plot(k, np.minimum(outline.lines["epsilon"], 1.0), color=_css(GREY))
     epsilon.set_ylim(0, 1.05)
     watched.set_ylabel(f"share of time\n({window} iterations)")
     reward.set_ylabel("R for staying")
-    policy.set_yticks(range(len(history.shown)), [history.streams[s] for s in history.shown])
+    policy.set_yticks(range(len(shown)), [names[s] for s in shown])
     policy.set_ylabel("policy: stay")
     policy.grid(False)
     epsilon.set_ylabel("random ε")
     for axes in (watched, reward, policy, epsilon):
-        for save in history.saved:
+        for save in outline.saved:
             axes.axvline(save.iteration, color=_css(VERMILLION), linewidth=0.8)
     _finish(epsilon, legends=(watched,))
     return figure
@@ -148,13 +140,14 @@ def modules(history: History) -> Figure | None:
     """Each module's output over time, and against what the world knows about its stream."""
     if not history.outputs:
         return None
+    spec = history.outline.header.spec
     figure = Figure(figsize=(INCHES, 1.7 * len(history.outputs)), layout="constrained")
     grid = figure.subplots(len(history.outputs), 2, squeeze=False, width_ratios=(2, 1))
     for (over_time, against), output in zip(grid, history.outputs, strict=True):
         shade = _css(colour(output.stream))
         shown = slice(-1000, None)
         over_time.plot(output.t[shown], output.y[shown], ".", color=shade, markersize=2)
-        over_time.set_ylabel(f"module {output.module}\n{history.streams[output.stream]}")
+        over_time.set_ylabel(f"module {output.module}\n{spec.streams[output.stream]}")
         best = output.best_truth()
         if best is None:
             against.set_axis_off()
@@ -166,7 +159,7 @@ def modules(history: History) -> Figure | None:
         if abs(correlation) >= FOLLOWS:
             line = np.linspace(truth.min(), truth.max(), 100)
             against.plot(line, polynomial_fit(truth, output.y)(line), color="black")
-        against.set_xlabel(history.truth[column])
+        against.set_xlabel(spec.truth[column])
         against.set_title(f"|r| = {abs(correlation):.2f}", fontsize=8)
     grid[-1][0].set_xlabel("frame t (its stream only)")
     grid[0][0].set_title("output y", fontsize=8)
@@ -185,22 +178,17 @@ def contact_sheet(history: History) -> Figure | None:
         images = [frame for _, frame, _ in strip.frames]
         height, width = images[0].shape
         gap = np.full((height, max(width // 16, 1)), 255, dtype=np.uint8)
-        above.imshow(
-            np.hstack([part for image in images for part in (image, gap)]),
-            cmap="gray",
-            vmin=0,
-            vmax=255,
-        )
+        row_of_images = np.hstack([part for image in images for part in (image, gap)])
+        above.imshow(row_of_images, cmap="gray", vmin=0, vmax=255)
         above.set_axis_off()
         step = width + gap.shape[1]
         centres = width / 2 + step * np.arange(len(images))
-        below.bar(
-            centres, [y for *_, y in strip.frames], width / 2, color=_css(colour(strip.stream))
-        )
+        heard = [y for *_, y in strip.frames]
+        below.bar(centres, heard, width / 2, color=_css(colour(strip.stream)))
         below.axhline(0, color="black", linewidth=0.5)
         below.set_xlim(0, step * len(images))
         below.set_xticks(centres, [f"t = {t}" for t, *_ in strip.frames], fontsize=6)
-        below.set_ylabel(f"module {strip.module}\non {history.streams[strip.stream]}")
+        below.set_ylabel(f"module {strip.module}\non {history.outline.names()[strip.stream]}")
     return figure
 
 
@@ -219,10 +207,9 @@ def polynomial_fit(x: Float, y: Float, degree: int = 3) -> np.polynomial.Polynom
     return np.polynomial.Polynomial.fit(x, y, max(degree, 0))
 
 
-def _panels(count: int, *, heights: tuple[float, ...]) -> tuple[Figure, list[Axes]]:
+def _panels(*heights: float) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(INCHES, 1.5 * sum(heights)), layout="constrained")
-    grid = figure.subplots(count, 1, sharex=True, height_ratios=heights)
-    return figure, list(grid)
+    return figure, list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
 
 
 def _finish(last: Axes, legends: tuple[Axes, ...] = ()) -> None:
@@ -231,17 +218,15 @@ def _finish(last: Axes, legends: tuple[Axes, ...] = ()) -> None:
         axes.legend(loc="upper right", ncols=4, fontsize=7)
 
 
-def _css(rgb: Rgb) -> tuple[float, float, float]:
-    red, green, blue = rgb
-    return red / 255, green / 255, blue / 255
+def _css(rgb: Rgb) -> tuple[float, ...]:
+    return tuple(part / 255 for part in rgb)
 
 
 def _write(figure: Figure, target: Path) -> None:
-    """Write one file, whole or not at all, the same bytes every time."""
+    """Write one file, the same bytes every time."""
     is_svg = target.suffix == ".svg"
     canvas: Any = FigureCanvasSVG(figure) if is_svg else FigureCanvasAgg(figure)
     with whole(target) as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
         if is_svg:
             canvas.print_svg(partial, metadata={"Date": None})
         else:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.runs.columns import SignalColumns, joined
+from replay.runs.columns import SignalColumns
 from replay.runs.log import TRUTH_TOPIC, WATCHED_TOPIC, RunHeader
-from replay.runs.outline import Saved, read_outline
+from replay.runs.outline import Outline, read_outline
 from replay.runs.stretches import Frames, read_columns, read_stretches
 
 Float = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Output:
 
     Attributes:
         module: its index, from 1.
-        stream: stream it was learned on.
+        stream: the one it was learned on.
         t: (n,) frames at which that stream was watched after the save.
         y: (n,) its first output there.
         truth: (n, D) what the world knows at these frames; D may be 0.
@@ -50,16 +50,12 @@ class Output:
 
     def best_truth(self) -> tuple[int, float] | None:
         """The column of truth that the output follows most, and its correlation."""
-        found: list[tuple[float, int, float]] = []
-        for column in range(self.truth.shape[1]):
-            values = self.truth[:, column]
-            if len(values) > 2 and np.std(values) > 0 and np.std(self.y) > 0:
-                r = float(np.corrcoef(values, self.y)[0, 1])
-                found.append((abs(r), column, r))
-        if not found:
-            return None
-        _, column, r = max(found)
-        return column, r
+        found = [
+            (column, float(np.corrcoef(values, self.y)[0, 1]))
+            for column, values in enumerate(self.truth.T)
+            if len(values) > 2 and np.std(values) > 0 and np.std(self.y) > 0
+        ]
+        return max(found, key=lambda one: (abs(one[1]), one[0]), default=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,34 +72,24 @@ class History:
     """What a run's figures are made of.
 
     Attributes:
-        streams: names of the streams.
-        truth: names of what the world knows.
-        delta: threshold of eta-dot.
-        saved: the saves.
+        outline: the run in short, of n iterations.
         shown: the streams that are drawn.
-        iterations: number of iterations, n.
         stream: (n,) stream watched.
         eta: (n, J) slowness.
         eta_dot: (n, J) its change.
         stay_reward: (n, shown) R(s, stay, s).
         policy: (n, shown) 0 stay, 1 switch.
-        epsilon: (n,).
         outputs: what the modules say about their streams.
         pictures: what they saw.
     """
 
-    streams: tuple[str, ...]
-    truth: tuple[str, ...]
-    delta: float | None
-    saved: tuple[Saved, ...]
+    outline: Outline
     shown: tuple[int, ...]
-    iterations: int
     stream: NDArray[np.int64]
     eta: Float
     eta_dot: Float
     stay_reward: Float
     policy: NDArray[np.int64]
-    epsilon: Float
     outputs: tuple[Output, ...]
     pictures: tuple[Strip, ...]
 
@@ -117,12 +103,14 @@ def read_history(path: Path) -> History:
     """
     outline = read_outline(path)
     header, n, shown = outline.header, outline.iterations, outline.streams(SHOWN)
-    policy = np.zeros((n, len(shown)), dtype=np.int64)
+    stream = np.empty(n, dtype=np.int64)
+    policy = np.empty((n, len(shown)), dtype=np.int64)
     stay = np.full((n, len(shown)), np.nan)
     heard = [_Heard(save.module, save.stream) for save in outline.saved[:SHOWN]]
     at = 0
     for columns in read_columns(path, header):
         rows = slice(at, at := at + len(columns))
+        stream[rows] = columns["stream"]
         policy[rows] = columns["policy"][:, shown]
         if columns["R"].size:
             stay[rows] = columns["R"][:, shown, 0, shown]
@@ -130,19 +118,16 @@ def read_history(path: Path) -> History:
             module.add(columns)
     truth = _truth(path, header) if header.spec.truth else None
     outputs = tuple(module.output(truth) for module in heard if module.blocks)
-    lines = joined(read_columns(path, header), ("stream", "eta", "eta_dot", "epsilon"))
     return History(
-        streams=outline.names(),
-        truth=header.spec.truth,
-        delta=outline.delta,
-        saved=outline.saved,
+        outline=outline,
         shown=tuple(shown),
-        iterations=n,
+        stream=stream,
+        eta=outline.lines["eta"].reshape(n, outline.outputs),
+        eta_dot=outline.lines["eta_dot"].reshape(n, outline.outputs),
         stay_reward=stay,
         policy=policy,
         outputs=outputs,
         pictures=_pictures(path, header, outputs) if header.spec.images else (),
-        **lines,
     )
 
 

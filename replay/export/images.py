@@ -6,10 +6,8 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec
@@ -21,21 +19,18 @@ PIECE = 1000
 PIECE_BYTES = 64 * 2**20
 """Most bytes of frames that are held at once, unless one frame has more."""
 
-
 _UNSAFE = re.compile(r"[^\w.-]|^\.")
 
 
 def pieces(source: RecordedSource, stream: int) -> Iterator[Block]:
     """Every frame of one view, in order.
 
-    Args:
-        source: a recording; its clock is moved.
-        stream: the view.
+    The source's clock is moved.
     """
     frame = math.prod(source.spec.frame_shape) * np.dtype(source.spec.dtype).itemsize
     size = max(1, min(PIECE, PIECE_BYTES // max(1, frame)))
-    first, end = source.first_frame, source.first_frame + source.frames
-    for t in range(first, end, size):
+    end = source.first_frame + source.frames
+    for t in range(source.first_frame, end, size):
         source.seek(t)
         yield source.take(stream, min(size, end - t))
 
@@ -53,18 +48,10 @@ def view_names(spec: SourceSpec) -> tuple[str, ...]:
 
 
 def write_images(source: RecordedSource, folder: Path) -> int:
-    """Write every frame of every view as VIEW/FRAME.png.
-
-    Returns:
-        How many images.
-    """
+    """Write every frame of every view as VIEW/FRAME.png, and return how many there are."""
     for stream, name in enumerate(view_names(source.spec)):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+        (folder / name).mkdir()
         for block in pieces(source, stream):
             for i, frame in enumerate(block.frames):
-                _save(frame, folder / name / f"{block.t + i:08d}.png")
+                Image.fromarray(frame).save(folder / name / f"{block.t + i:08d}.png")
     return source.frames * len(source.spec.streams)
-
-
-def _save(frame: NDArray[Any], file: Path) -> None:
-    Image.fromarray(frame).save(file)

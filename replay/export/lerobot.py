@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from replay.export.images import pieces, view_names
-from replay.export.videos import write_film
+from replay.export.videos import pixel_format, write_film
 from replay.recordings.source import RecordedSource
 
 VERSION = "v3.0"
@@ -48,13 +48,11 @@ dataset = LeRobotDataset("cdmisfa/{name}", root="{name}")
 """
 
 Feature = dict[str, Any]
-Stats = dict[str, NDArray[np.float64]]
+Stats = dict[str, list[Any]]
 
 
-def write_lerobot(
-    source: RecordedSource, folder: Path, *, name: str = "recording", lossless: bool = False
-) -> int:
-    """Write a recording as a LeRobot dataset.
+def write_lerobot(source: RecordedSource, folder: Path, *, name: str, lossless: bool) -> int:
+    """Write a recording as a LeRobot dataset, and return how many frames it has.
 
     Args:
         source: the recording. Images become videos `observation.images.VIEW`, values
@@ -62,9 +60,6 @@ def write_lerobot(
         folder: the dataset's.
         name: of the dataset, for its card.
         lossless: keep every value of the images.
-
-    Returns:
-        How many frames.
 
     Raises:
         UsageError: the frame rate is not a whole number, which LeRobot's format asks for, or
@@ -79,20 +74,21 @@ def write_lerobot(
         )
     columns, features = _columns(source, fps)
     stats = {key: _number_stats(column) for key, column in columns.items()}
+    videos = []
     if source.spec.images:
         for stream, view in enumerate(view_names(source.spec)):
-            key = f"observation.images.{view}"
+            videos.append(key := f"observation.images.{view}")
             file = _place(folder / "videos" / key, "mp4")
             write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY)
             features[key] = _video_feature(source.spec.frame_shape, fps)
             stats[key] = _image_stats(source, stream)
-    videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     task = f"what {source.scene().get('scene', 'a recording')} shows"
     pq.write_table(_table(columns, features), _place(folder / "data", "parquet"))
-    pq.write_table(_episode(source.frames, fps, task, videos, stats), _episodes_file(folder))
+    episode = _episode(source.frames, fps, task, videos, stats)
+    pq.write_table(episode, _place(folder / "meta" / "episodes", "parquet"))
     pq.write_table(_tasks(task), folder / "meta" / "tasks.parquet")
     _write_json(folder / "meta" / "info.json", _info(source.frames, fps, features))
-    _write_json(folder / "meta" / "stats.json", _as_lists(stats))
+    _write_json(folder / "meta" / "stats.json", stats)
     card = ABOUT.format(name=name, version=VERSION, frames=source.frames, fps=fps, state=STATE)
     (folder / "README.md").write_text(card, "utf-8")
     return source.frames
@@ -131,7 +127,6 @@ def _columns(
 
 def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
     height, width = shape
-    even = height % 2 == 0 and width % 2 == 0
     return {
         "dtype": "video",
         "shape": [height, width, 3],
@@ -140,7 +135,7 @@ def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
             "video.height": height,
             "video.width": width,
             "video.codec": "h264",
-            "video.pix_fmt": "yuv420p" if even else "yuv444p",
+            "video.pix_fmt": pixel_format(shape),
             "video.is_depth_map": False,
             "video.fps": fps,
             "video.channels": 3,
@@ -151,7 +146,7 @@ def _video_feature(shape: tuple[int, ...], fps: int) -> Feature:
 
 def _number_stats(values: NDArray[Any]) -> Stats:
     rows = values.astype(np.float64).reshape(len(values), -1)
-    return {
+    stats = {
         "min": rows.min(axis=0),
         "max": rows.max(axis=0),
         "mean": rows.mean(axis=0),
@@ -159,6 +154,7 @@ def _number_stats(values: NDArray[Any]) -> Stats:
         "count": np.array([len(rows)]),
         **{key: np.quantile(rows, q, axis=0) for key, q in QUANTILES.items()},
     }
+    return {key: value.tolist() for key, value in stats.items()}
 
 
 def _image_stats(source: RecordedSource, stream: int) -> Stats:
@@ -176,8 +172,8 @@ def _image_stats(source: RecordedSource, stream: int) -> Stats:
         "std": np.sqrt(((levels - mean) ** 2 * counts).sum() / total),
         **{key: levels[np.searchsorted(below, q * total)] for key, q in QUANTILES.items()},
     }
-    stats = {key: np.full((3, 1, 1), value) for key, value in found.items()}
-    return {**stats, "count": np.array([source.frames])}
+    stats = {key: np.full((3, 1, 1), value).tolist() for key, value in found.items()}
+    return {**stats, "count": [source.frames]}
 
 
 def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature]) -> pa.Table:
@@ -209,7 +205,7 @@ def _episode(
             f"videos/{key}/from_timestamp": 0.0,
             f"videos/{key}/to_timestamp": frames / fps,
         }
-    for key, values in _as_lists(stats).items():
+    for key, values in stats.items():
         row |= {f"stats/{key}/{name}": value for name, value in values.items()}
     row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
     return pa.Table.from_pylist([row])
@@ -218,15 +214,13 @@ def _episode(
 def _tasks(task: str) -> pa.Table:
     """The table of tasks as pandas writes it: the text is the index of the row."""
     index = "__index_level_0__"
-    text = {"name": None, "field_name": index, "pandas_type": "unicode", "metadata": None}
-    number = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64"}
+    facts = ("name", "field_name", "pandas_type", "numpy_type", "metadata")
+    number = ("task_index", "task_index", "int64", "int64", None)
+    text = (None, index, "unicode", "object", None)
     pandas = {
         "index_columns": [index],
         "column_indexes": [],
-        "columns": [
-            {**number, "numpy_type": "int64", "metadata": None},
-            {**text, "numpy_type": "object"},
-        ],
+        "columns": [dict(zip(facts, column, strict=True)) for column in (number, text)],
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.0.0",
     }
@@ -252,14 +246,6 @@ def _info(frames: int, fps: int, features: Mapping[str, Feature]) -> dict[str, A
         "video_path": f"videos/{{video_key}}/{place}.mp4" if videos else None,
         "features": features,
     }
-
-
-def _as_lists(stats: Mapping[str, Stats]) -> dict[str, dict[str, Any]]:
-    return {k: {name: value.tolist() for name, value in v.items()} for k, v in stats.items()}
-
-
-def _episodes_file(folder: Path) -> Path:
-    return _place(folder / "meta" / "episodes", "parquet")
 
 
 def _place(folder: Path, ending: str) -> Path:

@@ -66,12 +66,11 @@ def _export_recording(path: Path, out: Path, form: str, lossless: bool) -> int:
             if len(source.spec.streams) > 1:
                 raise UsageError(f"{path} has several views: name a folder, not {out.name}")
             with whole(out) as film:
-                film.parent.mkdir(parents=True, exist_ok=True)
                 write_film(source, 0, film, lossless=lossless)
             return source.frames
         _refuse_others(out)
         with whole(out) as folder:
-            folder.mkdir(parents=True)
+            folder.mkdir()
             if form == "lerobot":
                 return write_lerobot(source, folder, name=out.name, lossless=lossless)
             if form == "mp4":
@@ -83,7 +82,5 @@ def _refuse_others(out: Path) -> None:
     """Refuse to replace a folder with other files than exports write."""
     for file in out.rglob("*") if out.is_dir() else ():
         if not file.is_dir() and file.suffix not in WRITTEN:
-            raise UsageError(
-                f"{out} holds other files, such as {file.relative_to(out)}: export into a new "
-                "folder"
-            )
+            other = f"{out} holds other files, such as {file.relative_to(out)}"
+            raise UsageError(f"{other}: export into a new folder")

@@ -36,7 +36,7 @@ _CSV = {"float64": "double", "int64": "integer", "bool": "boolean"}
 
 
 def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> int:
-    """Write a run's signals to a file.
+    """Write a run's signals to a file, and return how many iterations there are.
 
     Args:
         run: the run.
@@ -45,19 +45,15 @@ def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> i
             that grow with the modules up with NaN.
         force: replace an existing file of notes beside a CSV file.
 
-    Returns:
-        The number of iterations.
-
     Raises:
         UsageError: no such run, or the notes exist and `force` is not set.
         LogDamagedError: the run cannot be read.
         LogWriteError: the file cannot be written.
     """
-    header, notes = read_header(run), csv_notes(out)
+    header, notes = read_header(run), out.with_name(f"{out.name}-metadata.json")
     if form == "csv" and notes.exists() and not force:
         raise UsageError(f"{notes} exists: choose another name or overwrite with --force")
     with whole(out) as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
         if form != "csv":
             return _WRITERS[form](run, header, partial)
         with whole(notes) as about:
@@ -66,12 +62,7 @@ def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> i
         return rows
 
 
-def csv_notes(out: Path) -> Path:
-    """The file that says what a CSV file's columns are."""
-    return out.with_name(f"{out.name}-metadata.json")
-
-
-def arrow_schema(header: RunHeader) -> pa.Schema:
+def _arrow_schema(header: RunHeader) -> pa.Schema:
     """The table's columns, nested one list a dimension, with what each signal is."""
     fields = []
     for signal in SIGNALS.values():
@@ -84,12 +75,10 @@ def arrow_schema(header: RunHeader) -> pa.Schema:
 
 
 def _about(signal: Signal) -> dict[str, str]:
-    """What a signal is, without how a viewer shows it."""
     return {name: str(value) for name, value in asdict(signal).items() if name != "show"}
 
 
 def _run(header: RunHeader) -> dict[str, str]:
-    """What run it is, as JSON."""
     return {
         "schema": str(header.schema),
         "spec": json.dumps(asdict(header.spec)),
@@ -108,19 +97,17 @@ def _nested(values: NDArray[Any]) -> pa.Array:
 
 
 def _write_parquet(run: Path, header: RunHeader, out: Path) -> int:
-    schema = arrow_schema(header)
-    with pq.ParquetWriter(out, schema, compression="zstd") as writer:
-        return _write_batches(run, header, schema, writer)
+    with pq.ParquetWriter(out, _arrow_schema(header), compression="zstd") as writer:
+        return _write_batches(run, header, writer)
 
 
 def _write_arrow(run: Path, header: RunHeader, out: Path) -> int:
-    schema = arrow_schema(header)
-    with pa.OSFile(str(out), "wb") as file, pa.ipc.new_file(file, schema) as writer:
-        return _write_batches(run, header, schema, writer)
+    with pa.OSFile(str(out), "wb") as file, pa.ipc.new_file(file, _arrow_schema(header)) as writer:
+        return _write_batches(run, header, writer)
 
 
-def _write_batches(run: Path, header: RunHeader, schema: pa.Schema, writer: Any) -> int:
-    rows = 0
+def _write_batches(run: Path, header: RunHeader, writer: Any) -> int:
+    rows, schema = 0, _arrow_schema(header)
     for piece in read_columns(run, header):
         arrays = [_nested(piece[name]) for name in SIGNALS]
         writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))

@@ -32,23 +32,15 @@ FULL_RANGE = 2
 """FFmpeg's number for luma from 0 to 255."""
 
 
-def write_films(source: RecordedSource, folder: Path, *, lossless: bool = False) -> int:
-    """Write each view as VIEW.mp4.
-
-    Returns:
-        How many frames, of all views.
-
-    Raises:
-        UsageError: PyAV is not installed.
-        CdmisfaError: a file cannot be written.
-    """
+def write_films(source: RecordedSource, folder: Path, *, lossless: bool) -> int:
+    """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
     for stream, name in enumerate(view_names(source.spec)):
         write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
     return source.frames * len(source.spec.streams)
 
 
 def write_film(
-    source: RecordedSource, stream: int, file: Path, *, lossless: bool = False, key_every: int = 0
+    source: RecordedSource, stream: int, file: Path, *, lossless: bool, key_every: int = 0
 ) -> None:
     """Write one view as a video of the recording's frame rate.
 
@@ -80,7 +72,7 @@ def write_film(
             container.metadata["comment"] = json.dumps(about)
             video = container.add_stream("libx264", rate=rate, options=options)
             video.height, video.width = spec.frame_shape
-            video.pix_fmt = _format(spec.frame_shape)
+            video.pix_fmt = pixel_format(spec.frame_shape)
             video.max_b_frames = 0  # each frame's place in the file is its place in time
             video.codec_context.color_range = FULL_RANGE
             for picture in _pictures(av, source, stream):
@@ -94,22 +86,20 @@ def write_film(
 def _pictures(av: Any, source: RecordedSource, stream: int) -> Iterator[Any]:
     """The frames of a view as PyAV's, in one buffer."""
     height, width = source.spec.frame_shape
-    kind = _format((height, width))
+    kind = pixel_format(source.spec.frame_shape)
     shape = (3, height, width) if kind == "yuv444p" else (height * 3 // 2, width)
     planes = np.full(shape, NEUTRAL, dtype=np.uint8)
     luma = planes[0] if planes.ndim == 3 else planes[:height]
-    count = 0
     for block in pieces(source, stream):
-        for frame in block.frames:
+        for t, frame in enumerate(block.frames, start=block.t):
             luma[:] = frame
             picture = av.VideoFrame.from_ndarray(planes, format=kind)
-            picture.pts, picture.color_range = count, FULL_RANGE
+            picture.pts, picture.color_range = t - source.first_frame, FULL_RANGE
             yield picture
-            count += 1
 
 
-def _format(shape: tuple[int, ...]) -> str:
-    """Half the chroma, which every player knows, needs even sides."""
+def pixel_format(shape: tuple[int, ...]) -> str:
+    """A video's pixels: half the chroma, which every player knows, needs even sides."""
     return "yuv444p" if shape[0] % 2 or shape[1] % 2 else "yuv420p"
 
 
@@ -118,7 +108,6 @@ def _library() -> Any:
         import av
         import av.error
     except ImportError as error:
-        raise UsageError(
-            "writing videos needs PyAV, which is not installed: pip install 'cdmisfa[video]'"
-        ) from error
+        missing = "writing videos needs PyAV, which is not installed: pip install 'cdmisfa[video]'"
+        raise UsageError(missing) from error
     return av
