@@ -214,13 +214,15 @@ def _episode(
 def _tasks(task: str) -> pa.Table:
     """The table of tasks as pandas writes it: the text is the index of the row."""
     index = "__index_level_0__"
-    facts = ("name", "field_name", "pandas_type", "numpy_type", "metadata")
-    number = ("task_index", "task_index", "int64", "int64", None)
-    text = (None, index, "unicode", "object", None)
+    text = {"name": None, "field_name": index, "pandas_type": "unicode", "metadata": None}
+    number = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64"}
     pandas = {
         "index_columns": [index],
         "column_indexes": [],
-        "columns": [dict(zip(facts, column, strict=True)) for column in (number, text)],
+        "columns": [
+            {**number, "numpy_type": "int64", "metadata": None},
+            {**text, "numpy_type": "object"},
+        ],
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.0.0",
     }
