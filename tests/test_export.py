@@ -13,7 +13,7 @@ from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
-from replay.export.recordings import export
+from replay.export.forms import export
 from replay.runs import stretches
 
 

@@ -16,7 +16,7 @@ from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
 from replay.export import images as frames
 from replay.export import videos as film
-from replay.export.recordings import export
+from replay.export.forms import export
 
 FRAMES = 53
 FIRST = 7

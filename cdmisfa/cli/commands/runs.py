@@ -101,7 +101,7 @@ def export_command(
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0.
     """
-    from replay.export.recordings import RECORDINGS, export
+    from replay.export.forms import RECORDINGS, export
     from replay.export.tables import CSV_LEAVES_OUT
 
     if str(out) == "-":

@@ -1,4 +1,4 @@
-"""A run's signals or a recording's frames in a form that other programs read."""
+"""The forms in which a run's signals or a recording's frames can be written for other programs."""
 
 from __future__ import annotations
 
