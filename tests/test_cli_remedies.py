@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -163,3 +166,13 @@ def test_doctor_says_how_to_get_each_extra(
     details = {check["what"]: check["detail"] for check in json.loads(done.out)["checks"]}
     assert details["extra cloud"] == "pip install 'cdmisfa[cloud]'"
     assert {f"extra {name}" for name in EXTRAS} <= details.keys()
+
+
+def test_doctor_names_the_folders_of_the_compiled_kernels(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "cdmisfa", "doctor", "--json"]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(words, capture_output=True, check=True, env=environment)
+    details = {check["what"]: check["detail"] for check in json.loads(done.stdout)["checks"]}
+    folders = [Path(folder) for folder in details["kernel cache"].split(", ")]
+    assert {folder.parent for folder in folders} == {tmp_path}
+    assert all(folder.is_dir() for folder in folders)

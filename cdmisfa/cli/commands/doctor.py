@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
+from typing import Any
 
 import click
 
@@ -95,11 +95,17 @@ def _simulator() -> Iterator[Check]:
 
 
 def _kernel_cache() -> Iterator[Check]:
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "__pycache__")
-    nearest = next(p for p in (folder, *folder.parents) if p.exists())
-    writable = os.access(nearest, os.W_OK)
-    detail = str(folder) if writable else f"{folder} is read-only: set NUMBA_CACHE_DIR"
-    yield Check("kernel cache", writable, detail, "a quick start the second time")
+    try:
+        from cdmisfa.agents.agent import think
+        from cdmisfa.features.incsfa import strict
+        from replay.recordings import kernels
+    except ImportError:  # said of the package that is missing
+        return
+    compiled: tuple[Any, ...] = (think, strict.update, kernels.scan)
+    folders = [function.stats.cache_path for function in compiled]
+    kept = None not in folders
+    detail = ", ".join(folders) if kept else "no folder can be written: set NUMBA_CACHE_DIR to one"
+    yield Check("kernel cache", kept, detail, "a quick start the second time")
 
 
 def _vulkan() -> Iterator[Check]:
