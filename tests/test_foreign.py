@@ -22,7 +22,7 @@ from source_contract import SourceContract
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.messages import image_decoder
-from replay.camera_logs.pixels import ENCODINGS, RawPixels, gray, shrink
+from replay.camera_logs.pixels import ENCODINGS, gray, shrink
 from replay.camera_logs.source import ForeignSource
 from replay.mcap.records import MalformedRecord
 
@@ -134,7 +134,7 @@ def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
 @pytest.mark.parametrize("encoding", ["bayer_rggb8", "32FC1", "yuv422", ""])
 def test_other_formats_are_refused_by_name(encoding: str) -> None:
     with pytest.raises(MalformedRecord, match=repr(encoding)):
-        gray(RawPixels(6, 8, encoding, False, 8, bytes(48)))
+        gray(bytes(48), 6, 8, encoding, 8)
 
 
 @given(data=st.binary(max_size=300), which=st.sampled_from(sorted(RAW)))

@@ -17,6 +17,7 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.pixels import shrink
 from replay.camera_logs.source import ForeignSource
 from replay.camera_logs.video import VideoImages
 
@@ -99,15 +100,16 @@ def test_other_codecs_come_close_in_any_order(
 ) -> None:
     path = tmp_path / f"a.{ending}"
     images = np.array(write_video(path, pictures(60), codec=codec, pixels=pixels), float)
-    video = VideoImages(path, None, SIZE)
-    once = [video.frame(row) for row in range(60)]
-    assert abs(np.array(once) - images).mean() < 8
-    other = VideoImages(path, None, SIZE)
+    video = VideoImages(path, None)
+    once = [video.image(row) for row in range(60)]
+    small = np.array([shrink(image, *SIZE) for image in once], float)
+    assert abs(small - images).mean() < 8
+    other = VideoImages(path, None)
     for row in (59, 0, 31, 30, 7, 8):
-        np.testing.assert_array_equal(other.frame(row), once[row])
-    again = VideoImages(path, None, SIZE)
+        np.testing.assert_array_equal(other.image(row), once[row])
+    again = VideoImages(path, None)
     digest = [
-        hashlib.sha256(b"".join(v.frame(r) for r in range(60))).hexdigest() for v in (video, again)
+        hashlib.sha256(b"".join(v.image(r) for r in range(60))).hexdigest() for v in (video, again)
     ]
     assert digest[0] == digest[1]
     for each in (video, other, again):

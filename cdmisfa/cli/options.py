@@ -148,8 +148,8 @@ def fetched_argument(name: str) -> Callable[[Command], Command]:
 def _fetched(ctx: click.Context, param: click.Parameter, value: str) -> Path:
     if "://" not in value:
         return Path(value)
-    from replay.storage.copied import fetched
     from replay.storage.location import location
+    from replay.storage.opening import fetched
 
     place = location(value)
     copy = ctx.with_resource(fetched(place))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -20,22 +19,15 @@ _UNEVEN: Final = 0.01
 Times = NDArray[np.uint64]
 """When each image of a stream was taken, (n,) in nanoseconds, in order."""
 
+Rows = NDArray[np.int64]
+"""Which image of a stream each frame shows, (frames,)."""
 
-@dataclass(frozen=True, slots=True)
-class Aligned:
-    """A stream on the common clock.
 
-    Attributes:
-        rows: (n,) int64, which image each frame shows.
-        messages: images of the stream.
-        repeated: frames that show the image of the frame before again.
-        dropped: images that no frame shows.
-    """
-
-    rows: NDArray[np.int64]
-    messages: int
-    repeated: int
-    dropped: int
+def counts(times: Times, rows: Rows) -> dict[str, int]:
+    """Images of a stream, frames that show one again, and images that no frame shows."""
+    shown = len(np.unique(rows))
+    repeated, dropped = len(rows) - shown, len(times) - shown
+    return {"messages": len(times), "repeated": repeated, "dropped": dropped}
 
 
 def step_of(times: Times) -> float:
@@ -70,14 +62,12 @@ def unlike(first: Times, times: Times) -> str:
     return "images at different times" if apart > NANOSECONDS * step_of(first) / 2 else ""
 
 
-def by_index(streams: Sequence[Times]) -> list[Aligned]:
+def by_index(streams: Sequence[Times]) -> list[Rows]:
     """Show the i-th image of every stream in frame i, up to the end of the shortest."""
-    count = min(map(len, streams))
-    rows = np.arange(count)
-    return [Aligned(rows, len(times), 0, len(times) - count) for times in streams]
+    return [np.arange(min(map(len, streams)))] * len(streams)
 
 
-def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list[Aligned]:
+def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list[Rows]:
     """Show in each frame the last image at or before its time.
 
     Args:
@@ -93,9 +83,4 @@ def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list
     if ticks > MAX_FRAMES:
         raise UsageError(f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one")
     clock = times_of(np.arange(int(ticks)), fps, start).astype(np.uint64)
-    aligned = []
-    for times in streams:
-        rows = np.searchsorted(times, clock, side="right").astype(np.int64) - 1
-        shown = len(np.unique(rows))
-        aligned.append(Aligned(rows, len(times), len(rows) - shown, len(times) - shown))
-    return aligned
+    return [np.searchsorted(times, clock, side="right") - 1 for times in streams]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,20 +10,18 @@ import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.messages import Decoder
-from replay.camera_logs.pixels import RECIPE, shrink
-from replay.camera_logs.stream import choose_images, explained, sorted_times
-from replay.mcap.records import Bytes, MalformedRecord
+from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
+from replay.mcap.records import Bytes
 
 BAGS: Final = (".bag", ".db3")
 
 
-class BagImages:
+class BagImages(ImageStream):
     """The images on one topic of a ROS bag, in the order of its time stamps.
 
     Args:
         path: a .bag, a .db3, or the folder of a rosbag2.
         topic: the topic; may be left out where there is one topic of images.
-        size: (height, width) of a frame.
 
     Raises:
         CdmisfaError: the package rosbags is missing.
@@ -31,19 +29,12 @@ class BagImages:
         LogDamagedError: rosbags cannot read it.
     """
 
-    recipe = RECIPE
-
-    def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
+    def __init__(self, path: Path, topic: str | None) -> None:
         self.path = path
-        self._size = size
-        self._reader: Any = None
         self._messages: Iterator[tuple[int, bytes]] = iter(())
         self._next = -1
         ros1 = path.suffix == ".bag" and path.is_file()
-        reader = _reader_of(path, ros1=ros1)
-        with explained(path, "rosbags"):
-            reader.open()
-        self._reader = reader
+        self._reader = _opened(path, ros1=ros1)
         try:
             self._connections, self._decode = self._find(topic, ros1=ros1)
             self.topic = str(self._connections[0].topic)
@@ -55,31 +46,19 @@ class BagImages:
         except BaseException:
             self.close()
             raise
-        self.count = len(stamps)
-        self.warnings: Sequence[str] = [
-            f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"
-        ]
+        self.warnings = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
-    def frame(self, row: int) -> Bytes:
-        """Decode a message into a frame, (height, width) uint8.
-
-        Raises:
-            LogDamagedError: the message is no image that is read, or the bag is damaged.
-        """
+    def image(self, row: int) -> Bytes:
         with explained(self.path, "rosbags"):
             if row != self._next:
                 self._messages = self._from(int(self.times[row]))
                 self._next = int(np.searchsorted(self.times, self.times[row]))
             while self._next <= row:
-                stamp, data = next(self._messages, (0, b""))
+                _, data = next(self._messages, (0, b""))
                 self._next += 1
-        try:
-            return shrink(self._decode(data), *self._size)
-        except MalformedRecord as error:
-            raise LogDamagedError(f"{self.path}: {self.topic} at {stamp} ns: {error}") from None
+        return self._decode(data)
 
     def close(self) -> None:
-        """Let go of the files; harmless when called twice."""
         reader, self._reader = self._reader, None
         if reader is not None:
             self._messages = iter(())
@@ -110,7 +89,7 @@ class BagImages:
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 
-def _reader_of(path: Path, *, ros1: bool) -> Any:
+def _opened(path: Path, *, ros1: bool) -> Any:
     try:
         from rosbags.rosbag1 import Reader as Rosbag1
         from rosbags.rosbag2 import Reader as Rosbag2
@@ -119,4 +98,6 @@ def _reader_of(path: Path, *, ros1: bool) -> Any:
             f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
     with explained(path, "rosbags"):
-        return Rosbag1(path) if ros1 else Rosbag2(path)
+        reader = Rosbag1(path) if ros1 else Rosbag2(path)
+        reader.open()
+        return reader

@@ -12,22 +12,19 @@ from replay.mcap.records import Bytes
 from replay.storage.location import Location
 
 
-class JoinedImages:
+class JoinedImages(ImageStream):
     """The images on one topic of several logs, by their times, ties in the order of the logs.
 
     Args:
         path: what stands for all of them.
         parts: each has times, and the same topic.
-
-    Attributes:
-        parts: as given.
     """
 
     def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
         self.path = path
         self.recipe = parts[0].recipe
         self.topic = parts[0].topic
-        self.warnings: Sequence[str] = [
+        self.warnings = [
             f"{path}: {self.topic} is joined from {len(parts)} logs, by time",
             *(warning for part in parts for warning in part.warnings),
         ]
@@ -35,20 +32,16 @@ class JoinedImages:
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")
         self.times = times[order]
-        self.count = len(order)
         self._part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
         self._row_in = np.concatenate([np.arange(part.count) for part in parts])[order]
 
-    def frame(self, row: int) -> Bytes:
-        """Decode an image into a frame, (height, width) uint8.
+    def image(self, row: int) -> Bytes:
+        return self.parts[int(self._part_of[row])].image(int(self._row_in[row]))
 
-        Raises:
-            LogDamagedError: it is no image that is read.
-        """
-        return self.parts[int(self._part_of[row])].frame(int(self._row_in[row]))
+    def where(self, row: int) -> str:
+        return self.parts[int(self._part_of[row])].where(int(self._row_in[row]))
 
     def close(self) -> None:
-        """Let go of the files; harmless when called twice."""
         for part in self.parts:
             part.close()
 

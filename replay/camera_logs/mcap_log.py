@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import UsageError
 from replay.camera_logs.messages import Decoder
-from replay.camera_logs.pixels import RECIPE, shrink
-from replay.camera_logs.stream import choose_images, sorted_times
+from replay.camera_logs.stream import ImageStream, choose_images, sorted_times
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Bytes, Channel, MalformedRecord
 from replay.mcap.segments import Segment
@@ -21,13 +20,12 @@ CACHE_BYTES: Final = 1024 * 1024
 """Decoded chunks that are kept; one always is."""
 
 
-class McapImages:
+class McapImages(ImageStream):
     """The images on one topic of one log, in the order of log time.
 
     Args:
         path: the log.
         topic: the topic; may be left out where the log has one topic of images.
-        size: (height, width) of a frame.
         salvage: leave out what is damaged.
 
     Raises:
@@ -35,13 +33,8 @@ class McapImages:
         LogDamagedError: the log is damaged.
     """
 
-    recipe = RECIPE
-
-    def __init__(
-        self, path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
-    ) -> None:
+    def __init__(self, path: Location, topic: str | None, *, salvage: bool = False) -> None:
         self.path = path
-        self._size = size
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
         try:
             self._channel, self._decode = self._find(topic)
@@ -50,26 +43,9 @@ class McapImages:
         except BaseException:
             self.reader.close()
             raise
-        self.warnings: Sequence[str] = self.reader.warnings
+        self.warnings = self.reader.warnings
 
-    def frame(self, row: int) -> Bytes:
-        """Decode a message into a frame, (height, width) uint8.
-
-        Raises:
-            LogDamagedError: the message is no image that is read.
-        """
-        try:
-            return shrink(self._decode(self._payload(row)), *self._size)
-        except MalformedRecord as error:
-            raise LogDamagedError(
-                f"{self.path}: {self.topic} at {self.times[row]} ns: {error}"
-            ) from None
-
-    def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
-        self.reader.close()
-
-    def _payload(self, row: int) -> bytes:
+    def image(self, row: int) -> Bytes:
         table = self.reader.table(self._segments[int(self._segment_of[row])])
         if table is None:
             raise MalformedRecord("it is damaged")
@@ -79,7 +55,10 @@ class McapImages:
             if place >= len(own) or table.log_time[own[place]] != self.times[row]:
                 raise MalformedRecord("its chunk holds other messages than the summary names")
             place = int(own[place])
-        return table.payload(place)
+        return self._decode(table.payload(place))
+
+    def close(self) -> None:
+        self.reader.close()
 
     def _find(self, topic: str | None) -> tuple[Channel, Decoder]:
         kinds = {number: schema.name for number, schema in self.reader.schemas.items()}
@@ -110,7 +89,6 @@ class McapImages:
         self.times = sorted_times(f"{self.path}: {self.topic}", np.concatenate(times)[order])
         self._segment_of = np.concatenate(members)[order]
         self._row_in = np.concatenate(rows)[order]
-        self.count = len(order)
         self.reader.expect(self._segments)
 
     def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:

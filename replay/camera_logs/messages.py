@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
-from replay.camera_logs.pixels import RawPixels, compressed_gray, gray
+from replay.camera_logs.pixels import compressed_gray, gray
 from replay.mcap.records import Bytes, MalformedRecord
 
 Decoder = Callable[[bytes], Bytes]
@@ -27,11 +27,7 @@ def image_decoder(schema: str, encoding: str) -> Decoder | None:
 
 def _foxglove_raw(data: bytes) -> Bytes:
     message = _parse(RawImage, data)
-    return gray(
-        RawPixels(
-            message.height, message.width, message.encoding, False, message.step, message.data
-        )
-    )
+    return gray(message.data, message.height, message.width, message.encoding, message.step)
 
 
 def _foxglove_compressed(data: bytes) -> Bytes:
@@ -51,7 +47,7 @@ def _json_raw(data: bytes) -> Bytes:
     if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
         raise MalformedRecord("a JSON image needs whole height, width and step")
     height, width, step = (int(n) for n in numbers if n is not None)
-    return gray(RawPixels(height, width, str(fields.get("encoding")), False, step, _base64(fields)))
+    return gray(_base64(fields), height, width, str(fields.get("encoding")), step)
 
 
 def _json_compressed(data: bytes) -> Bytes:
@@ -76,60 +72,50 @@ def _base64(fields: Mapping[str, Any]) -> bytes:
 
 
 class _RosFields:
-    """Fields of a ROS message, aligned (ROS 2) or packed (ROS 1)."""
+    """Fields of a ROS message after its header, aligned (ROS 2) or packed (ROS 1)."""
 
     def __init__(self, data: bytes, *, ros1: bool) -> None:
         self._data = memoryview(data)
-        self._at = self._base = 0
-        self._aligned = not ros1
+        self._at = 0
+        self._ros1 = ros1
         self._order = "<"
-        self.terminated = not ros1
         if not ros1:
-            head = bytes(self._take(4))
+            head = bytes(self.take(4))
             if head[0] != 0 or head[1] not in (0, 1, 6, 7, 8, 9, 10, 11):
                 raise MalformedRecord("a message is no CDR")
             self._order = "<" if head[1] & 1 else ">"
-            self._base = 4
+        for _ in range(3 if ros1 else 2):  # sequence number of ROS 1, seconds, nanoseconds
+            self.u32()
+        self.text()
 
-    def _take(self, count: int) -> memoryview:
+    def take(self, count: int) -> memoryview:
         if count > len(self._data) - self._at:
             raise MalformedRecord("a ROS message is cut short or lies about a length")
         self._at += count
         return self._data[self._at - count : self._at]
 
     def u32(self) -> int:
-        if self._aligned:
-            self._take(-(self._at - self._base) % 4)
-        return int(struct.unpack(self._order + "I", self._take(4))[0])
-
-    def u8(self) -> int:
-        return self._take(1)[0]
-
-    def text(self) -> str:
-        raw = bytes(self._take(self.u32()))
-        return str(raw.removesuffix(b"\0") if self.terminated else raw, "utf-8", "replace")
+        if not self._ros1:  # CDR's own header has 4 bytes, too
+            self.take(-self._at % 4)
+        return int(struct.unpack(self._order + "I", self.take(4))[0])
 
     def data(self) -> memoryview:
-        return self._take(self.u32())
+        return self.take(self.u32())
 
-
-def _ros_header(data: bytes, ros1: bool) -> _RosFields:
-    fields = _RosFields(data, ros1=ros1)
-    for _ in range(3 if ros1 else 2):
-        fields.u32()
-    fields.text()
-    return fields
+    def text(self) -> str:
+        raw = bytes(self.data())
+        return str(raw if self._ros1 else raw.removesuffix(b"\0"), "utf-8", "replace")
 
 
 def _ros_raw(data: bytes, *, ros1: bool) -> Bytes:
-    fields = _ros_header(data, ros1)
+    fields = _RosFields(data, ros1=ros1)
     height, width, encoding = fields.u32(), fields.u32(), fields.text()
-    big_endian, step = bool(fields.u8()), fields.u32()
-    return gray(RawPixels(height, width, encoding, big_endian, step, fields.data()))
+    big_endian, step = bool(fields.take(1)[0]), fields.u32()
+    return gray(fields.data(), height, width, encoding, step, big_endian=big_endian)
 
 
 def _ros_compressed(data: bytes, *, ros1: bool) -> Bytes:
-    fields = _ros_header(data, ros1)
+    fields = _RosFields(data, ros1=ros1)
     fields.text()
     return compressed_gray(bytes(fields.data()))
 

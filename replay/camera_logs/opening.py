@@ -20,15 +20,12 @@ from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
 
 
-def open_images(
-    path: Location, topic: str | None, size: tuple[int, int], *, salvage: bool = False
-) -> ImageStream:
+def open_images(path: Location, topic: str | None, *, salvage: bool = False) -> ImageStream:
     """Open the images on a topic of a log, or in a folder.
 
     Args:
         path: an MCAP log or its URL, a ROS bag, a video or a folder of pictures.
         topic: the topic; may be left out where there is one topic of images.
-        size: (height, width) of a frame.
         salvage: leave out what is damaged.
 
     Raises:
@@ -37,14 +34,14 @@ def open_images(
     """
     if isinstance(path, Path):
         if _is_bag(path):
-            return BagImages(path, topic, size)
+            return BagImages(path, topic)
         if _is_split(path):
-            return _open_parts(path, topic, size, salvage=salvage)
+            return _open_parts(path, topic, salvage=salvage)
         if path.is_dir():
-            return FolderImages(path, topic, size)
+            return FolderImages(path, topic)
         if path.suffix.lower() in VIDEOS:
-            return VideoImages(path, topic, size)
-    return McapImages(path, topic, size, salvage=salvage)
+            return VideoImages(path, topic)
+    return McapImages(path, topic, salvage=salvage)
 
 
 def image_logs(paths: Sequence[str | Location]) -> list[Location]:
@@ -89,21 +86,14 @@ def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any
     return {"file": path.name, "sha256": whole.hexdigest()}
 
 
-def _open_parts(
-    path: Path, topic: str | None, size: tuple[int, int], *, salvage: bool
-) -> ImageStream:
-    """Open the images on a topic of a log in parts; a part may lack a topic that is named.
-
-    Raises:
-        UsageError: no part has images on the topic, or they have several topics.
-        LogDamagedError: a part is damaged.
-    """
+def _open_parts(path: Path, topic: str | None, *, salvage: bool) -> ImageStream:
+    """Open the images on a topic of a log in parts; a part may lack a topic that is named."""
     parts: list[ImageStream] = []
     refusal: UsageError | None = None
     try:
         for file in sorted(path.glob("*.mcap"), key=by_number):
             try:
-                parts.append(McapImages(file, topic, size, salvage=salvage))
+                parts.append(McapImages(file, topic, salvage=salvage))
             except UsageError as error:
                 refusal = refusal or error
         if refusal is not None and (topic is None or not parts):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -39,46 +38,50 @@ ENCODINGS: Final = tuple(_LAYOUTS)
 """Pixel formats that are read."""
 
 
-@dataclass(frozen=True, slots=True)
-class RawPixels:
-    """An image as it stands in a message: rows of `step` bytes."""
-
-    height: int
-    width: int
-    encoding: str
-    big_endian: bool
-    step: int
-    data: bytes | memoryview
-
-
-def gray(image: RawPixels) -> Bytes:
+def gray(
+    data: bytes | memoryview,
+    height: int,
+    width: int,
+    encoding: str,
+    step: int = 0,
+    *,
+    big_endian: bool = False,
+) -> Bytes:
     """Turn pixels of any supported format into gray, (height, width) uint8.
+
+    Args:
+        data: rows of `step` bytes, 0 for no more than the pixels take.
+        height: rows of pixels.
+        width: pixels of a row.
+        encoding: the pixel format, as ROS names it.
+        step: bytes from one row to the next.
+        big_endian: the byte order of 16 bits.
 
     Raises:
         MalformedRecord: an unsupported format, or sizes that contradict the data.
     """
-    layout = _LAYOUTS.get(image.encoding)
+    layout = _LAYOUTS.get(encoding)
     if layout is None:
-        hint = " (undo the Bayer pattern first)" if "bayer" in image.encoding.lower() else ""
+        hint = " (undo the Bayer pattern first)" if "bayer" in encoding.lower() else ""
         raise MalformedRecord(
-            f"its pixel format {image.encoding[:40]!r} is not read{hint}: use one of "
+            f"its pixel format {encoding[:40]!r} is not read{hint}: use one of "
             f"{', '.join(ENCODINGS)}"
         )
     size, kind = layout
-    height, width, step = image.height, image.width, image.step or image.width * size
+    step = step or width * size
     if not 0 < height * width <= MAX_PIXELS:
         raise MalformedRecord(f"an image of {height}x{width} pixels is not read")
-    if step < width * size or step * (height - 1) + width * size > len(image.data):
+    if step < width * size or step * (height - 1) + width * size > len(data):
         raise MalformedRecord(
-            f"an image of {height}x{width} {image.encoding} with a step of {step} bytes does not "
-            f"fit its {len(image.data)} bytes"
+            f"an image of {height}x{width} {encoding} with a step of {step} bytes does not "
+            f"fit its {len(data)} bytes"
         )
-    raw = np.frombuffer(image.data, np.uint8)
+    raw = np.frombuffer(data, np.uint8)
     rows = np.ndarray((height, width, size), np.uint8, raw, 0, (step, size, 1))
     if kind == "gray":
         return np.ascontiguousarray(rows[:, :, 0])
     if kind == "gray16":
-        return np.ascontiguousarray(rows[:, :, 0 if image.big_endian else 1])
+        return np.ascontiguousarray(rows[:, :, 0 if big_endian else 1])
     red, green, blue = (rows[:, :, kind.index(c)].astype(np.uint32) for c in "rgb")
     return ((19595 * red + 38470 * green + 7471 * blue + 32768) >> 16).astype(np.uint8)
 

@@ -10,11 +10,12 @@ from typing import Any, Literal
 import numpy as np
 
 from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from replay.camera_logs.alignment import (
-    Aligned,
+    Rows,
     by_index,
     by_time,
+    counts,
     even_times,
     of_other_rate,
     overlap,
@@ -24,8 +25,9 @@ from replay.camera_logs.alignment import (
 from replay.camera_logs.joined import join_parts
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
+from replay.camera_logs.pixels import shrink
 from replay.camera_logs.stream import ImageStream
-from replay.mcap.records import Bytes
+from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
 
 Align = Literal["index", "time"]
@@ -87,7 +89,7 @@ class ForeignSource(SeekableSource):
         self._shown: dict[int, tuple[int, Bytes]] = {}
         try:
             for path, topic in _pairs(self._files, topics):
-                self._streams.append(open_images(path, topic, size, salvage=salvage))
+                self._streams.append(open_images(path, topic, salvage=salvage))
             if align != "index":
                 self._streams = join_parts(self._streams)
             self._align_by = align
@@ -95,23 +97,17 @@ class ForeignSource(SeekableSource):
             self._times = [
                 s.times if len(s.times) else even_times(s.count, self._fps) for s in self._streams
             ]
-            start_ns, self._aligned = self._put_on_clock(align)
-            for stream, aligned in enumerate(self._aligned):  # refused before anything is written
-                self._frame(stream, int(aligned.rows[0]))
+            start_ns, self._rows = self._put_on_clock(align)
+            for stream, rows in enumerate(self._rows):  # refused before anything is written
+                self._frame(stream, int(rows[0]))
         except BaseException:
             self.close()
             raise
-        self._count = len(self._aligned[0].rows)
+        self._count = len(self._rows[0])
         names, length = stream_names(self._streams), None if loop else self._count
         self._spec = SourceSpec(names, size, "uint8", (), self._fps, start_ns, length)
-        self.alignment = {
-            name: {
-                "messages": aligned.messages,
-                "repeated": aligned.repeated,
-                "dropped": aligned.dropped,
-            }
-            for name, aligned in zip(self._spec.streams, self._aligned, strict=True)
-        }
+        found = map(counts, self._times, self._rows)
+        self.alignment = dict(zip(names, found, strict=True))
         self.warnings = tuple(dict.fromkeys(w for s in self._streams for w in s.warnings))
 
     @property
@@ -140,7 +136,7 @@ class ForeignSource(SeekableSource):
                 f"{n} are needed; begin again at the end with --loop"
             )
         frames = np.empty((n, *self._spec.frame_shape), np.uint8)
-        rows = self._aligned[stream].rows
+        rows = self._rows[stream]
         for i in range(n):
             frames[i] = self._frame(stream, int(rows[(self._t + i) % self._count]))
         block = Block(stream, self._t, freeze(frames), freeze(np.empty((n, 0))))
@@ -190,13 +186,15 @@ class ForeignSource(SeekableSource):
             return shown[1]
         images = self._streams[stream]
         try:
-            frame = images.frame(row)
+            frame = shrink(images.image(row), *self._size)
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{images.where(row)}: {error}") from None
         except UsageError as error:
             raise UsageError(f"{images.path}: {error}") from None
         self._shown[stream] = (row, frame)
         return frame
 
-    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Aligned]]:
+    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows]]:
         """When frame 0 is, and which image of each stream every frame shows.
 
         Raises:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.messages import SCHEMAS, Decoder, image_decoder
+from replay.camera_logs.pixels import RECIPE
 from replay.mcap.records import Bytes
 from replay.storage.location import Location
 
@@ -21,35 +22,43 @@ LAST_NS: Final = 2**62
 Found = TypeVar("Found")
 
 
-class ImageStream(Protocol):
+class ImageStream(ABC):
     """The images of one camera, in the order of time.
 
     Attributes:
+        path: the log or the folder they are in.
+        topic: the topic, or what stands for it.
         times: (n,) uint64, when each was taken, in nanoseconds; empty where nobody knows,
             in which case they are `count` images at any even rate.
-        count: how many there are.
-        topic: the topic, or what stands for it.
         recipe: how an image becomes a frame, for the record.
         warnings: what the user should know: what was cut or left out.
     """
 
-    recipe: str
-    times: NDArray[np.uint64]
-    count: int
+    path: Location
     topic: str
-    warnings: Sequence[str]
+    times: NDArray[np.uint64]
+    recipe: str = RECIPE
+    warnings: Sequence[str] = ()
 
     @property
-    def path(self) -> Location:
-        """The log or the folder they are in."""
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.times)
 
-    def frame(self, row: int) -> Bytes:
-        """Decode an image into a frame, (height, width) uint8.
+    @abstractmethod
+    def image(self, row: int) -> Bytes:
+        """Decode an image, gray and of its own size, (height, width) uint8.
 
         Raises:
-            LogDamagedError: it is no image that is read.
+            MalformedRecord: it is no image that is read.
+            LogDamagedError: the log is damaged there.
         """
 
+    def where(self, row: int) -> str:
+        """How an error names an image."""
+        return f"{self.path}: {self.topic} at {self.times[row]} ns"
+
+    @abstractmethod
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""
 
@@ -104,7 +113,7 @@ def sorted_times(where: str, times: Sequence[int] | NDArray[np.uint64]) -> NDArr
 
 
 @contextmanager
-def explained(path: Path, program: str) -> Iterator[None]:
+def explained(path: Location, program: str) -> Iterator[None]:
     """Say in one line what a library that lets any exception through cannot read."""
     try:
         yield

@@ -6,18 +6,17 @@ on the processor, comes between; only videos without luma are taken by their col
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.pixels import MAX_PIXELS, RECIPE, RawPixels, gray, shrink
-from replay.camera_logs.stream import explained, sorted_times
+from replay.camera_logs.pixels import MAX_PIXELS, RECIPE, gray
+from replay.camera_logs.stream import ImageStream, explained, sorted_times
 from replay.mcap.records import Bytes, MalformedRecord
 
 VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
@@ -26,15 +25,16 @@ _FORWARD: Final = 256
 """Frames that are decoded and passed over rather than sought."""
 _FULL_RANGE: Final = 2
 _LUMA: Final = ("yuv", "yuvj", "gray", "nv12", "nv21")
+_STRETCH: Final[Bytes] = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8)
+"""Luma of limited range as full range, a value for each byte, (256,)."""
 
 
-class VideoImages:
+class VideoImages(ImageStream):
     """The frames of a video's first stream, at its presentation times.
 
     Args:
         path: the file.
         topic: its name without the ending, or None.
-        size: (height, width) of a frame.
 
     Raises:
         CdmisfaError: the package av is missing.
@@ -47,10 +47,9 @@ class VideoImages:
         "((Y - 16) * 510 + 219) // 438 where its range is limited"
     )
 
-    def __init__(self, path: Path, topic: str | None, size: tuple[int, int]) -> None:
+    def __init__(self, path: Path, topic: str | None) -> None:
         self.path = path
         self.topic = path.stem
-        self._size = size
         self._av = _pyav(path)
         self._next = _NOWHERE
         self._frames: Iterator[Any] = iter(())
@@ -67,16 +66,10 @@ class VideoImages:
         unsure = f"{path}: a video has no checksums, damaged pixels may go unnoticed"
         last, stated = int(self.times[-1]) / NANOSECONDS, self._stated_seconds
         short = f"{path}: it states {stated:g} s, its last frame is at {last:g} s"
-        self.warnings: Sequence[str] = [unsure, short] if stated > last + 1 else [unsure]
+        self.warnings = [unsure, short] if stated > last + 1 else [unsure]
 
-    def frame(self, row: int) -> Bytes:
-        """Decode a frame, (height, width) uint8.
-
-        Raises:
-            LogDamagedError: the video is broken there, or has other frames than it states.
-        """
+    def image(self, row: int) -> Bytes:
         stamp = int(self._stamps[row])
-        where = f"{self.path}: at {float(stamp * self._tick):g} s"
         with explained(self.path, "FFmpeg"):
             if not self._next <= row < self._next + _FORWARD:
                 self._container.seek(stamp, stream=self._stream, backward=True)
@@ -85,14 +78,13 @@ class VideoImages:
             self._next = row + 1
             if found is None or found.pts != stamp or found.is_corrupt:
                 self._next = _NOWHERE
-                raise LogDamagedError(f"{where}: the video is broken, no frame can be decoded")
-            try:
-                return shrink(self._gray(found), *self._size)
-            except MalformedRecord as error:
-                raise LogDamagedError(f"{where}: {error}") from None
+                raise MalformedRecord("the video is broken, no frame can be decoded")
+            return _gray(found)
+
+    def where(self, row: int) -> str:
+        return f"{self.path}: at {float(int(self._stamps[row]) * self._tick):g} s"
 
     def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
         container, self._container = self._container, None
         self._frames = iter(())
         if container is not None:
@@ -130,39 +122,25 @@ class VideoImages:
         self._stamps = np.sort(np.array(stamps, np.int64))
         if (np.diff(self._stamps) == 0).any():
             raise LogDamagedError(f"{self.path}: two of its frames have the same time")
-        self.count = len(stamps)
         self._stated_seconds = (self._container.duration or 0) / self._av.time_base
-        self.times = self._nanoseconds()
-        self._container.seek(0, stream=stream, backward=True)
-
-    def _nanoseconds(self) -> NDArray[np.uint64]:
-        """Times of the frames, from the video's beginning, or its first frame if that is before."""
+        # From the video's beginning, or its first frame if that is before.
         first = min(int(self._stamps[0]), 0)
         exact = [round((int(stamp) - first) * self._tick * NANOSECONDS) for stamp in self._stamps]
-        return sorted_times(f"{self.path}: it", exact)
-
-    def _gray(self, frame: Any) -> Bytes:
-        """The luma of a frame, or the grey of its colours, (height, width) uint8."""
-        form = frame.format
-        if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
-            colours = frame.to_ndarray(format="rgb24")
-            height, width = colours.shape[:2]
-            return gray(RawPixels(height, width, "rgb8", False, 3 * width, colours.tobytes()))
-        plane = frame.planes[0]
-        luma = gray(
-            RawPixels(frame.height, frame.width, "mono8", False, plane.line_size, memoryview(plane))
-        )
-        full = form.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
-        return luma if full else _STRETCH[luma]
+        self.times = sorted_times(f"{self.path}: it", exact)
+        self._container.seek(0, stream=stream, backward=True)
 
 
-def _stretch() -> Bytes:
-    """Luma of limited range as full range, a value for each byte, (256,) uint8."""
-    stretched: Bytes = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8)
-    return stretched
-
-
-_STRETCH: Final = _stretch()
+def _gray(frame: Any) -> Bytes:
+    """The luma of a frame, or the grey of its colours, (height, width) uint8."""
+    form = frame.format
+    if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
+        colours = frame.to_ndarray(format="rgb24")
+        height, width = colours.shape[:2]
+        return gray(colours.tobytes(), height, width, "rgb8")
+    plane = frame.planes[0]
+    luma = gray(memoryview(plane), frame.height, frame.width, "mono8", plane.line_size)
+    full = form.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
+    return luma if full else _STRETCH[luma]
 
 
 def _pyav(path: Path) -> Any:

@@ -16,9 +16,9 @@ from replay.integrity.survey import SCHEMA, ChannelSurvey, Problem, problems_of
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel, Schema
 from replay.mcap.tables import MessageTable
-from replay.storage.copied import fetched
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
+from replay.storage.opening import fetched
 
 
 @dataclass(slots=True)

@@ -21,9 +21,9 @@ from replay.integrity.survey import (
 from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
-from replay.storage.copied import fetched
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
+from replay.storage.opening import fetched
 
 
 @dataclass(frozen=True, slots=True)

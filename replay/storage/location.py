@@ -16,11 +16,7 @@ _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Url:
-    """A log on a server; as a text it shows neither password nor signature.
-
-    Attributes:
-        address: the whole URL.
-    """
+    """A log on a server, by its whole address; as a text it shows no password or signature."""
 
     address: str
 
@@ -60,7 +56,7 @@ class Url:
     @property
     def folder(self) -> bool:
         """Whether it names what is listed; only s3 lists."""
-        return self.scheme == "s3" and not {".mcap", ".partial"} & {self.suffix}
+        return self.scheme == "s3" and self.suffix not in (".mcap", ".partial")
 
 
 Location = Path | Url
@@ -80,25 +76,16 @@ def location(value: str | Path | Url) -> Location:
     if scheme not in SCHEMES:
         raise UsageError(f"{scheme}:// is not read: use one of {', '.join(SCHEMES)}, or a path")
     url = Url(scheme + value[len(found[1]) :])
+    if scheme == "s3" and url.address.removeprefix("s3://").strip("/"):
+        return url
     try:
         parts = urlsplit(url.address)
-        whole = bool(parts.netloc and parts.path.strip("/"))
     except ValueError:
-        whole = False
-    else:
-        _check_port(url)
-    if not whole and not (scheme == "s3" and url.address.removeprefix("s3://").strip("/")):
-        raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
-    return url
-
-
-def _check_port(url: Url) -> None:
-    """Refuse a port that no server can have.
-
-    Raises:
-        UsageError: it is no number up to 65535.
-    """
+        parts = urlsplit("")
     try:
-        _ = urlsplit(url.address).port if url.scheme != "s3" else None
+        _ = parts.port
     except ValueError:
         raise UsageError(f"{url} has no port: a port is a number up to 65535") from None
+    if not (parts.netloc and parts.path.strip("/")):
+        raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
+    return url

@@ -1,10 +1,15 @@
-"""Opening what a path or a URL names, to read at any place of it."""
+"""Opening what a path or a URL names: to read at any place of it, or as files of this machine."""
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
-from replay.storage.location import Location
+from cdmisfa.core.errors import CdmisfaError
+from replay.storage.listing import log_files
+from replay.storage.location import Location, Url
 from replay.storage.store import FileStore, Store
 
 
@@ -21,3 +26,33 @@ def open_store(place: Location) -> Store:
     from replay.storage.remote import RemoteStore
 
     return RemoteStore(place)
+
+
+@contextlib.contextmanager
+def fetched(place: Location) -> Iterator[Path]:
+    """Give a path as it is, and a URL as a copy that is gone afterwards.
+
+    Raises:
+        UsageError: there is no such object.
+        LogDamagedError: the server sends less than it says, or something else.
+        CdmisfaError: the server does not give it, or there is no room for it.
+    """
+    if not isinstance(place, Url):
+        yield place
+        return
+    with tempfile.TemporaryDirectory(prefix="cdmisfa-") as temporary:
+        folder = Path(temporary) / (place if place.folder else place.parent).name
+        folder.mkdir()
+        for log in log_files(place):
+            _copy(log, folder / log.name)
+        yield folder if place.folder else folder / place.name
+
+
+def _copy(log: Location, target: Path) -> None:
+    with contextlib.closing(open_store(log)) as source:
+        try:
+            with target.open("xb") as copy:
+                for block in source.blocks(0, source.size):
+                    copy.write(block)
+        except OSError as error:
+            raise CdmisfaError(f"{log}: cannot be copied to {target}: {error.strerror}") from None

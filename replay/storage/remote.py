@@ -27,12 +27,7 @@ _AT_ONCE: Final = 16
 
 
 class RemoteStore(Store):
-    """An object on a server, read part by part.
-
-    Attributes:
-        size: its bytes, as the server says.
-        tag: what the server calls this version of it: its ETag, or its date.
-    """
+    """An object on a server, read part by part; `tag` names its version (ETag or date)."""
 
     def __init__(self, url: Url) -> None:
         """Look for the object and read its beginning.
@@ -59,7 +54,7 @@ class RemoteStore(Store):
         self._keep(0, self._checked(first, 0, EDGE_BYTES))
 
     def read_at(self, offset: int, count: int) -> bytes:
-        """Read `count` bytes from `offset` on, fewer only at the end.
+        """`count` bytes from `offset` on, fewer only at the end.
 
         Raises:
             UnreachableError: the server does not give them.
@@ -86,7 +81,6 @@ class RemoteStore(Store):
         self._starts = [start for start, _ in self._spans]
 
     def close(self) -> None:
-        """Forget what was read; harmless when called twice."""
         self._drop_ahead()
         self._parts.clear()
         self._begins.clear()

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.storage.location import Location, Url
@@ -45,17 +45,8 @@ class Part:
     tag: str
 
 
-class Server(Protocol):
-    """Where parts come from."""
-
-    loop: asyncio.AbstractEventLoop
-
-    async def part(self, start: int, stop: int) -> Part:
-        """Fetch the bytes [start, stop), or up to the end."""
-
-
 class _HttpServer:
-    """An object of a web server."""
+    """An object of a web server; `part` fetches its bytes [start, stop), or up to the end."""
 
     def __init__(self, url: Url) -> None:
         import aiohttp
@@ -107,7 +98,7 @@ class _HttpServer:
 
 
 class _S3Server:
-    """An object of an S3 bucket."""
+    """An object of an S3 bucket, as `_HttpServer`."""
 
     def __init__(self, url: Url) -> None:
         self._files = _s3()
@@ -116,12 +107,9 @@ class _S3Server:
 
     async def part(self, start: int, stop: int) -> Part:
         try:
-            answer = await self._files._call_s3(
-                "get_object",
-                Bucket=self._bucket,
-                Key=self._key,
-                Range=f"bytes={start}-{stop - 1}",
-            )
+            place = {"Bucket": self._bucket, "Key": self._key}
+            span = f"bytes={start}-{stop - 1}"
+            answer = await self._files._call_s3("get_object", **place, Range=span)
         except OSError as error:
             if "InvalidRange" in f"{error} {error.__cause__!r}" and not start:
                 return Part(b"", 0, "")
@@ -147,7 +135,7 @@ def listed(url: Url) -> list[Url]:
         return [str(e["name"]) for e in await files._ls(url.address, detail=True, refresh=True)]
 
     try:
-        names = _waited(files.loop, keys())
+        names = asyncio.run_coroutine_threadsafe(keys(), files.loop).result(WAIT_SECONDS)
     except Exception as error:
         raise refusal(url, error) from None
     logs = [Url(f"s3://{n}") for n in sorted(names) if n.endswith((".mcap", ".mcap.partial"))]
@@ -167,9 +155,9 @@ def _range_of(text: str, start: int, stop: int) -> tuple[int, int]:
     return total, last + 1 - first
 
 
-def connect(url: Url) -> Server:
-    kind: type[_S3Server] | type[_HttpServer] = _S3Server if url.scheme == "s3" else _HttpServer
-    return _importing(lambda: kind(url))
+def connect(url: Url) -> _S3Server | _HttpServer:
+    """The server of an object, which is not asked for anything yet."""
+    return _importing(lambda: _S3Server(url) if url.scheme == "s3" else _HttpServer(url))
 
 
 def _s3() -> Any:
@@ -188,10 +176,6 @@ def _importing(make: Callable[[], Value]) -> Value:
         raise CdmisfaError(
             "reading URLs needs packages that are not installed: pip install 'cdmisfa[cloud]'"
         ) from None
-
-
-def _waited(loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, Value]) -> Value:
-    return asyncio.run_coroutine_threadsafe(work, loop).result(WAIT_SECONDS)
 
 
 def refusal(url: Location, error: BaseException) -> CdmisfaError:

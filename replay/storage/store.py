@@ -16,15 +16,7 @@ _PEEK: Final = 4096
 
 
 class Store(ABC):
-    """Bytes read at any place, short pieces through one small window; never past their end.
-
-    Args:
-        path: where they lie.
-
-    Attributes:
-        path: as given.
-        size: how many there are.
-    """
+    """`size` bytes at a path or URL, read at any place, short pieces through one small window."""
 
     size: int
 
@@ -35,7 +27,7 @@ class Store(ABC):
 
     @abstractmethod
     def read_at(self, offset: int, count: int) -> bytes:
-        """Read up to `count` bytes from `offset` on; none at the end.
+        """Up to `count` bytes from `offset` on; none at the end.
 
         Raises:
             LogDamagedError: they cannot be read.
@@ -107,31 +99,23 @@ class FileStore(Store):
             raise UsageError(f"{path}: not a file")
 
     def read_at(self, offset: int, count: int) -> bytes:
-        """Read up to `count` bytes from `offset` on.
-
-        Raises:
-            LogDamagedError: the disk does not give them.
-        """
         try:
             return os.pread(self._descriptor(), min(count, 1 << 30), offset)
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror}") from None
 
     def is_at(self, path: Path) -> bool:
-        """Whether a path leads to the very file that was opened."""
         try:
             return os.path.samestat(os.stat(path), os.fstat(self._descriptor()))
         except OSError:
             return False
 
     def grow(self) -> bool:
-        """Look at the size again; whether it grew."""
         before, self.size = self.size, os.fstat(self._descriptor()).st_size
         self._window = b""
         return self.size > before
 
     def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
