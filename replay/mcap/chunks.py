@@ -23,7 +23,7 @@ from replay.mcap.records import (
     chunk_header,
 )
 from replay.mcap.segments import Definitions, Segment
-from replay.mcap.tables import MessageTable, indexed_table, walked_table
+from replay.mcap.tables import MessageTable, Spans, indexed_table, walked_table
 from replay.storage.checksum import crc32
 from replay.storage.store import Store
 
@@ -85,12 +85,10 @@ class Chunks:
         if size > MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
         raw = self._file.read(first, size)
+        pairs = np.frombuffer
         return [
-            (
-                part.channel,
-                np.frombuffer(raw, "<u8", 2 * part.count, part.offset - first).reshape(-1, 2),
-            )
-            for part in segment.indexes
+            (p.channel, pairs(raw, "<u8", 2 * p.count, p.offset - first).reshape(-1, 2))
+            for p in segment.indexes
         ]
 
     def unpack(self, segment: Segment, out: Bytes) -> memoryview:
@@ -149,17 +147,15 @@ class Chunks:
             self._definitions.add(opcode, raw[start:stop].tobytes(), segment.name)
         return table
 
-    def _table_of(
-        self, segment: Segment, raw: Bytes
-    ) -> tuple[MessageTable, list[tuple[int, int, int]]]:
-        if segment.indexes:
-            try:
-                return indexed_table(raw, self.index(segment))
-            except MalformedRecord as error:
-                found = walked_table(raw)
-                self._note(segment.name, f"{error} (the index is not used)")
-                return found
-        return walked_table(raw)
+    def _table_of(self, segment: Segment, raw: Bytes) -> tuple[MessageTable, Spans]:
+        if not segment.indexes:
+            return walked_table(raw)
+        try:
+            return indexed_table(raw, self.index(segment))
+        except MalformedRecord as error:
+            found = walked_table(raw)
+            self._note(segment.name, f"{error} (the index is not used)")
+            return found
 
 
 def confirm(file: Store, segment: Segment) -> None:

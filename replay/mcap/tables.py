@@ -23,6 +23,9 @@ from replay.mcap.segments import Segment
 
 _NO_TIMES: Final = np.empty(0, np.uint64)
 
+Spans = list[tuple[int, int, int]]
+"""(opcode, start, stop) of the content of every definition in a chunk."""
+
 
 @dataclass(frozen=True, slots=True)
 class MessageTable:
@@ -54,7 +57,6 @@ class MessageTable:
         return self.headers["log_time"]
 
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
-        """Give the table of some rows."""
         return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
 
     def payload(self, row: int) -> bytes:
@@ -104,23 +106,18 @@ def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
     return MessageTable(data, headers, at, size)
 
 
-def walked_table(
-    raw: Bytes, *, cut: bool = False
-) -> tuple[MessageTable, list[tuple[int, int, int]]]:
+def walked_table(raw: Bytes, *, cut: bool = False) -> tuple[MessageTable, Spans]:
     """Build the table of a chunk by walking over its records.
 
     Args:
         raw: the chunk's records.
         cut: the chunk ends early; what is broken at its end is left out.
 
-    Returns:
-        The table, and (opcode, start, stop) of the content of every definition.
-
     Raises:
         MalformedRecord: the chunk holds something that is no record, or that has no place there.
     """
     offsets: list[int] = []
-    definitions: list[tuple[int, int, int]] = []
+    definitions: Spans = []
     try:
         for opcode, at, end in walk(raw.data):
             if opcode == Opcode.MESSAGE:
@@ -139,7 +136,7 @@ def walked_table(
 
 def indexed_table(
     data: Bytes, indexes: list[tuple[int, NDArray[np.uint64]]]
-) -> tuple[MessageTable, list[tuple[int, int, int]]]:
+) -> tuple[MessageTable, Spans]:
     """Build the table of a chunk from its message indexes, without touching each message.
 
     The index is believed only where it accounts for every byte of the chunk: what lies
@@ -149,9 +146,8 @@ def indexed_table(
         MalformedRecord: index and chunk contradict each other.
     """
     pairs = np.concatenate([pairs for _, pairs in indexes])
-    channels = np.repeat(
-        np.array([c for c, _ in indexes], np.uint16), [len(pairs) for _, pairs in indexes]
-    )
+    numbers = np.array([number for number, _ in indexes], np.uint16)
+    channels = np.repeat(numbers, [len(pairs) for _, pairs in indexes])
     if len(pairs) and pairs[:, 1].max() >= len(data):
         raise MalformedRecord("a message index points outside its chunk")
     offsets = pairs[:, 1].astype(np.int64)
@@ -164,7 +160,7 @@ def indexed_table(
     edges = np.empty((len(offsets) + 1, 2), np.int64)
     edges[1:, 0], edges[0, 0] = table.at + table.size, 0
     edges[:-1, 1], edges[-1, 1] = offsets, len(data)
-    definitions: list[tuple[int, int, int]] = []
+    definitions: Spans = []
     for low, high in edges[edges[:, 0] != edges[:, 1]].tolist():
         if low > high:
             raise MalformedRecord("its message index names overlapping messages")
@@ -214,13 +210,13 @@ def in_order(
 def _overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[Segment]]:
     """Group segments so that sorting within each group sorts all."""
     ordered = sorted(segments, key=lambda pair: (pair[1].start, pair[0]))
-    group: list[tuple[int, Segment]] = []
+    group: dict[int, Segment] = {}
     end, last = -1, -1
     for number, segment in ordered:
         if group and (segment.start > end or (segment.start == end and number > last)):
-            yield [s for _, s in sorted(group, key=lambda pair: pair[0])]
-            group, end, last = [], -1, -1
-        group.append((number, segment))
+            yield [group[place] for place in sorted(group)]
+            group, end, last = {}, -1, -1
+        group[number] = segment
         end, last = max(end, segment.end), max(last, number)
     if group:
-        yield [s for _, s in sorted(group, key=lambda pair: pair[0])]
+        yield [group[place] for place in sorted(group)]
