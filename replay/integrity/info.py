@@ -9,18 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from replay.integrity.survey import (
-    SCHEMA,
-    Crc,
-    Kind,
-    Problem,
-    crc_state,
-    kind_of,
-    problems_of,
-    survey,
-)
+from replay.integrity.survey import SCHEMA, Crc, Kind, Problem, survey
 from replay.mcap.reader import LogReader
 from replay.runs.folders import METADATA, RUN_FILE, read_manifest
+from replay.runs.log import record_version
 from replay.runs.messages import missing
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
@@ -44,12 +36,7 @@ class ChannelInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecordInfo:
-    """The record of signals that a run was written with.
-
-    Attributes:
-        version: its version.
-        missing: signals that it lacks, which are read as NaN.
-    """
+    """The version of the signals' record in a run, and the signals it lacks: they are NaN."""
 
     version: int
     missing: tuple[str, ...]
@@ -86,7 +73,7 @@ class LogInfo:
     signals: RecordInfo | None
 
     def as_json(self) -> dict[str, Any]:
-        """What was found as JSON values."""
+        """The description as JSON values."""
         return {"schema": SCHEMA, **asdict(self)}
 
 
@@ -124,8 +111,8 @@ def describe(path: str | Location) -> LogInfo:
 def _describe_file(path: Location) -> LogInfo:
     with LogReader(path, salvage=True) as reader:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
-        channels = []
-        for number, found in sorted(survey(reader, decode=decode).items()):
+        surveyed, channels = survey(reader, decode=decode), []
+        for number, found in sorted(surveyed.channels.items()):
             channel = reader.channels.get(number)
             schema = reader.schemas.get(channel.schema_id) if channel else None
             channels.append(
@@ -140,18 +127,19 @@ def _describe_file(path: Location) -> LogInfo:
                 )
             )
         metadata = {m.name: m.values for m in reader.metadata}
+        version = record_version(metadata.get(METADATA, {}))
         return LogInfo(
             path=str(path),
-            kind=kind_of(reader),
+            kind=surveyed.kind,
             channels=tuple(channels),
-            chunks=sum(1 for s in reader.segments if s.chunked),
+            chunks=sum(s.chunked for s in reader.segments),
             complete=reader.complete,
-            crc=crc_state(reader, decoded=decode),
-            problems=problems_of(reader),
+            crc=surveyed.crc,
+            problems=surveyed.problems,
             metadata={path.name: metadata},
             seed=None,
             ended=None,
-            signals=_signals(metadata),
+            signals=RecordInfo(version, missing(version)) if version else None,
         )
 
 
@@ -163,13 +151,6 @@ def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
             manifest = json.loads(values.get("manifest", "{}"))
             seeds.add(int(values.get("seed", manifest.get("seed"))))
     return seeds.pop() if len(seeds) == 1 else None
-
-
-def _signals(metadata: Mapping[str, Mapping[str, str]]) -> RecordInfo | None:
-    text = metadata.get(METADATA, {}).get("schema", "")
-    if text.isascii() and text.isdigit() and len(text) < 10:
-        return RecordInfo(int(text), missing(int(text)))
-    return None
 
 
 def _ended(path: Path) -> str | None:

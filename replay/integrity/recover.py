@@ -14,7 +14,6 @@ from recorder.log.logfile import LogFile
 from recorder.log.whole import PARTIAL
 from replay.integrity.survey import SCHEMA, ChannelSurvey, Problem, problems_of
 from replay.mcap.reader import LogReader
-from replay.mcap.records import Channel, Schema
 from replay.mcap.tables import MessageTable
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
@@ -89,15 +88,15 @@ def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) ->
 
 def _recover(src: Path, dst: Path, force: bool) -> Recovery:
     files = [file for file in log_files(src) if isinstance(file, Path)]
-    if src.is_dir() and dst.exists() and not dst.is_dir():
-        raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
+    targets = [dst]
+    if src.is_dir():
+        if dst.exists() and not dst.is_dir():
+            raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
+        targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
     try:
         (dst if src.is_dir() else dst.parent).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{dst}: {error.strerror}") from None
-    targets = [dst]
-    if src.is_dir():
-        targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
     for file, target in zip(files, targets, strict=True):
         if target.exists() and file.samefile(target):
             raise UsageError(f"{target}: cannot be recovered into itself, name another file")
@@ -149,7 +148,13 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:
     tallies = {number: _Tally() for number in channels}
     known: dict[int, int] = {}
     for number, channel in sorted(channels.items()):
-        known[number] = _register(log, channel, schemas.get(channel.schema_id))
+        schema = schemas.get(channel.schema_id)
+        known[number] = log.add_channel(
+            channel.topic,
+            log.add_schema(schema.name, schema.encoding, schema.data) if schema else 0,
+            encoding=channel.encoding,
+            metadata=channel.metadata,
+        )
     unverified = 0
     for segment, table in reader.tables(ordered=False):
         unverified += len(table) if segment.cut and segment.crc else 0
@@ -167,17 +172,8 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:
     return tallies, unverified
 
 
-def _register(log: LogFile, channel: Channel, schema: Schema | None) -> int:
-    number = 0 if schema is None else log.add_schema(schema.name, schema.encoding, schema.data)
-    return log.add_channel(
-        channel.topic, number, encoding=channel.encoding, metadata=channel.metadata
-    )
-
-
 def _tally(tallies: dict[int, _Tally], table: MessageTable) -> None:
-    for number in np.unique(table.channel).tolist():
-        if number not in tallies:
-            continue
+    for number in tallies.keys() & np.unique(table.channel).tolist():
         rows = table.select(table.channel == number)
         tally = tallies[number]
         tally.kept.add(rows.log_time)
@@ -189,24 +185,18 @@ def _tally(tallies: dict[int, _Tally], table: MessageTable) -> None:
 def _count_lost(reader: LogReader, tallies: dict[int, _Tally]) -> None:
     """How many messages are gone: by the writer's statistics, else by the index of each chunk."""
     stated = reader.statistics
-    damaged = [s for s in reader.segments if reader.table(s) is None]
+    counts = [s.channel_counts() for s in reader.segments if reader.table(s) is None]
     for number, tally in tallies.items():
         if stated is not None:
             tally.lost = max(stated.per_channel.get(number, 0) - tally.kept.messages, 0)
-            continue
-        counts = [s.channel_counts() for s in damaged]
-        if not reader.data_complete or None in counts:
+        elif not reader.data_complete or None in counts:
             tally.lost = None
         else:
             tally.lost = sum(c.get(number, 0) for c in counts if c is not None)
 
 
 def _compare(dst: Path, source: LogReader, tallies: dict[int, _Tally]) -> None:
-    """Read the new log with every checksum and compare it with what was written.
-
-    Raises:
-        LogDamagedError: they differ.
-    """
+    """Read the new log with every checksum and compare it with what was written."""
     with LogReader(dst) as reader:
         found = {number: _Tally() for number in reader.channels}
         numbers = dict(zip(sorted(reader.channels), sorted(tallies), strict=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -55,6 +55,16 @@ class ChannelSurvey:
             self.end = high if self.end is None else max(self.end, high)
 
 
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What one log is: its messages by channel number, its checksums, and what is wrong."""
+
+    kind: Kind
+    channels: Mapping[int, ChannelSurvey]
+    crc: Crc
+    problems: tuple[Problem, ...]
+
+
 def kind_of(reader: LogReader) -> Kind:
     """Tell a recording and a run from other logs by their metadata."""
     names = {m.name for m in reader.metadata}
@@ -63,8 +73,7 @@ def kind_of(reader: LogReader) -> Kind:
     return "run" if RUN in names else "foreign"
 
 
-def crc_state(reader: LogReader, *, decoded: bool) -> Crc:
-    """Say what the checksums of a log amount to."""
+def _crc(reader: LogReader, decoded: bool) -> Crc:
     if any("CRC" in problem.what for problem in reader.problems):
         return "bad"
     if not decoded:
@@ -78,8 +87,8 @@ def problems_of(reader: LogReader) -> tuple[Problem, ...]:
     return (*found, *([Problem(str(reader.path), reader.missing)] if reader.missing else ()))
 
 
-def survey(reader: LogReader, *, decode: bool) -> dict[int, ChannelSurvey]:
-    """Count the messages of each channel.
+def survey(reader: LogReader, *, decode: bool) -> Survey:
+    """Count the messages of each channel, and collect what is wrong.
 
     Args:
         reader: of a log; of one behind a URL the summary and few message indexes are read.
@@ -92,11 +101,11 @@ def survey(reader: LogReader, *, decode: bool) -> dict[int, ChannelSurvey]:
     found = {number: ChannelSurvey() for number in reader.channels}
     if reader.by_index:
         _survey_summary(reader, found)
-        return found
-    for segment in reader.segments:
-        for number, times in _times(reader, segment, decode):
-            found.setdefault(number, ChannelSurvey()).add(times)
-    return found
+    else:
+        for segment in reader.segments:
+            for number, times in _times(reader, segment, decode):
+                found.setdefault(number, ChannelSurvey()).add(times)
+    return Survey(kind_of(reader), found, _crc(reader, decode), problems_of(reader))
 
 
 def _times(reader: LogReader, segment: Segment, decode: bool) -> Iterator[tuple[int, Times]]:

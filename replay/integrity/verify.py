@@ -4,20 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.integrity.survey import (
-    SCHEMA,
-    Crc,
-    Kind,
-    Problem,
-    crc_state,
-    kind_of,
-    problems_of,
-    survey,
-)
+from replay.integrity.survey import SCHEMA, Crc, Kind, Problem, survey
 from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
@@ -28,12 +20,7 @@ from replay.storage.opening import fetched
 
 @dataclass(frozen=True, slots=True)
 class FileCheck:
-    """What the checksums of one log amount to.
-
-    Attributes:
-        file: the log.
-        crc: "absent" where nothing protects the messages of a log that is fine otherwise.
-    """
+    """The checksums of one log: "absent" where nothing protects its messages."""
 
     file: str
     crc: Crc
@@ -73,37 +60,37 @@ def check_log(path: str | Location) -> LogCheck:
     views: list[Location] = []
     with fetched(place) as copy:
         for file in log_files(copy):
-            state, kind = _check_file(file, problems)
-            files.append(FileCheck(str(file).replace(str(copy), str(place)), state))
+            crc, kind, found = _check_file(file)
+            problems += found
+            files.append(FileCheck(str(file).replace(str(copy), str(place)), crc))
             if kind == "recording":
                 views.append(file)
         if views:
-            _check_views(views, problems, alone=copy.is_file())
+            problems += _check_views(views, alone=copy.is_file())
     unique = dict.fromkeys(problem.moved(copy, place) for problem in problems)
     return LogCheck(tuple(unique), tuple(files))
 
 
-def _check_file(path: Location, problems: list[Problem]) -> tuple[Crc, Kind]:
+def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem]]:
     try:
         with LogReader(path, salvage=True) as reader:
             found = survey(reader, decode=True)
-            for number in found.keys() - reader.channels.keys():
-                what = f"holds messages of channel {number}, never defined"
-                problems.append(Problem(str(path), what))
-            there = sum(channel.messages for channel in found.values())
-            if reader.statistics and not reader.problems and reader.statistics.messages != there:
-                stated = reader.statistics.messages
-                what = f"its summary states {stated} messages, there are {there}"
-                problems.append(Problem(str(path), what))
-            problems += problems_of(reader)
-            return crc_state(reader, decoded=True), kind_of(reader)
+            wrong = [
+                f"holds messages of channel {number}, never defined"
+                for number in found.channels.keys() - reader.channels.keys()
+            ]
+            there = sum(channel.messages for channel in found.channels.values())
+            stated = reader.statistics.messages if reader.statistics else there
+            if stated != there and not reader.problems:
+                wrong.append(f"its summary states {stated} messages, there are {there}")
+            problems = [Problem(str(path), what) for what in wrong]
+            return found.crc, found.kind, [*problems, *found.problems]
     except LogDamagedError as error:
-        problems.append(_said(path, error))
-        return "bad", "foreign"
+        return "bad", "foreign", [_said(path, error)]
 
 
-def _check_views(paths: list[Location], problems: list[Problem], *, alone: bool) -> None:
-    sound, folder = True, paths[0].parent
+def _check_views(paths: list[Location], *, alone: bool) -> Iterator[Problem]:
+    sound, folder = True, str(paths[0].parent)
     streams: set[str] = set()
     names: set[str] = set()
     for path in paths:
@@ -114,21 +101,19 @@ def _check_views(paths: list[Location], problems: list[Problem], *, alone: bool)
                 edges = [(0, view.facts.first_frame), *view.ranges]
                 for (_, end), (start, _) in itertools.pairwise(edges):
                     if start > end:
-                        what = f"frames {end} to {start - 1} are missing"
-                        problems.append(Problem(str(path), what))
+                        yield Problem(str(path), f"frames {end} to {start - 1} are missing")
                 view.check()
         except LogDamagedError as error:
             sound = False
-            problems.append(_said(path, error))
+            yield _said(path, error)
     for name in () if alone else sorted(streams - names):
-        what = f"the view {name!r} of the recording has no file"
-        problems.append(Problem(str(folder), what))
+        yield Problem(folder, f"the view {name!r} of the recording has no file")
     if not sound:
         return
     try:
         source = RecordedSource(paths, salvage=True)
     except LogDamagedError as error:
-        problems.append(_said(paths[0], error, folder))
+        yield replace(_said(paths[0], error), where=folder)
         return
     with contextlib.closing(source):
         ends = {name: ranges[-1][1] for name, ranges in source.coverage().items()}
@@ -136,9 +121,9 @@ def _check_views(paths: list[Location], problems: list[Problem], *, alone: bool)
         for name, end in ends.items():
             if end > shortest:
                 what = f"the view {name!r} ends before frame {end}, another before {shortest}"
-                problems.append(Problem(str(folder), what))
+                yield Problem(folder, what)
 
 
-def _said(path: Location, error: LogDamagedError, where: Location | None = None) -> Problem:
-    """An error as a problem of the log that it names, or of another place."""
-    return Problem(str(where or path), str(error).removeprefix(f"{path}: "))
+def _said(path: Location, error: LogDamagedError) -> Problem:
+    """An error as a problem of the log that it names."""
+    return Problem(str(path), str(error).removeprefix(f"{path}: "))

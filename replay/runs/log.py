@@ -85,7 +85,15 @@ def read_header(path: Path) -> RunHeader:
         found = next((r.values for r in reader.metadata if r.name == METADATA), None)
     if found is None:
         raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
-    schema = _schema(log, found)
+    schema = record_version(found)
+    if schema < 1:  # asked first: all else may look different in a later one
+        text = found.get("schema", "")
+        raise LogDamagedError(f"{log}: its metadata {METADATA} is broken (schema {text[:20]!r})")
+    if schema > SCHEMA_VERSION:
+        raise UsageError(
+            f"{log} was written with version {schema} of the signals, this is version "
+            f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
+        )
     try:
         spec = json.loads(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
@@ -108,15 +116,7 @@ def count_iterations(path: Path) -> int:
         return sum(int(np.isin(table.channel, numbers).sum()) for table in tables)
 
 
-def _schema(log: Path, found: Mapping[str, str]) -> int:
-    """The version of the record, asked first: all else may look different in a later one."""
-    text = found.get("schema", "")
-    version = int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
-    if version < 1:
-        raise LogDamagedError(f"{log}: its metadata {METADATA} is broken (schema {text[:20]!r})")
-    if version > SCHEMA_VERSION:
-        raise UsageError(
-            f"{log} was written with version {version} of the signals, this is version "
-            f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
-        )
-    return version
+def record_version(metadata: Mapping[str, str]) -> int:
+    """The version of the signals' record that a run's metadata names, 0 where it names none."""
+    text = metadata.get("schema", "")
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
