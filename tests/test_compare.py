@@ -13,12 +13,13 @@ from replay.runs.writer import RunWriter
 
 
 def write_changed(path, iteration, name, change):
-    with RunWriter(path, VECTOR, {}) as writer:
-        for signals, block in run_of(VECTOR, 8, seed=3):
-            if signals.iteration == iteration:
-                value = change(np.array(getattr(signals, name)))
-                signals = dataclasses.replace(signals, **{name: value})
-            writer.block(block, signals, having(np.zeros((1, 2))))
+    writer = RunWriter(path, VECTOR, {})
+    for signals, block in run_of(VECTOR, 8, seed=3):
+        if signals.iteration == iteration:
+            value = change(np.array(getattr(signals, name)))
+            signals = dataclasses.replace(signals, **{name: value})
+        writer.block(block, signals, having(np.zeros((1, 2))))
+    writer.finish()
 
 
 def test_equal_runs_have_no_difference(tmp_path):
@@ -63,8 +64,9 @@ def test_one_nan_is_as_good_as_another(tmp_path):
 
 def test_a_run_that_ended_early_is_said_so(tmp_path):
     write_run(tmp_path / "a", VECTOR, 8, seed=3)
-    with RunWriter(tmp_path / "b", VECTOR, {}) as writer:
-        for signals, block in list(run_of(VECTOR, 8, seed=3))[:6]:
-            writer.block(block, signals, having(np.zeros((1, 2))))
+    writer = RunWriter(tmp_path / "b", VECTOR, {})
+    for signals, block in list(run_of(VECTOR, 8, seed=3))[:6]:
+        writer.block(block, signals, having(np.zeros((1, 2))))
+    writer.finish()
     difference = first_difference(tmp_path / "a", tmp_path / "b")
     assert str(difference) == "iteration 6: goes on against ended after 6 iterations"

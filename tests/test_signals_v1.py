@@ -82,9 +82,10 @@ def written(folder: Path, records: list[BlockSignals]) -> Path:
     truth = np.split(rows_of(OLD, "truth"), len(records))
     _, phi = parts_of(OLD, "phi")[0]
     folder.mkdir()
-    with RunWriter(folder / "run.mcap", header.spec, header.manifest) as writer:
-        for signals, x, world in zip(records, watched, truth, strict=True):
-            writer.block(Block(signals.stream, signals.t, x, world), signals, having(phi))
+    writer = RunWriter(folder / "run.mcap", header.spec, header.manifest)
+    for signals, x, world in zip(records, watched, truth, strict=True):
+        writer.block(Block(signals.stream, signals.t, x, world), signals, having(phi))
+    writer.finish()
     return folder
 
 

@@ -13,18 +13,14 @@ from numpy.typing import NDArray
 from cdmisfa.core.signals import SIGNALS, BlockSignals, Signal
 from replay.mcap.records import MalformedRecord
 from replay.runs.messages import NUMBERS
-from replay.runs.wire import Span, alike, column, spans
+from replay.runs.wire import alike, column, spans
 
 Decode = Callable[[bytes], BlockSignals]
 
 
 @dataclass(frozen=True, slots=True)
 class SignalColumns:
-    """Consecutive records whose values have the same shapes.
-
-    Attributes:
-        values: of each signal by its name, (n, *dims).
-    """
+    """Consecutive records of the same shapes: of each signal by its name the (n, *dims) values."""
 
     values: Mapping[str, NDArray[Any]]
 
@@ -87,13 +83,9 @@ def padded(signal: Signal, values: NDArray[Any], modules: int) -> NDArray[Any]:
 def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumns]:
     """Records as arrays, a new piece wherever a shape changes."""
     for _, group in groupby(records, key=_shapes):
-        alike_ones = list(group)
-        yield SignalColumns(
-            {
-                s.name: np.array([getattr(r, s.name) for r in alike_ones], dtype=s.dtype)
-                for s in SIGNALS.values()
-            }
-        )
+        records = list(group)
+        values = ((s, [getattr(r, s.name) for r in records]) for s in SIGNALS.values())
+        yield SignalColumns({s.name: np.array(found, dtype=s.dtype) for s, found in values})
 
 
 def columns_of_messages(messages: Sequence[bytes], decode: Decode) -> Iterator[SignalColumns]:
@@ -117,8 +109,7 @@ def _at_once(messages: Sequence[bytes], first: BlockSignals) -> SignalColumns | 
         places = spans(messages[0])
     except MalformedRecord:
         return None
-    fields: dict[str, Span] = {n: places[k] for n, k in NUMBERS.items() if k in places}
-    stored = {name: fields[name] for name in SIGNALS if name in fields}
+    stored = {name: places[NUMBERS[name]] for name in SIGNALS if NUMBERS[name] in places}
     rows = alike(messages, list(stored.values()))
     if rows is None:
         return None
@@ -129,11 +120,11 @@ def _at_once(messages: Sequence[bytes], first: BlockSignals) -> SignalColumns | 
         if signal.name not in stored:  # an empty array, or one that this version has not got
             values[signal.name] = np.broadcast_to(value, shape)
             continue
-        width = np.dtype(signal.dtype).itemsize * value.size
-        if stored[signal.name][1] - stored[signal.name][0] != width:
+        start, stop = stored[signal.name]
+        if stop - start != value.nbytes:
             return None
-        kind = np.dtype(signal.dtype).newbyteorder("<").str
-        found = column(rows, stored[signal.name], "u1" if signal.dtype == "bool" else kind)
+        kind = np.dtype("u1" if signal.dtype == "bool" else signal.dtype).newbyteorder("<")
+        found = column(rows, (start, stop), kind.str)
         if signal.dtype == "bool":
             if found.max(initial=0) > 1:
                 return None

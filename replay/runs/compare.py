@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import run_log
-from replay.runs.log import RunHeader, read_header
+from replay.runs.log import read_header
 from replay.runs.outline import Outline, read_outline
 from replay.runs.stretches import read_columns
 
@@ -27,8 +27,7 @@ class Difference:
             record and what both hold is the same.
         signal: name of its first signal that differs, or "" where one run has ended.
         place: index of the first element that differs; () for a scalar or a shape.
-        first: the value in the first run, as text.
-        second: the value in the second run, as text.
+        first: the value in the first run, as text; `second` that in the second one.
         versions: of the two runs' records, where they are not the same one.
     """
 
@@ -55,34 +54,20 @@ class Difference:
 
     def as_json(self) -> dict[str, Any]:
         """The difference as JSON values."""
-        return {
-            "iteration": self.iteration,
-            "signal": self.signal,
-            "place": list(self.place),
-            "first": self.first,
-            "second": self.second,
-            "versions": None if self.versions is None else list(self.versions),
-        }
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
 
-def first_difference(
-    first: Path, second: Path, headers: tuple[RunHeader, RunHeader] | None = None
-) -> Difference | None:
+def first_difference(first: Path, second: Path) -> Difference | None:
     """The first difference between two runs' signals, or None where every bit is the same.
 
     Runs of different versions of the record differ by that; the first difference is then
     sought among the signals that both hold.
 
-    Args:
-        first: a run.
-        second: another one.
-        headers: what stands at the beginning of their logs, where that was read already.
-
     Raises:
         UsageError: one of them is no run.
         LogDamagedError: one of them cannot be read.
     """
-    a, b = headers or (read_header(first), read_header(second))
+    a, b = read_header(first), read_header(second)
     versions = a.schema, b.schema
     found = _first_of(read_columns(first, a), read_columns(second, b), min(versions))
     if versions[0] == versions[1]:
@@ -123,7 +108,7 @@ def _difference(
     if x.shape != y.shape:
         return Difference(at, name, (), f"of shape {x.shape}", f"of shape {y.shape}")
     place = tuple(int(i) for i in np.argwhere(_differ(x, y))[0])
-    return Difference(at, name, place, _text(x[place]), _text(y[place]))
+    return Difference(at, name, place, repr(x[place].item()), repr(y[place].item()))
 
 
 def _row(x: NDArray[Any], y: NDArray[Any]) -> int:
@@ -142,21 +127,9 @@ def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
     return differ & ~(np.isnan(x) & np.isnan(y)) if differ.any() else differ
 
 
-def _text(value: Any) -> str:
-    """A number with every digit that tells it from its neighbours."""
-    return repr(value.item())
-
-
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A run in a table of runs.
-
-    Attributes:
-        name: of the run's folder.
-        outline: the run in short.
-        difference: where its signals first differ from the first run's; None where every
-            bit is the same, as for the first run itself.
-    """
+    """A run in a table of runs, and where its signals first differ from the first run's."""
 
     name: str
     outline: Outline
@@ -193,12 +166,6 @@ def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
     """
     rows: list[Row] = []
     for run in runs:
-        outline, found = read_outline(run), None
-        if rows:
-            found = first_difference(runs[0], run, (rows[0].outline.header, outline.header))
-        rows.append(Row(_name(run), outline, found))
+        name, outline = run_log(run).resolve().parent.name, read_outline(run)
+        rows.append(Row(name, outline, first_difference(runs[0], run) if rows else None))
     return tuple(rows)
-
-
-def _name(run: Path) -> str:
-    return run_log(run).resolve().parent.name

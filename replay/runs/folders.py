@@ -52,8 +52,7 @@ def is_run(path: Path) -> bool:
     """
     path = Path(path)
     if path.is_dir():
-        whole = path / RUN_FILE
-        return whole.is_file() or partial_path(whole).is_file()
+        return any(p.is_file() for p in (path / RUN_FILE, partial_path(path / RUN_FILE)))
     with LogReader(run_log(path)) as reader:
         return any(record.name == METADATA for record in reader.metadata)
 
@@ -71,9 +70,6 @@ def runs_in(folder: Path) -> list[Path]:
     """The folders of runs in a folder or in its `trials`; none where it is itself a run.
 
     Of a sweep's trials they are those that it was asked for last.
-
-    Args:
-        folder: of a sweep, or any other.
 
     Raises:
         LogDamagedError: the sweep's request cannot be read.

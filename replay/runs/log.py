@@ -56,11 +56,11 @@ class RunHeader:
         value = self.setting("learner", "delta")
         return float(value) if isinstance(value, int | float) else None
 
-    def setting(self, section: str, key: str, default: Any = None) -> Any:
-        """A value of the run's configuration, as `setting("learner", "delta")`."""
+    def setting(self, section: str, key: str) -> Any:
+        """A value of the run's configuration, as `setting("learner", "delta")`, or None."""
         config = self.manifest.get("config")
         table = config.get(section) if isinstance(config, Mapping) else None
-        return table.get(key, default) if isinstance(table, Mapping) else default
+        return table.get(key) if isinstance(table, Mapping) else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,41 +46,36 @@ _LATER = tuple(s.name for s in _BY_AGE if s.since > 1)
 NUMBERS = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
 """Number of each signal's field."""
 
-_HEAD = struct.Struct("<BqBIBI")
+_HEAD = struct.Struct("<BqBIB5s")
 """Tag and value of t, of the number of columns, and the values' tag and length.
 
-The length of the values is written as a varint of five bytes, which any reader
-takes and which has a fixed place.
+The length is a varint of five bytes, which any reader takes and which has a fixed place.
 """
 
 
 def _signals_file() -> descriptor_pb2.FileDescriptorProto:
-    """The message's definition, with each signal's symbol, unit and meaning as its comment."""
+    """The definition of the signals' message, with what each of them is as its comment."""
     file = descriptor_pb2.FileDescriptorProto(
         name="cdmisfa/block_signals.proto", package="cdmisfa", syntax="proto3"
     )
     definition = file.message_type.add(name="BlockSignals")
-    for signal in _BY_AGE:
+    for place, signal in enumerate(_BY_AGE):
         definition.field.add(
             name=signal.name,
             number=NUMBERS[signal.name],
             type=_TYPES[signal.dtype],
             label=_FIELD.LABEL_REPEATED if signal.dims else _FIELD.LABEL_OPTIONAL,
         )
-        _comment(file, len(definition.field) - 1, _sentence(signal))
+        _comment(file, place, _sentence(signal))
     definition.field.add(
         name=SHAPES, number=NUMBERS[SHAPES], type=_FIELD.TYPE_UINT32, label=_FIELD.LABEL_REPEATED
     )
-    _comment(
-        file,
-        len(definition.field) - 1,
-        "Sizes of the dimensions of " + ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS),
-    )
+    arrays = ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS)
+    _comment(file, len(_BY_AGE), f"Sizes of the dimensions of {arrays}")
     return file
 
 
 def _matrix_file() -> descriptor_pb2.FileDescriptorProto:
-    """The message's definition."""
     file = descriptor_pb2.FileDescriptorProto(
         name="cdmisfa/matrix.proto", package="cdmisfa", syntax="proto3"
     )
@@ -117,11 +112,8 @@ def encode_signals(signals: BlockSignals) -> bytes:
 def encode_matrix(t: int, matrix: NDArray[np.float64]) -> bytes:
     """(rows, columns) values from frame t on as the bytes of a message."""
     values = np.asarray(matrix, dtype="<f8")
-    return (
-        _HEAD.pack(0x09, t, 0x15, values.shape[1], 0x1A, _padded_varint(values.nbytes))
-        + bytes((values.nbytes >> 28 & 0x7F,))
-        + values.tobytes()
-    )
+    length = bytes(values.nbytes >> 7 * k & 0x7F | (k < 4) << 7 for k in range(5))
+    return _HEAD.pack(0x09, t, 0x15, values.shape[1], 0x1A, length) + values.tobytes()
 
 
 def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.float64]]:
@@ -147,7 +139,7 @@ def decode_matrices(
         LogDamagedError: one of them is no such message.
     """
     t, first = decode_matrix(messages[0], where)
-    values = _HEAD.size + 1, len(messages[0])
+    values = _HEAD.size, len(messages[0])
     known = encode_matrix(t, first) == messages[0]
     table = alike(messages, [(1, 9), values]) if known else None
     if table is None:
@@ -167,12 +159,7 @@ def missing(version: int) -> tuple[str, ...]:
 def decode_signals(
     data: bytes, where: str = "record", version: int = SCHEMA_VERSION
 ) -> BlockSignals:
-    """The record in the bytes of a message; NaN where its version lacks a signal.
-
-    Args:
-        data: what `encode_signals` of that version made.
-        where: what to name in an error.
-        version: of the record.
+    """The record in what `encode_signals` of a version made; NaN where that lacks a signal.
 
     Raises:
         LogDamagedError: the bytes are not such a message, or its sizes contradict its values.
@@ -197,11 +184,7 @@ def decode_signals(
 
 
 def iteration_of(data: bytes, where: str = "record") -> int:
-    """The iteration of the record in the bytes of a message.
-
-    Raises:
-        LogDamagedError: the bytes are not such a message.
-    """
+    """The iteration of the record in the bytes of a message."""
     return int(parsed(_SIGNALS, data, where).iteration)
 
 
@@ -209,7 +192,7 @@ def parsed(kind: Any, data: bytes, where: str) -> Any:
     """A message of some kind in its bytes.
 
     Raises:
-        LogDamagedError: the bytes are not such a message.
+        LogDamagedError: there is none in them.
     """
     try:
         return kind.FromString(data)
@@ -249,14 +232,6 @@ def _tag(name: str, wire_type: int) -> bytes:
 
 def _length_prefix(tag: bytes, length: int) -> bytes:
     return tag + (bytes((length,)) if length < 0x80 else varint(length))
-
-
-def _padded_varint(value: int) -> int:
-    """The first four of a varint's five bytes, as a little-endian number."""
-    number = 0
-    for byte in range(4):
-        number |= (value >> 7 * byte & 0x7F | 0x80) << 8 * byte
-    return number
 
 
 def _message_class(file: descriptor_pb2.FileDescriptorProto, name: str) -> Any:

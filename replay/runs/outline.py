@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,11 +78,6 @@ class Outline:
     policy: tuple[int, ...]
     lines: dict[str, Float]
 
-    @property
-    def delta(self) -> float | None:
-        """Threshold of eta-dot, where the configuration names it."""
-        return self.header.delta
-
     def streams(self, most: int) -> list[int]:
         """The most watched streams, at most so many, in their own order."""
         ranked = np.argsort(-self.visits, kind="stable")[:most]
@@ -94,12 +88,7 @@ class Outline:
         return self.header.spec.streams
 
     def span(self, *names: str, low: float | None = None) -> tuple[float, float] | None:
-        """A range that shows these lines without their few wildest values.
-
-        Args:
-            names: of the lines.
-            low: where the range must begin.
-        """
+        """A range, beginning at `low`, that shows these lines without their wildest values."""
         values = np.concatenate([self.lines[name] for name in names])
         values = values[np.isfinite(values)]
         if not len(values):
@@ -111,11 +100,7 @@ class Outline:
 
 
 class Tally:
-    """Sums a run up, as its records come.
-
-    Attributes:
-        header: what stands at the beginning of its log.
-    """
+    """Sums a run up, as its records come."""
 
     def __init__(self, header: RunHeader) -> None:
         self.header = header
@@ -140,15 +125,15 @@ class Tally:
 
     def _phase(self, columns: SignalColumns) -> Phase:
         """The last abstraction's phase, as far as it has come."""
-        module = int(columns["module"][-1])
+        module, before = int(columns["module"][-1]), self._last
         own = columns["module"] == module
-        before = self._last if self._last is not None and self._last.module == module else None
-        visits = np.bincount(columns["stream"][own], minlength=len(self._visits))
+        if before is None or before.module != module:
+            before = Phase(module, 0, 0, np.zeros_like(self._visits))
         return Phase(
             module,
-            int(own.sum()) + (before.blocks if before else 0),
-            int(columns["novel"][own].sum()) + (before.novel if before else 0),
-            visits + (before.visits if before else 0),
+            before.blocks + int(own.sum()),
+            before.novel + int(columns["novel"][own].sum()),
+            before.visits + np.bincount(columns["stream"][own], minlength=len(self._visits)),
         )
 
     def outline(self) -> Outline:
@@ -164,7 +149,9 @@ class Tally:
             saved=tuple(self._saved),
             last=self._last,
             policy=self._policy,
-            lines={name: _joined(parts) for name, parts in self._lines.items()},
+            lines={
+                name: np.concatenate([np.empty(0), *parts]) for name, parts in self._lines.items()
+            },
         )
 
 
@@ -191,7 +178,3 @@ def _save_of(columns: SignalColumns, place: int) -> Saved:
         eta=tuple(columns["eta"][place].tolist()),
         eta_dot=tuple(columns["eta_dot"][place].tolist()),
     )
-
-
-def _joined(parts: Sequence[Float]) -> Float:
-    return np.concatenate(parts) if parts else np.empty(0)

@@ -84,8 +84,8 @@ def read_stretches(
         LogDamagedError: a message is damaged, or a finished file is cut short.
     """
     log = run_log(path)
-    waiting = _Waiting(log, header or read_header(log))
-    spec = waiting.header.spec
+    header = header or read_header(log)
+    waiting, spec = _Waiting(log, header), header.spec
     with LogReader(log) as reader:
         wanted = {number: c.topic for number, c in reader.channels.items() if c.topic in topics}
         for _, table in reader.tables(ordered=False):
@@ -101,7 +101,8 @@ def read_stretches(
                 if topic is None or (topic == WATCHED_TOPIC and spec.images and t % every):
                     continue
                 if waiting.full(topic):
-                    yield waiting.stretch()
+                    stretch, waiting = waiting.stretch(), _Waiting(log, header)
+                    yield stretch
                 waiting.add(topic, t, bytes(data[at : at + size]))
         yield waiting.stretch()
         if not reader.complete and not log.name.endswith(PARTIAL):
@@ -126,9 +127,6 @@ class _Waiting:
     def __init__(self, log: Path, header: RunHeader) -> None:
         self.header = header
         self._log = log
-        self._empty()
-
-    def _empty(self) -> None:
         self._data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self._frames: dict[str, list[int]] = {topic: [] for topic in TOPICS}
         self._bytes = 0
@@ -145,19 +143,17 @@ class _Waiting:
         self._bytes += len(data)
 
     def stretch(self) -> Stretch:
-        """What waits, decoded; nothing waits any longer."""
+        """What waits, decoded."""
         log, spec, data = self._log, self.header.spec, self._data
         watched = self._pictures() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
         events = zip(data[EVENT_TOPIC], self._frames[EVENT_TOPIC], strict=True)
-        stretch = Stretch(
+        return Stretch(
             signals=self._records(),
             watched=watched,
             truth=self._rows(TRUTH_TOPIC, (len(spec.truth),)),
             phi=tuple(decode_matrix(d, f"{log} {PHI_TOPIC}") for d in data[PHI_TOPIC]),
             events=tuple(_event(d, t, log) for d, t in events),
         )
-        self._empty()
-        return stretch
 
     def _records(self) -> tuple[SignalColumns, ...]:
         where, version = f"{self._log} {SIGNALS_TOPIC}", self.header.schema
@@ -174,7 +170,8 @@ class _Waiting:
         shape = self.header.spec.frame_shape
         pixels = np.empty((len(data), *shape), dtype=np.uint8)
         for place, entry in zip(pixels, data, strict=True):
-            place[:] = _image(entry, shape, self._log)
+            image = parsed(RawImage_pb2.RawImage, entry, f"{self._log} {WATCHED_TOPIC}")
+            place[:] = _reshaped(np.frombuffer(image.data, np.uint8), shape, self._log)
         return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), pixels),)
 
     def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
@@ -187,7 +184,7 @@ class _Waiting:
 
 
 def _checked(columns: SignalColumns, streams: int, where: str) -> SignalColumns:
-    """Records as they are, where they are about streams that there are."""
+    """Records as they are, where they are about the run's streams."""
     watched, rewards = columns["stream"], columns["R"]
     if (
         watched.min() < 0
@@ -201,18 +198,10 @@ def _checked(columns: SignalColumns, streams: int, where: str) -> SignalColumns:
 
 
 def _event(data: bytes, t: int, log: Path) -> Event:
-    """What happened at frame t, in the bytes of its message."""
     entry = parsed(Log_pb2.Log, data, f"{log} {EVENT_TOPIC}")
     match = _ITERATION.fullmatch(entry.name)
     level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
     return Event(t, int(match[1]) if match else -1, entry.message, level)
-
-
-def _image(data: bytes, shape: tuple[int, ...], log: Path) -> NDArray[np.uint8]:
-    """The watched (height, width) image in the bytes of its message."""
-    pixels = parsed(RawImage_pb2.RawImage, data, f"{log} {WATCHED_TOPIC}").data
-    image: NDArray[np.uint8] = _reshaped(np.frombuffer(pixels, np.uint8), shape, log)
-    return image
 
 
 def _reshaped(values: NDArray[Any], shape: tuple[int, ...], log: Path) -> NDArray[Any]:

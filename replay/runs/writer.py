@@ -7,8 +7,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from foxglove_schemas_protobuf import Log_pb2
 
@@ -45,7 +44,7 @@ FLUSH_SECONDS = 1.0
 
 
 class RunWriter(Sink):
-    """Writes run.mcap; a context manager that finishes on success.
+    """Writes run.mcap: to the end with `finish`, or to wherever it was `abandon`ed.
 
     Args:
         path: the file's name.
@@ -95,18 +94,17 @@ class RunWriter(Sink):
             },
         )
         self._channels: dict[str, int] = {}
-        self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA, SCHEMAS[SIGNALS_SCHEMA])
-        for topic in (PHI_TOPIC, TRUTH_TOPIC):
-            self._add_channel(topic, MATRIX_SCHEMA, SCHEMAS[MATRIX_SCHEMA])
+        self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA)
+        self._add_channel(PHI_TOPIC, MATRIX_SCHEMA)
+        self._add_channel(TRUTH_TOPIC, MATRIX_SCHEMA)
         self._add_channel(EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
         self._images: list[ImageEncoder] = []
         if spec.images:
             height, width = spec.frame_shape
             self._images = [ImageEncoder(height, width, name) for name in spec.streams]
-            data = self._images[0].schema_data()
-            self._add_channel(WATCHED_TOPIC, ImageEncoder.schema, data)
+            self._add_channel(WATCHED_TOPIC, ImageEncoder.schema, self._images[0].schema_data())
         else:
-            self._add_channel(WATCHED_TOPIC, MATRIX_SCHEMA, SCHEMAS[MATRIX_SCHEMA])
+            self._add_channel(WATCHED_TOPIC, MATRIX_SCHEMA)
 
     @property
     def path(self) -> Path:
@@ -143,16 +141,9 @@ class RunWriter(Sink):
         self._write(EVENT_TOPIC, at, iteration, entry.SerializeToString())
 
     def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
-        """Copy what another log of the same run holds of its first iterations.
+        """Copy the first iterations of another log of the same run, and yield their signals.
 
         Messages are copied as they are, so a run that is resumed keeps its past bit for bit.
-
-        Args:
-            log: the log to copy from.
-            iterations: how many.
-
-        Yields:
-            The signals that were copied, in order.
         """
         where, taken = f"{log} {SIGNALS_TOPIC}", list[bytes]()
         with LogReader(log) as reader:
@@ -181,19 +172,8 @@ class RunWriter(Sink):
         """Leave a readable NAME.partial."""
         self._log.abandon()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._log.__exit__(kind, error, trace)
-
-    def _add_channel(self, topic: str, name: str, data: bytes) -> None:
-        schema = self._log.add_schema(name, ENCODING, data)
+    def _add_channel(self, topic: str, name: str, definition: bytes = b"") -> None:
+        schema = self._log.add_schema(name, ENCODING, definition or SCHEMAS[name])
         self._channels[topic] = self._log.add_channel(topic, schema)
 
     def _write(self, topic: str, at: int, iteration: int, data: bytes) -> None:

@@ -314,7 +314,7 @@ class RunLayout:
 
     def _convergence(self, name: str) -> rrb.View:
         """Eta-dot with delta well above the floor, and the saves."""
-        span, delta = self._outline.span("eta_dot", low=0.0), self._outline.delta
+        span, delta = self._outline.span("eta_dot", low=0.0), self._outline.header.delta
         if span is not None and delta is not None:
             span = 0.0, min(max(span[1], 2.5 * delta), 8 * delta)
         return self._lines(

@@ -40,7 +40,7 @@ def summary_text(outline: Outline, name: str, ended: str = "") -> str:
         lines.append(f"| {spec.streams[s]} | {outline.visits[s]} frames, {share:.0%} |")
     settings = [("seed", header.manifest.get("seed"))]
     settings += [(key, header.setting("learner", key)) for key in ("nu", "tau", "sigma")]
-    settings += [("delta", outline.delta)]
+    settings += [("delta", header.delta)]
     said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
     lines += ["", said, ""]
     if header.missing:
