@@ -17,7 +17,7 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.signals import BlockSignals, SignalsHash, values
-from recorder.world.oscillatory import OscillatorySource
+from recorder.world.oscillatory import OscillatorySource, one_period
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
 
@@ -368,7 +368,7 @@ def test_ten_thousand_streams() -> None:
     n = 10_000
     spec = SourceSpec(tuple(map(str, range(n))), (2,), "float64")
     learner = CuriousLearner(CONFIG, spec, 0)
-    tables = OscillatorySource().tables
+    tables = [one_period(name) for name in ("x1", "x2", "x3")]
     for k in range(100):
         stream = learner.stream
         frames = freeze(np.take(tables[stream % 3], range(100 * k, 100 * k + 100), 0, mode="wrap"))

@@ -24,13 +24,6 @@ Matrix = tuple[float, ...]
 Vector = NDArray[np.float64]
 
 
-def head_pose(neck: Vector, yaw: float) -> HeadPose:
-    """The head turned by `yaw` degrees to the left."""
-    half = math.radians(yaw) / 2
-    x, y, z = neck.tolist()
-    return HeadPose((x, y, z), (0.0, 0.0, math.sin(half), math.cos(half)))
-
-
 def eye_matrix(eyes: EyesConfig, neck: Vector, yaw: float, side: int) -> Matrix:
     """View matrix of an eye, column by column as OpenGL has it.
 
@@ -65,13 +58,13 @@ def perspective(vertical_fov: float, aspect: float, near: float, far: float) -> 
     """Projection matrix of a camera, column by column; degrees and metres."""
     scale = 1.0 / math.tan(math.radians(vertical_fov) / 2)
     depth = near - far
-    matrix = np.zeros((4, 4))
-    matrix[0, 0] = scale / aspect
-    matrix[1, 1] = scale
-    matrix[2, 2] = (near + far) / depth
-    matrix[2, 3] = 2 * near * far / depth
-    matrix[3, 2] = -1.0
-    return tuple(matrix.T.ravel().tolist())
+    columns = (
+        (scale / aspect, 0.0, 0.0, 0.0),
+        (0.0, scale, 0.0, 0.0),
+        (0.0, 0.0, (near + far) / depth, -1.0),
+        (0.0, 0.0, 2 * near * far / depth, 0.0),
+    )
+    return tuple(value for column in columns for value in column)
 
 
 def grey(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -122,7 +115,9 @@ class Eyes:
 
     def poses(self) -> Sequence[HeadPose]:
         """The head's pose in each view."""
-        return [head_pose(self._world.neck, yaw) for yaw in self._eyes.yaw]
+        x, y, z = self._world.neck.tolist()
+        halves = [math.radians(yaw) / 2 for yaw in self._eyes.yaw]
+        return [HeadPose((x, y, z), (0.0, 0.0, math.sin(h), math.cos(h))) for h in halves]
 
     def _plate(self, matrix: Matrix) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """The grey picture and the depth of the world as it is, to be drawn over."""

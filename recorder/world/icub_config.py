@@ -26,7 +26,8 @@ class TableConfig:
 
     def __post_init__(self) -> None:
         positive(self, "scene.table", "half_size", "thickness")
-        _colours("scene.table.colour", self.colour)
+        if not all(0 <= part <= 1 for part in self.colour):
+            raise UsageError(f"scene.table.colour is {self.colour}: each part must be in [0, 1]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,7 @@ class EyesConfig:
         within(self, "scene.eyes", 1.0, 170.0, "vertical_fov")
         within(self, "scene.eyes", -89.0, 89.0, "tilt")
         within(self, "scene.eyes", 1, 4096, "width", "height")
-        if len(self.views) != len(self.yaw) or not self.views:
+        if len(self.views) != len(self.yaw):
             raise UsageError(
                 f"scene.eyes.yaw has {len(self.yaw)} angles for the {len(self.views)} views of "
                 "scene.eyes.views: give one for each"
@@ -138,8 +139,3 @@ class IcubConfig(SceneConfig):
 def _range(key: str, limits: Range) -> None:
     if not -1e3 <= limits[0] <= limits[1] <= 1e3:
         raise UsageError(f"{key} is {limits}: give the lower limit first, both within 1 km")
-
-
-def _colours(key: str, parts: tuple[float, ...]) -> None:
-    if not all(0 <= part <= 1 for part in parts):
-        raise UsageError(f"{key} is {parts}: each part must be in [0, 1]")

@@ -7,12 +7,12 @@ where an object is at frame t depends on the seed and t alone.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import check_frame
 from recorder.world.icub_config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 
 CHUNK = 4096
@@ -22,7 +22,6 @@ _WORLD = 0x1C0B
 """Spawn key of the world: the learner may spawn its own generators from the same seed."""
 
 Float = NDArray[np.float64]
-
 
 Motion = Iterator[Float]
 """Positions of one object, (CHUNK, 2), chunk after chunk."""
@@ -76,11 +75,7 @@ class Motions:
     """
 
     def __init__(self, scene: IcubConfig, seed: int) -> None:
-        self._makers: list[Callable[[np.random.Generator], Motion]] = [
-            partial(toggling, scene.object1),
-            partial(uniform, scene.object2),
-            partial(walk, scene.object3),
-        ]
+        self._scene = scene
         self._seed = seed
         self._restart()
         self.seek(0)
@@ -91,18 +86,14 @@ class Motions:
         return self._t
 
     def seek(self, t: int) -> None:
-        """Go to frame t: drawing on when it lies ahead, from the start when behind.
-
-        Raises:
-            ValueError: t is negative.
-        """
-        if t < 0:
-            raise ValueError(f"frame {t} does not exist: the first is 0")
+        """Go to frame t: drawing on when it lies ahead, from the start when behind."""
+        check_frame(t)
         chunk = t // CHUNK
         if chunk < self._chunk:
             self._restart()
         while self._chunk < chunk:
-            self._next_chunk()
+            self._positions = np.stack([next(motion) for motion in self._motions], axis=1)
+            self._chunk += 1
         self._t = t
 
     def take(self, n: int) -> Float:
@@ -122,18 +113,18 @@ class Motions:
         return np.concatenate(parts)
 
     def _restart(self) -> None:
-        self._motions = [
-            make(np.random.Generator(np.random.PCG64(self._generator_seed(i))))
-            for i, make in enumerate(self._makers)
-        ]
+        box, cylinder, sphere = (
+            np.random.Generator(
+                np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=(_WORLD, i)))
+            )
+            for i in range(3)
+        )
+        self._motions = (
+            toggling(self._scene.object1, box),
+            uniform(self._scene.object2, cylinder),
+            walk(self._scene.object3, sphere),
+        )
         self._chunk = -1
-
-    def _next_chunk(self) -> None:
-        self._positions = np.stack([next(motion) for motion in self._motions], axis=1)
-        self._chunk += 1
-
-    def _generator_seed(self, index: int) -> np.random.SeedSequence:
-        return np.random.SeedSequence(self._seed, spawn_key=(_WORLD, index))
 
 
 def _uniform(unit: Float, limits: Range) -> Float:

@@ -135,11 +135,6 @@ class OscillatorySource(SeekableSource):
         """Global counter of the next frame."""
         return self._t
 
-    @property
-    def tables(self) -> Float:
-        """One period of every stream, (streams, 500, 2)."""
-        return np.stack(self._tables)
-
     def replace(self, stream: int, name: str) -> None:
         """From the next block on, show another signal on a stream (the abrupt swap)."""
         self._tables[stream] = one_period(name)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
-from PIL import Image
 
 from recorder.world.eyes import look, perspective
-from recorder.world.icub_config import IcubConfig
+from recorder.world.icub_config import IcubConfig, TableConfig
 from recorder.world.motions import Motions
 from recorder.world.world import World
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 SIZE = (960, 720)
 """Width and height of the picture, pixels."""
@@ -22,7 +24,7 @@ _TARGET = np.array([-0.36, 0.0, -0.16])
 _FOV = 29.0
 _LIGHT = (-0.6, -0.8, 1.4)
 _FLOOR = -0.6
-_TABLE_BACK, _TABLE_FRONT, _TABLE_SIDE = -0.3, -0.95, 0.75
+_TABLE_BACK, _TABLE_FRONT, _TABLE_SIDE, _HALF_THICKNESS = -0.3, -0.95, 0.75, 0.015
 
 
 def scene_picture(scene: IcubConfig) -> Image.Image:
@@ -34,9 +36,11 @@ def scene_picture(scene: IcubConfig) -> Image.Image:
     Raises:
         CdmisfaError: the simulator is not installed.
     """
+    from PIL import Image
+
     width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
     with contextlib.closing(World(scene, robot_seen=True)) as world:
-        _furnish(world, scene)
+        _furnish(world, scene.table)
         world.place(Motions(scene, scene.seed or 0).take(1)[0])
         world.turn_head(scene.eyes.yaw[len(scene.eyes.yaw) // 2])
         colours, _ = world.render(
@@ -49,14 +53,13 @@ def scene_picture(scene: IcubConfig) -> Image.Image:
     return Image.fromarray(colours[..., :3]).resize(SIZE, Image.Resampling.LANCZOS)
 
 
-def _furnish(world: World, scene: IcubConfig) -> None:
+def _furnish(world: World, table: TableConfig) -> None:
     """A floor and a table with legs in place of the endless table top."""
     world.hide_table()
-    table = dataclasses.replace(scene.table, thickness=0.03)
     centre = (_TABLE_BACK + _TABLE_FRONT) / 2
     depth = (_TABLE_BACK - _TABLE_FRONT) / 2
-    middle = table.top - table.thickness / 2
-    world.add_box((centre, 0.0, middle), (depth, _TABLE_SIDE, table.thickness / 2), table.colour)
+    middle = table.top - _HALF_THICKNESS
+    world.add_box((centre, 0.0, middle), (depth, _TABLE_SIDE, _HALF_THICKNESS), table.colour)
     length = (middle - _FLOOR) / 2
     for x in (_TABLE_BACK - 0.05, _TABLE_FRONT + 0.05):
         for y in (-_TABLE_SIDE + 0.05, _TABLE_SIDE - 0.05):

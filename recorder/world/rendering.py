@@ -58,7 +58,7 @@ def take_here(
         for request in requests(starts, frames):
             yield _take(source, request)
         return
-    first = min(starts.values())
+    first = min(starts.values(), default=frames)
     if first >= frames:
         return
     if source.t > first:

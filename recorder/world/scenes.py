@@ -14,7 +14,9 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.icub_config import IcubConfig
+from recorder.world.live import LiveSource
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
+from recorder.world.picture import scene_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -46,26 +48,14 @@ class Scene:
     packages: tuple[str, ...] = ()
 
 
-def _open_icub(config: IcubConfig, record: RecordConfig) -> SeekableSource:
-    from recorder.world.live import LiveSource  # which imports the simulator
-
-    return LiveSource(config, record)
-
-
 def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> SeekableSource:
     return OscillatorySource(config.streams, fps=record.fps, start_ns=record.start_ns)
-
-
-def _icub_picture(config: IcubConfig) -> Image:
-    from recorder.world.picture import scene_picture
-
-    return scene_picture(config)
 
 
 SCENES: Registry[Scene] = Registry(
     "scene",
     {
-        "icub": Scene(IcubConfig, _open_icub, "icub", _icub_picture, ("pybullet", "icub-models")),
+        "icub": Scene(IcubConfig, LiveSource, "icub", scene_picture, ("pybullet", "icub-models")),
         "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
     },
 )
