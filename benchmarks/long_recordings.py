@@ -32,10 +32,10 @@ def write_long(folder: Path, size: int) -> Path:
     frames = np.full((TAU, *SHAPE), 100, np.uint8)
     frames[np.arange(TAU), np.arange(TAU)] = 200
     truth = np.zeros((TAU, 2))
-    while log.size < size:
+    while log.file.size < size:
         log.write(Block(0, log.t, frames, truth))
-    log.finish()
-    return log.path
+    log.file.finish()
+    return log.file.path
 
 
 def play(path: Path) -> None:

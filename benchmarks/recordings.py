@@ -32,5 +32,5 @@ def write_pictures(folder: Path, n: int) -> Path:
     spec = SourceSpec(("left",), (48, 128), "uint8", ("x", "y"), 50.0, 10**18)
     log = ViewLog(folder, "left", Identity("noisy", 0, spec, {}), RecordConfig())
     log.write(Block(0, 0, noisy_pictures(n), np.zeros((n, 2))))
-    log.finish()
-    return log.path
+    log.file.finish()
+    return log.file.path

@@ -18,10 +18,10 @@ from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.log.folder import cleared, refuse_existing, view_logs
 from recorder.log.manifest import Manifest, keep_recording, read_recording
-from recorder.log.parts import ViewParts
-from recorder.log.resume import FramesHeld, Resume, frames_held, resume_view
+from recorder.log.resume import FramesHeld, frames_held, make_way, resume_view
 from recorder.log.split import Split
 from recorder.log.viewfacts import FASTEST, SLOWEST, Identity
+from recorder.log.viewlog import ViewParts
 from recorder.log.whole import whole
 from recorder.world.rendering import render_in_processes, take_here
 from recorder.world.scenes import SCENES, OpenScene, open_scene, scene_of
@@ -35,6 +35,9 @@ DEFAULT_FRAMES = 1000
 
 Progress = Callable[[float], None]
 """Told, after every block, how many frames have been written of every view."""
+
+Earlier = Mapping[str, Mapping[Path, FramesHeld]]
+"""What the files of each view hold that an earlier attempt left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,50 +136,51 @@ def record(
     chosen = [name for name in streams if not views or name in views]
     with ExitStack() as open_logs:
         open_logs.enter_context(cleared(folder, chosen if force else ()))
-        places = dict.fromkeys(chosen, Resume())
+        earlier: Earlier = {view: {} for view in chosen}
         if resume:
-            split = _as_begun(folder, identity, chosen, split)
-            earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in chosen}
-            frames = _length(folder, earlier, frames, length)
-            places = {
-                view: resume_view(folder, view, identity, split, there, frames)
-                for view, there in earlier.items()
-            }
+            earlier, split, frames = _as_begun(folder, identity, chosen, split, frames)
         frames = frames or length or DEFAULT_FRAMES
-        poses = dict(zip(streams, getattr(source, "head_poses", ()), strict=False))
-        logs = [
-            ViewParts(
-                folder, view, identity, settings, split=split, pose=poses.get(view), resume=place
-            )
-            for view, place in places.items()
-        ]
-        unfinished = [log.view for log in logs if not log.complete]
+        places = {
+            view: resume_view(folder, view, identity, split, there, frames)
+            for view, there in earlier.items()
+        }
+        unfinished = [view for view, place in places.items() if not place.complete]
         if unfinished:
             lengths = dict.fromkeys(unfinished, frames)
             limits = {} if split is None else dict.fromkeys(unfinished, str(split))
             options = {"seed": identity.seed, "frames": lengths, "split": limits}
             keep_recording(folder, unfinished, Manifest((identity.kind,), options))
-        for log in logs:
+        poses = dict(zip(streams, getattr(source, "head_poses", ()), strict=False))
+        parts = {view: list(place.parts) for view, place in places.items()}
+        logs: dict[int, ViewParts] = {}
+        for view, place in places.items():
+            log_to_resume = make_way(place)
+            if place.complete:
+                continue
+            log = ViewParts(
+                folder, view, identity, settings, split, poses.get(view), parts[view], place.first
+            )
             open_logs.callback(log.abandon)
-            log.open()
-        by_stream = {log.stream: log for log in logs}
-        starts = {log.stream: log.t for log in logs}
+            if log_to_resume is not None:
+                log.copy(log_to_resume, place.stop)
+            logs[streams.index(view)] = log
+        starts = {stream: log.t for stream, log in logs.items()}
         blocks = (
             render_in_processes(scene, starts, frames, jobs)
-            if scene and jobs > 1 and unfinished
+            if scene and jobs > 1 and logs
             else take_here(source, starts, frames)
         )
         with contextlib.closing(blocks):
             for block in blocks:
-                by_stream[block.stream].write(block)
+                logs[block.stream].write(block)
                 if progress is not None:
-                    progress(min(log.t for log in logs))
+                    progress(min(log.t for log in logs.values()))
                 if stop():
                     raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
-        for log in logs:
+        for log in logs.values():
             log.finish()
         keep_recording(folder, chosen)
-    return [written(log.view, path, n) for log in logs for path, n in log.parts]
+    return [_written(view, path, n) for view, done in parts.items() for path, n in done]
 
 
 def record_scene(
@@ -202,8 +206,7 @@ def record_scene(
         return record(source, folder, **options)
 
 
-def written(view: str, path: Path, frames: int) -> ViewRecording:
-    """What a finished file of a view came to."""
+def _written(view: str, path: Path, frames: int) -> ViewRecording:
     with path.open("rb") as file:
         checksum = hashlib.file_digest(file, "sha256").hexdigest()
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)
@@ -249,44 +252,20 @@ def _identity(
     )
 
 
-def _length(
-    folder: Path,
-    earlier: Mapping[str, Mapping[Path, FramesHeld]],
-    frames: int | None,
-    length: int | None,
-) -> int:
-    """Frames of each view of a recording that is resumed.
-
-    Raises:
-        UsageError: a file has more frames than are wanted.
-    """
-    longest = 0
-    for path, there in (item for files in earlier.values() for item in files.items()):
-        if frames is not None and there.end > frames:
-            raise UsageError(
-                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
-                f"nothing, give --frames {there.end} or more, or overwrite with --force"
-            )
-        longest = max(longest, there.end)
-    begun = read_recording(folder).options["frames"]
-    wanted = max((begun[view] for view in earlier if view in begun), default=0)
-    finished = all(
-        files and all(path.suffix == ".mcap" for path in files) for files in earlier.values()
-    )
-    return frames or max(longest, wanted or (0 if finished else length or DEFAULT_FRAMES))
-
-
 def _as_begun(
-    folder: Path, identity: Identity, views: Sequence[str], split: Split | None
-) -> Split | None:
-    """Where parts end in a recording that is resumed.
+    folder: Path, identity: Identity, views: Sequence[str], split: Split | None, frames: int | None
+) -> tuple[Earlier, Split | None, int]:
+    """What there is of a recording that is resumed, where its parts end, and its frames.
 
     Raises:
-        UsageError: it was begun with another scene, seed or split.
+        UsageError: it was begun with another scene, seed or split, or has more frames.
     """
     begun = read_recording(folder)
-    splits = begun.options["split"]
-    limit = min((splits[view] for view in views if view in splits), default=None)
+    limits, lengths = (
+        [begun.options[name][view] for view in views if view in begun.options[name]]
+        for name in ("split", "frames")
+    )
+    limit = min(limits, default=None)
     kind, seed = identity.kind, identity.seed
     for option, before, now in (
         ("", "".join(begun.source) or kind, kind),
@@ -298,7 +277,22 @@ def _as_begun(
                 f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
                 "same, or overwrite with --force"
             )
-    return split if split is not None or limit is None else Split.parse(limit)
+    if split is None and limit is not None:
+        split = Split.parse(limit)
+    earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in views}
+    unfinished = not all(
+        files and all(p.suffix == ".mcap" for p in files) for files in earlier.values()
+    )
+    if unfinished and not lengths:
+        lengths = [identity.spec.length or DEFAULT_FRAMES]
+    for path, there in (item for files in earlier.values() for item in files.items()):
+        if frames is not None and there.end > frames:
+            raise UsageError(
+                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
+                f"nothing, give --frames {there.end} or more, or overwrite with --force"
+            )
+        lengths.append(there.end)
+    return earlier, split, frames or max(lengths)
 
 
 def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = False) -> None:

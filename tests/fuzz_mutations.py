@@ -119,8 +119,8 @@ def _recording(folder: Path, compression: str) -> bytes:
     pixels = np.frombuffer(b"".join(map(frames_of, range(FRAMES))), np.uint8)
     truth = np.arange(FRAMES * 2, dtype=np.float64).reshape(FRAMES, 2)
     log.write(Block(0, 0, pixels.reshape(FRAMES, *SHAPE), truth))
-    log.finish()
-    return log.path.read_bytes()
+    log.file.finish()
+    return log.file.path.read_bytes()
 
 
 def _other(**options: object) -> bytes:

@@ -33,7 +33,7 @@ def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0):
     for stream, view in enumerate(views):
         log = ViewLog(folder, view, Identity("test", 3, spec, {}), RecordConfig())
         log.write(Block(stream, 0, freeze(pixels[stream].copy()), freeze(truth.copy())))
-        log.finish()
+        log.file.finish()
     return pixels, truth
 
 

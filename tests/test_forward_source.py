@@ -172,6 +172,18 @@ def test_streams_that_cannot_name_files_take_other_names(tmp_path: Path) -> None
     assert RecordedSource(tmp_path / "rec").spec.streams == ("a", "b")
 
 
+def test_a_dot_in_a_name_is_no_part(tmp_path: Path) -> None:
+    for frames in (60, 100):
+        files = record(
+            Webcams(("a.b", "c")),
+            tmp_path / "rec",
+            frames=frames,
+            split=Split(seconds=1),
+            resume=True,
+        )
+    assert [f.file.name for f in files][:2] == ["a.b-000.mcap", "a.b-001.mcap"]
+
+
 def test_what_no_recording_can_hold_is_refused(tmp_path: Path) -> None:
     source = Webcams()
     for spec, words in (

@@ -43,7 +43,7 @@ def write_pictures(folder: Path, **settings: object) -> list[Block]:
         identity = Identity("icub", 3, IMAGES, {})
         log = ViewLog(folder, name, identity, RecordConfig(**settings))  # type: ignore[arg-type]
         log.write(block)
-        log.finish()
+        log.file.finish()
     return blocks
 
 

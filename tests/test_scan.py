@@ -41,8 +41,8 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         settings = RecordConfig(compression=compression)
         log = ViewLog(folder, "left", Identity("icub", 3, PICTURES, {}), settings)
         log.write(block)
-        log.finish()
-        paths[compression] = log.path
+        log.file.finish()
+        paths[compression] = log.file.path
     return paths
 
 

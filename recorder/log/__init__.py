@@ -7,9 +7,8 @@ __getattr__, __dir__, __all__ = face(
     {
         "recorder.log.logfile": "LogFile",
         "recorder.log.manifest": "Manifest",
-        "recorder.log.parts": "ViewParts",
         "recorder.log.split": "Split",
         "recorder.log.viewfacts": "Identity ViewFacts",
-        "recorder.log.viewlog": "ViewLog",
+        "recorder.log.viewlog": "ViewLog ViewParts",
     },
 )

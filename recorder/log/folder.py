@@ -42,22 +42,15 @@ def part_name(view: str, number: int | None) -> str:
     return f"{view}.mcap" if number is None else f"{view}-{number:03d}.mcap"
 
 
-def part_number(path: Path) -> int:
-    """Number of a part by its file's name."""
-    return int(path.name.partition(".")[0].rpartition("-")[2])
+def part_number(path: Path, view: str) -> int | None:
+    """Number of a view's part by its file's name; None for the file of one that is not split."""
+    number = path.name.removeprefix(view).partition(".")[0]
+    return int(number[1:]) if number else None
 
 
-def view_logs(folder: Path, view: str, *, split: bool | None = None) -> list[Path]:
-    """Files of a view in a folder, finished or not.
-
-    Args:
-        folder: of the recording.
-        view: name of the view.
-        split: only parts, or only whole views; None for both.
-    """
-    parts = r"-\d{3,}"
-    middle = {True: parts, False: "", None: f"({parts})?"}[split]
-    pattern = re.compile(rf"{re.escape(view)}{middle}\.mcap(\.partial(\.kept)?)?")
+def view_logs(folder: Path, view: str) -> list[Path]:
+    """Files of a view in a folder, finished or not."""
+    pattern = re.compile(rf"{re.escape(view)}(-\d{{3,}})?\.mcap(\.partial(\.kept)?)?")
     return sorted(p for p in folder.iterdir() if pattern.fullmatch(p.name))
 
 
@@ -81,19 +74,12 @@ def cleared(folder: Path, views: Sequence[str]) -> Iterator[None]:
         UsageError: another process holds it.
         LogWriteError: it cannot be made, or they cannot be removed.
     """
-    with _naming(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    with held(folder):
-        with _naming(folder):
-            for view in views:
-                for old in view_logs(folder, view):
-                    old.unlink()
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(held(folder))
+            for old in (path for view in views for path in view_logs(folder, view)):
+                old.unlink()
+        except OSError as error:
+            raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
         yield
-
-
-@contextlib.contextmanager
-def _naming(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

@@ -11,8 +11,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Literal, Self
+from typing import Literal, Self
 
 from mcap.writer import CompressionType, Writer
 
@@ -23,12 +22,6 @@ FLUSH_NS = 1_000_000_000
 """Log time after which the chunk in progress is handed to the operating system."""
 
 Compression = Literal["zstd", "lz4", "none"]
-
-_COMPRESSION = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "none": CompressionType.NONE,
-}
 
 
 class LogFile:
@@ -65,13 +58,18 @@ class LogFile:
         self._flush_ns = flush_ns
         self._chunk_start: int | None = None
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        if not force:
-            self._refuse_existing()
-        self._stream = _LatchedStream(self.partial, self._open())
+        if self.path.exists() and not force:
+            raise UsageError(f"{self.path} exists: choose another name or overwrite with --force")
+        if self.partial.exists() and not force:
+            raise UsageError(
+                f"{self.partial} is left from a writing that was cut short: "
+                "recover or remove it, or overwrite with --force"
+            )
+        self._stream = _LatchedStream(self.partial, "wb" if force else "xb")
         self._writer = Writer(
             self._stream,  # type: ignore[arg-type]
             chunk_size=chunk_size,
-            compression=_COMPRESSION[compression],
+            compression=CompressionType[compression.upper()],
             enable_crcs=True,
             enable_data_crcs=True,
         )
@@ -196,7 +194,11 @@ class LogFile:
             )
         try:
             os.replace(self.partial, self.path)
-            _sync_folder(self.path.parent)
+            folder = os.open(self.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
         except OSError as error:
             raise _write_error(self.path, error) from error
 
@@ -212,31 +214,11 @@ class LogFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             self.abandon()
         elif not self.closed:
             self.finish()
-
-    def _refuse_existing(self) -> None:
-        if self.path.exists():
-            raise UsageError(f"{self.path} exists: choose another name or overwrite with --force")
-        if self.partial.exists():
-            raise UsageError(
-                f"{self.partial} is left from a writing that was cut short: "
-                "recover or remove it, or overwrite with --force"
-            )
-
-    def _open(self) -> BinaryIO:
-        try:
-            return open(self.partial, "wb" if self._force else "xb")
-        except OSError as error:
-            raise _write_error(self.partial, error) from error
 
 
 class _LatchedStream:
@@ -245,10 +227,13 @@ class _LatchedStream:
     The MCAP writer would go on after a failed write, and the log would have a hole in it.
     """
 
-    def __init__(self, path: Path, file: BinaryIO) -> None:
+    def __init__(self, path: Path, mode: Literal["wb", "xb"]) -> None:
         self._path = path
-        self._file = file
         self._error: OSError | None = None
+        try:
+            self._file = open(path, mode)  # noqa: SIM115 - open until `close`
+        except OSError as error:
+            raise _write_error(path, error) from error
 
     @property
     def closed(self) -> bool:
@@ -296,11 +281,3 @@ def _write_error(path: Path, error: OSError) -> LogWriteError:
         f"{path} cannot be written: {error.strerror or error}; "
         "check the free space and rights there, what was flushed is readable"
     )
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

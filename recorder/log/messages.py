@@ -7,7 +7,6 @@ because only the timestamp in front of it varies in length.
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -88,12 +87,11 @@ def truth_tags(names: Sequence[str]) -> list[bytes]:
 
 
 class _Encoder:
-    """Encodes one kind of message; every one has a timestamp."""
-
-    schema: str
+    """Encodes one kind of message, all of which have a timestamp; `schema` is its name."""
 
     def __init__(self, message: Any) -> None:
         self._message = message
+        self.schema: str = message.DESCRIPTOR.full_name
 
     def schema_data(self) -> bytes:
         """The FileDescriptorSet that describes the message."""
@@ -113,8 +111,6 @@ class ImageEncoder(_Encoder):
         frame_id: the coordinate frame the image belongs to.
     """
 
-    schema = IMAGE_SCHEMA
-
     def __init__(self, height: int, width: int, frame_id: str) -> None:
         super().__init__(
             RawImage_pb2.RawImage(
@@ -131,10 +127,10 @@ class ImageEncoder(_Encoder):
 class VectorEncoder(_Encoder):
     """Values of a stream as `cdmisfa.Vector`, exact to the bit."""
 
-    schema = VECTOR_SCHEMA
-
     def __init__(self) -> None:
-        super().__init__(_vector_class()())
+        repeated = _FIELD.LABEL_REPEATED
+        values = _FIELD(name="values", number=2, type=_FIELD.TYPE_DOUBLE, label=repeated)
+        super().__init__(_message("Vector", [values]))
 
     def __call__(self, time_ns: int, frame: NDArray[np.float64]) -> bytes:
         """Encode one frame, (I,) float64."""
@@ -152,11 +148,28 @@ class TruthEncoder(_Encoder):
         UsageError: a name that protobuf does not allow, or too many of them.
     """
 
-    schema = TRUTH_SCHEMA
-
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        super().__init__(_truth_class(self._names)())
+        if len(names) > MAX_TRUTH or len(set(names)) != len(names):
+            raise UsageError(f"ground truth needs at most {MAX_TRUTH} different names")
+        for name in names:
+            if not _NAME.fullmatch(name) or name == "timestamp":
+                raise UsageError(
+                    f"ground truth cannot be called {name!r}: use letters, digits and _"
+                )
+        # Explicit presence: a zero is written too, so that every message has the same layout.
+        fields = [
+            _FIELD(
+                name=name,
+                number=_FIRST_TRUTH_FIELD + i,
+                type=_FIELD.TYPE_DOUBLE,
+                label=_FIELD.LABEL_OPTIONAL,
+                proto3_optional=True,
+                oneof_index=i,
+            )
+            for i, name in enumerate(names)
+        ]
+        super().__init__(_message("GroundTruth", fields))
 
     def __call__(self, time_ns: int, values: NDArray[np.float64]) -> bytes:
         """Encode one row of ground truth, (D,) float64."""
@@ -167,8 +180,6 @@ class TruthEncoder(_Encoder):
 
 class PoseEncoder(_Encoder):
     """A pose in a frame as `foxglove.PoseInFrame`."""
-
-    schema = POSE_SCHEMA
 
     def __init__(self, frame_id: str) -> None:
         super().__init__(PoseInFrame_pb2.PoseInFrame(frame_id=frame_id))
@@ -199,36 +210,8 @@ def descriptor_set(descriptor: Any) -> bytes:
     return bytes(collected.SerializeToString(deterministic=True))
 
 
-@functools.cache
-def _vector_class() -> Any:
-    values = _FIELD(name="values", number=2, type=_FIELD.TYPE_DOUBLE, label=_FIELD.LABEL_REPEATED)
-    return _message_class("Vector", [values])
-
-
-@functools.cache
-def _truth_class(names: tuple[str, ...]) -> Any:
-    if len(names) > MAX_TRUTH or len(set(names)) != len(names):
-        raise UsageError(f"ground truth needs at most {MAX_TRUTH} different names")
-    fields = []
-    for number, name in enumerate(names, start=_FIRST_TRUTH_FIELD):
-        if not _NAME.fullmatch(name) or name == "timestamp":
-            raise UsageError(f"ground truth cannot be called {name!r}: use letters, digits and _")
-        # Explicit presence: a zero is written too, so that every message has the same layout.
-        fields.append(
-            _FIELD(
-                name=name,
-                number=number,
-                type=_FIELD.TYPE_DOUBLE,
-                label=_FIELD.LABEL_OPTIONAL,
-                proto3_optional=True,
-                oneof_index=number - _FIRST_TRUTH_FIELD,
-            )
-        )
-    return _message_class("GroundTruth", fields)
-
-
-def _message_class(name: str, fields: Sequence[Any]) -> Any:
-    """A message of package cdmisfa: a timestamp as field 1, then the fields."""
+def _message(name: str, fields: Sequence[Any]) -> Any:
+    """An empty message of package cdmisfa: a timestamp as field 1, then the fields."""
     file = descriptor_pb2.FileDescriptorProto(
         name=f"cdmisfa/{name}.proto",
         package="cdmisfa",
@@ -250,7 +233,7 @@ def _message_class(name: str, fields: Sequence[Any]) -> Any:
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(timestamp_pb2.DESCRIPTOR.serialized_pb)
     pool.AddSerializedFile(file.SerializeToString())
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"cdmisfa.{name}"))
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"cdmisfa.{name}"))()
 
 
 def varint(number: int) -> bytes:

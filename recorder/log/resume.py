@@ -7,18 +7,20 @@ bytes of a log that was never interrupted.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.folder import part_name, part_number
 from recorder.log.messages import METADATA, view_topic
 from recorder.log.split import Split
@@ -62,23 +64,25 @@ def frames_held(path: Path, view: str) -> FramesHeld:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """Where a view is resumed; without arguments at its beginning.
+    """Where a view is begun or resumed.
 
     Attributes:
-        parts: file and number of frames of each part that is finished, before the one to resume.
-        first: first frame of the part to resume.
+        path: file of the part to write.
+        parts: file and number of frames of each part that is finished.
+        first: first frame of the part to write.
         log: the earlier log that holds the most frames of that part, where one does.
         stop: it holds [first, stop).
-        complete: that log is the finished view, which stays as it is.
         stale: logs of which nothing is needed.
+        complete: whether the parts are the whole view, and nothing is to be written.
     """
 
-    parts: tuple[tuple[Path, int], ...] = ()
-    first: int = 0
+    path: Path
+    parts: tuple[tuple[Path, int], ...]
+    first: int
     log: Path | None = None
     stop: int = 0
-    complete: bool = False
     stale: tuple[Path, ...] = ()
+    complete: bool = False
 
 
 def resume_view(
@@ -103,7 +107,8 @@ def resume_view(
         UsageError: what is there is something else, or split in another way.
     """
     length = split.frames(identity.spec.fps) if split else None
-    other = next((path for path in there if (path.name in _names(view)) != (split is None)), None)
+    numbers = {path: part_number(path, view) for path in there}
+    other = next((p for p, number in numbers.items() if (number is None) != (split is None)), None)
     if other is not None:
         raise UsageError(
             f"{other} was recorded {'with' if split is None else 'without'} --split: "
@@ -113,17 +118,18 @@ def resume_view(
     first = 0
     while True:
         path = folder / part_name(view, None if split is None else len(parts))
-        found = {p: there[p].whole(first) for p in _attempts(path) if p in there}
-        later = [p for p in there if split is not None and part_number(p) > len(parts)]
-        best = max(found, key=lambda p: found[p], default=None)
-        if best is None or found[best] <= first:
+        attempts = (path, partial_path(path), kept_path(path))
+        found = {p: there[p].whole(first) for p in attempts if p in there}
+        later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
+        best = max(found, key=lambda p: found[p], default=path)
+        stop = found.get(best, first)
+        if stop == first:
             if path in found:
                 raise UsageError(
                     f"{path} holds no frames of {view} from {first} on: overwrite with --force"
                 )
-            place = Resume(tuple(parts), first, stale=(*found, *later))
+            place = Resume(path, tuple(parts), first, stale=(*found, *later))
             break
-        stop = found[best]
         _refuse_other(best, identity.facts(view, first))
         follows = best == path and bool(later)
         if length is not None and (stop - first > length or (follows and stop - first != length)):
@@ -131,9 +137,12 @@ def resume_view(
                 f"{best} has {stop - first} frames, with this --split it would have {length}: "
                 "use the same, or overwrite with --force"
             )
+        if best == path and stop == frames and not follows:
+            aside = tuple(p for p in found if p == kept_path(path))
+            parts.append((path, stop - first))
+            return Resume(path, tuple(parts), stop, stale=aside, complete=True)
         if not follows:
-            complete = best == path and stop == frames
-            place = Resume(tuple(parts), first, best, stop, complete, tuple(later))
+            place = Resume(path, tuple(parts), first, best, stop, tuple(later))
             break
         if stop >= frames:
             raise UsageError(
@@ -151,17 +160,27 @@ def resume_view(
     return place
 
 
-def keep(path: Path, log: Path) -> Path:
-    """Move the log to be resumed aside, and remove the poorer ones of the same file.
+def make_way(place: Resume) -> Path | None:
+    """Remove what is stale, and move the log to be resumed aside.
 
     Returns:
-        Where it is now.
+        Where that log is now, if there is one.
+
+    Raises:
+        LogWriteError: the disk does not allow it.
     """
-    kept = kept_path(path)
-    if log != kept:
-        os.replace(log, kept)
-    for other in (path, partial_path(path)):
-        other.unlink(missing_ok=True)
+    path, kept = place.path, kept_path(place.path)
+    try:
+        for old in place.stale:
+            old.unlink()
+        if place.log is None:
+            return None
+        if place.log != kept:
+            os.replace(place.log, kept)
+        for poorer in (path, partial_path(path)):
+            poorer.unlink(missing_ok=True)
+    except OSError as error:
+        raise LogWriteError(f"{path} cannot be continued: {error.strerror}") from error
     return kept
 
 
@@ -172,23 +191,15 @@ def kept_path(path: Path) -> Path:
 
 def messages(path: Path) -> Iterator[tuple[Channel, Message]]:
     """Messages in the order of the file, up to where it is damaged or torn."""
-    try:
-        with path.open("rb") as file:
-            reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT)
-            for _, channel, message in reader.iter_messages(log_time_order=False):
-                yield channel, message
-    except _DAMAGE:
-        return
+    read = partial(NonSeekingReader.iter_messages, log_time_order=False)
+    for _, channel, message in _undamaged(path, read):
+        yield channel, message
 
 
-def _attempts(path: Path) -> tuple[Path, Path, Path]:
-    """Where earlier attempts at a log may have left frames."""
-    return path, partial_path(path), kept_path(path)
-
-
-def _names(view: str) -> set[str]:
-    """Names that the logs of a view have that is not split."""
-    return {path.name for path in _attempts(Path(part_name(view, None)))}
+def _undamaged(path: Path, read: Callable[[NonSeekingReader], Iterator[Any]]) -> Iterator[Any]:
+    """What a reader of a log gives, up to where the log is damaged or torn."""
+    with contextlib.suppress(*_DAMAGE), path.open("rb") as file:
+        yield from read(NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT))
 
 
 def _refuse_other(path: Path, facts: ViewFacts) -> None:
@@ -197,12 +208,8 @@ def _refuse_other(path: Path, facts: ViewFacts) -> None:
     Raises:
         UsageError: it states other facts.
     """
-    try:
-        with path.open("rb") as file:
-            reader = NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT)
-            record = next((m for m in reader.iter_metadata() if m.name == METADATA), None)
-    except _DAMAGE:
-        record = None
+    records = _undamaged(path, NonSeekingReader.iter_metadata)
+    record = next((m for m in records if m.name == METADATA), None)
     if record is None:
         raise UsageError(f"{path} does not say what it is a recording of: overwrite with --force")
     for key, value in facts.as_metadata().items():

@@ -1,14 +1,17 @@
-"""The log of one view: its channels and its metadata."""
+"""The log of one view: its channels and metadata, as one file or as parts of limited size."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import Block, HeadPose
 from recorder.config import RecordConfig
+from recorder.log.folder import part_name
 from recorder.log.logfile import LogFile
 from recorder.log.messages import (
+    ENCODING,
     METADATA,
     POSE_TOPIC,
     TRUTH_TOPIC,
@@ -18,8 +21,9 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
-from recorder.log.resume import messages
-from recorder.log.viewfacts import Identity, version
+from recorder.log.resume import kept_path, messages
+from recorder.log.split import Split
+from recorder.log.viewfacts import MAX_FRAMES, Identity, version
 
 CONFIG_NAME = "config.json"
 ROOT_FRAME = "root"
@@ -41,8 +45,7 @@ class ViewLog:
         first_frame: with which the file begins.
 
     Attributes:
-        view: name of the view.
-        stream: its index.
+        file: the log itself, to be flushed, finished or abandoned.
         t: the next frame to be written.
     """
 
@@ -57,52 +60,37 @@ class ViewLog:
         name: str | None = None,
         first_frame: int = 0,
     ) -> None:
-        spec = identity.spec
-        self.view = view
-        self.stream = spec.streams.index(view)
         self.t = self._first = first_frame
-        self._spec = spec
+        self._spec = spec = identity.spec
+        self._stream = spec.streams.index(view)
+        self._topic = view_topic(view)
         self._pose = pose
         self._pose_every = max(round(spec.fps), 1)
-        self._frame: ImageEncoder | VectorEncoder
+        encoders: dict[str, Any] = {self._topic: VectorEncoder()}
         if spec.images:
             height, width = spec.frame_shape
-            self._frame = ImageEncoder(height, width, frame_id=view)
-        else:
-            self._frame = VectorEncoder()
-        self._truth = TruthEncoder(spec.truth)
-        self._head = PoseEncoder(ROOT_FRAME)
-        self._log = LogFile(
-            folder / (name or f"{view}.mcap"),
+            encoders[self._topic] = ImageEncoder(height, width, frame_id=view)
+        if spec.truth:
+            encoders[TRUTH_TOPIC] = TruthEncoder(spec.truth)
+        if pose is not None:
+            encoders[POSE_TOPIC] = PoseEncoder(ROOT_FRAME)
+        self.file = log = LogFile(
+            folder / (name or part_name(view, None)),
             library=f"cdmisfa {version('cdmisfa')}",
             compression=settings.compression,
             chunk_size=settings.chunk_size,
         )
-        self._log.add_metadata(METADATA, identity.facts(view, first_frame).as_metadata())
-        self._log.add_attachment(
+        log.add_metadata(METADATA, identity.facts(view, first_frame).as_metadata())
+        log.add_attachment(
             CONFIG_NAME, "application/json", identity.config_json(), log_time=spec.start_ns
         )
-        encoders: list[tuple[str, Any]] = [(view_topic(view), self._frame)]
-        if spec.truth:
-            encoders.append((TRUTH_TOPIC, self._truth))
-        if pose is not None:
-            encoders.append((POSE_TOPIC, self._head))
         self._channels = {
-            topic: self._log.add_channel(
-                topic, self._log.add_schema(encoder.schema, "protobuf", encoder.schema_data())
+            topic: (
+                log.add_channel(topic, log.add_schema(e.schema, ENCODING, e.schema_data())),
+                e,
             )
-            for topic, encoder in encoders
+            for topic, e in encoders.items()
         }
-
-    @property
-    def path(self) -> Path:
-        """The file's name once it is finished."""
-        return self._log.path
-
-    @property
-    def size(self) -> int:
-        """Bytes that were handed to the operating system: whole chunks."""
-        return self._log.size
 
     def write(self, block: Block) -> None:
         """Write the frames of a block, which must start at `t`.
@@ -111,19 +99,15 @@ class ViewLog:
             ValueError: the block is of another stream or time.
             LogWriteError: the disk does not take it.
         """
-        if block.stream != self.stream or block.t != self.t:
-            raise ValueError(f"{self.view}: frame {self.t} is next, not {block.t}")
-        write, channels = self._log.write, self._channels
-        image = channels[view_topic(self.view)]
-        truth, pose = channels.get(TRUTH_TOPIC), self._pose
+        if block.stream != self._stream or block.t != self.t:
+            raise ValueError(f"{self.file.path}: frame {self.t} is next, not {block.t}")
+        pose = self._pose
         for frame, values in zip(block.frames, block.truth, strict=True):
-            t, time = self.t, self._spec.time_ns(self.t)
-            if pose is not None and (t % self._pose_every == 0 or t == self._first):
-                data = self._head(time, pose.position, pose.quaternion)
-                write(channels[POSE_TOPIC], time, data, t)
-            if truth is not None:
-                write(truth, time, self._truth(time, values), t)
-            write(image, time, self._frame(time, frame), t)
+            if pose is not None and (self.t % self._pose_every == 0 or self.t == self._first):
+                self._write(POSE_TOPIC, pose.position, pose.quaternion)
+            if self._spec.truth:
+                self._write(TRUTH_TOPIC, values)
+            self._write(self._topic, frame)
             self.t += 1
 
     def copy(self, path: Path, stop: int) -> None:
@@ -136,22 +120,110 @@ class ViewLog:
             if message.sequence >= stop:
                 break
             if channel.topic in self._channels:
-                target = self._channels[channel.topic]
-                self._log.write(target, message.log_time, message.data, message.sequence)
+                number, _ = self._channels[channel.topic]
+                self.file.write(number, message.log_time, message.data, message.sequence)
         self.t = stop
 
-    def flush(self) -> None:
-        """Hand everything to the operating system.
+    def _write(self, topic: str, *values: Any) -> None:
+        number, encode = self._channels[topic]
+        time = self._spec.time_ns(self.t)
+        self.file.write(number, time, encode(time, *values), self.t)
 
-        Raises:
-            LogWriteError: the disk does not take it.
-        """
-        self._log.flush()
+
+class ViewParts:
+    """Writes one view: VIEW.mcap, or VIEW-000.mcap, VIEW-001.mcap, ... where it is split.
+
+    Where a part ends depends on its frames only, not on the blocks they came in.
+
+    Args:
+        folder: of the recording.
+        view: name of the view.
+        identity: what is recorded.
+        settings: how it is written.
+        split: where parts end; None for a single file.
+        pose: of the head in this view, where there is a head.
+        parts: file and number of frames of each part that is done; more are added.
+        first: first frame of the part that is next.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        view: str,
+        identity: Identity,
+        settings: RecordConfig,
+        split: Split | None,
+        pose: HeadPose | None,
+        parts: list[tuple[Path, int]],
+        first: int,
+    ) -> None:
+        self._parts = parts
+        self._view = view
+        self._split = split
+        self._length = split.frames(identity.spec.fps) if split else None
+        self._first = first
+        self._open = partial(ViewLog, folder, view, identity, settings, pose=pose)
+        self._log = self._next()
+
+    @property
+    def t(self) -> int:
+        """The next frame to be written."""
+        return self._log.t
+
+    def copy(self, path: Path, stop: int) -> None:
+        """Take over what an earlier attempt left of the part to be written; see `ViewLog`."""
+        self._log.copy(path, stop)
+
+    def write(self, block: Block) -> None:
+        """Write the frames of a block, which must start at `t`; see `ViewLog`."""
+        at = 0
+        while at < len(block):
+            n = min(self._room(), len(block) - at)
+            if n == 0:
+                self._begin_next()
+                continue
+            piece = slice(at, at + n)
+            self._log.write(
+                Block(block.stream, block.t + at, block.frames[piece], block.truth[piece])
+            )
+            at += n
 
     def finish(self) -> None:
-        """Give the file its index and its name."""
-        self._log.finish()
+        """Give the last part its index and its name, and forget what it was copied from."""
+        file = self._log.file
+        file.finish()
+        kept_path(file.path).unlink(missing_ok=True)
+        self._parts.append((file.path, self.t - self._first))
 
     def abandon(self) -> None:
         """Leave a readable partial."""
-        self._log.abandon()
+        self._log.file.abandon()
+
+    def _next(self) -> ViewLog:
+        """The log of the part that comes after those that are done."""
+        number = None if self._split is None else len(self._parts)
+        return self._open(name=part_name(self._view, number), first_frame=self._first)
+
+    def _room(self) -> int:
+        """Frames that the part takes before it must be looked at again; 0 where it is full."""
+        if self._split is None:
+            return MAX_FRAMES
+        written = self.t - self._first
+        if self._length is not None:
+            return self._length - written
+        return int(written == 0 or self._log.file.size < (self._split.size or 0))
+
+    def _begin_next(self) -> None:
+        """Begin a part before the one before is finished, so that some file is always open.
+
+        Whoever follows the recording sees that it continues.
+        """
+        full = self._log.file
+        full.flush()
+        self._parts.append((full.path, self.t - self._first))
+        self._first = self.t
+        try:
+            self._log = self._next()
+        finally:
+            full.finish()
+        kept_path(full.path).unlink(missing_ok=True)

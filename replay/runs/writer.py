@@ -102,7 +102,8 @@ class RunWriter(Sink):
         if spec.images:
             height, width = spec.frame_shape
             self._images = [ImageEncoder(height, width, name) for name in spec.streams]
-            self._add_channel(WATCHED_TOPIC, ImageEncoder.schema, self._images[0].schema_data())
+            encoder = self._images[0]
+            self._add_channel(WATCHED_TOPIC, encoder.schema, encoder.schema_data())
         else:
             self._add_channel(WATCHED_TOPIC, MATRIX_SCHEMA)
 
