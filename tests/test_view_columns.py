@@ -16,15 +16,16 @@ from replay.runs import stretches as stretch
 from replay.runs.columns import columns_of_messages, columns_of_records
 from replay.runs.log import read_header
 from replay.runs.messages import (
+    alike,
     decode_matrices,
     decode_matrix,
     decode_signals,
     encode_matrix,
     encode_signals,
+    spans,
 )
 from replay.runs.outline import read_outline
 from replay.runs.stretches import read_stretches
-from replay.runs.wire import alike, spans
 from replay.view.build import build_view
 
 ITERATIONS = 30

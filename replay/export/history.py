@@ -75,12 +75,9 @@ class History:
         outline: the run in short, of n iterations.
         shown: the streams that are drawn.
         stream: (n,) stream watched.
-        eta: (n, J) slowness.
-        eta_dot: (n, J) its change.
+        eta: (n, J), as eta_dot.
         stay_reward: (n, shown) R(s, stay, s).
         policy: (n, shown) 0 stay, 1 switch.
-        outputs: what the modules say about their streams.
-        pictures: what they saw.
     """
 
     outline: Outline
@@ -95,12 +92,7 @@ class History:
 
 
 def read_history(path: Path) -> History:
-    """Read what a run's figures need.
-
-    Raises:
-        UsageError: there is no such run.
-        LogDamagedError: it cannot be read.
-    """
+    """Read what a run's figures need; see `read_stretches`."""
     outline = read_outline(path)
     header, n, shown = outline.header, outline.iterations, outline.streams(SHOWN)
     stream = np.empty(n, dtype=np.int64)

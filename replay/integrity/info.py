@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from replay.integrity.survey import SCHEMA, Crc, Kind, Problem, survey
 from replay.mcap.reader import LogReader
+from replay.mcap.records import Channel
 from replay.runs.folders import METADATA, RUN_FILE, read_manifest
 from replay.runs.log import record_version
 from replay.runs.messages import missing
@@ -47,13 +48,10 @@ class LogInfo:
     """What is in a log, or in all logs of a folder.
 
     Attributes:
-        path: the log or the folder.
         kind: what the logs are; "foreign" where they are of several kinds.
-        channels: of all files.
         chunks: how many there are.
         complete: no file is cut short.
         crc: what the checksums amount to.
-        problems: what is wrong.
         metadata: of each file by its name, each record by its own.
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
@@ -68,9 +66,9 @@ class LogInfo:
     crc: Crc
     problems: tuple[Problem, ...]
     metadata: Mapping[str, Mapping[str, Mapping[str, str]]]
-    seed: int | None
-    ended: str | None
-    signals: RecordInfo | None
+    seed: int | None = None
+    ended: str | None = None
+    signals: RecordInfo | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The description as JSON values."""
@@ -113,12 +111,13 @@ def _describe_file(path: Location) -> LogInfo:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
         surveyed, channels = survey(reader, decode=decode), []
         for number, found in sorted(surveyed.channels.items()):
-            channel = reader.channels.get(number)
-            schema = reader.schemas.get(channel.schema_id) if channel else None
+            undefined = Channel(number, 0, f"(channel {number}, never defined)", "", {})
+            channel = reader.channels.get(number, undefined)
+            schema = reader.schemas.get(channel.schema_id)
             channels.append(
                 ChannelInfo(
-                    topic=channel.topic if channel else f"(channel {number}, never defined)",
-                    encoding=channel.encoding if channel else "",
+                    topic=channel.topic,
+                    encoding=channel.encoding,
                     schema=schema.name if schema else "",
                     messages=found.messages,
                     start_ns=found.start,
@@ -137,8 +136,6 @@ def _describe_file(path: Location) -> LogInfo:
             crc=surveyed.crc,
             problems=surveyed.problems,
             metadata={path.name: metadata},
-            seed=None,
-            ended=None,
             signals=RecordInfo(version, missing(version)) if version else None,
         )
 

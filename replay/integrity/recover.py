@@ -47,7 +47,6 @@ class Recovery:
 
     Attributes:
         out: the log or folder that was written.
-        channels: of all files.
         lost: what could not be saved.
         unverified: messages saved of a cut chunk, whose checksum cannot be checked.
     """

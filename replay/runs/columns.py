@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS, BlockSignals, Signal
 from replay.mcap.records import MalformedRecord
-from replay.runs.messages import NUMBERS
-from replay.runs.wire import alike, column, spans
+from replay.runs.messages import NUMBERS, alike, column, spans
 
 Decode = Callable[[bytes], BlockSignals]
 

@@ -158,12 +158,7 @@ HEAD = ("run", "seed", "iterations", "modules", "against the first run")
 
 
 def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
-    """What each run came to, and where it first differs from the first one.
-
-    Raises:
-        UsageError: one of them is no run.
-        LogDamagedError: one of them cannot be read.
-    """
+    """What each run came to, and its `first_difference` from the first one."""
     rows: list[Row] = []
     for run in runs:
         name, outline = run_log(run).resolve().parent.name, read_outline(run)

@@ -1,9 +1,4 @@
-"""run.mcap: what the learner thought in every iteration, with the frames it watched.
-
-One file holds the whole story of a run: its configuration, every `BlockSignals`,
-watched frames, ground truth, the abstraction's weights now and then, and what
-happened as text.
-"""
+"""run.mcap, the whole story of a run: what it was started with, and the topics of its messages."""
 
 from __future__ import annotations
 
@@ -37,13 +32,11 @@ class RunHeader:
         schema: version of `BlockSignals` it was written with.
         spec: what the learner's source delivered.
         manifest: what the run was started with: `config` by sections, `seed`, `source`.
-        watched_every: every how many frames an image was kept.
     """
 
     schema: int
     spec: SourceSpec
     manifest: Mapping[str, Any]
-    watched_every: int
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -98,12 +91,7 @@ def read_header(path: Path) -> RunHeader:
         spec = json.loads(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
-        return RunHeader(
-            schema=schema,
-            spec=SourceSpec(**spec),
-            manifest=json.loads(found["manifest"]),
-            watched_every=int(found["watched_every"]),
-        )
+        return RunHeader(schema, SourceSpec(**spec), json.loads(found["manifest"]))
     except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {METADATA} is broken ({error})") from error
 

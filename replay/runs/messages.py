@@ -7,7 +7,8 @@ version of the record follow all of the versions before.
 `cdmisfa.Matrix` holds rows of float64 from frame t on: a block's vectors, its ground truth, or
 the abstraction's weights.
 
-Every number has a fixed width, so what is read is, bit for bit, what was written.
+Every number has a fixed width, so what is read is, bit for bit, what was written. And messages
+whose sizes are the same differ in their values alone: one says where the values of all stand.
 """
 
 from __future__ import annotations
@@ -24,19 +25,27 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
 from recorder.log.messages import varint
-from replay.runs.wire import alike, column
+from replay.mcap.records import MalformedRecord
 
 SIGNALS_SCHEMA = "cdmisfa.BlockSignals"
 MATRIX_SCHEMA = "cdmisfa.Matrix"
 
+Span = tuple[int, int]
+"""Where a value begins and ends in a message."""
+
 SHAPES = "shapes"
 """Field with the sizes of every dimension of every array, the oldest arrays first."""
+
+_Field = tuple[str, int, Any, bool, str]
+"""A field's name, number and type, whether it is repeated, and its comment."""
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _TYPES = {"float64": _FIELD.TYPE_DOUBLE, "int64": _FIELD.TYPE_SFIXED64, "bool": _FIELD.TYPE_BOOL}
 _CODES = {"float64": "d", "int64": "q", "bool": "?"}
 _WIRE = {"float64": 1, "int64": 1, "bool": 0}
-_LENGTH_DELIMITED = 2
+_VARINT, _LENGTH_DELIMITED = 0, 2
+_WIDTHS = {1: 8, 5: 4}
+_LONGEST = 10  # bytes of a varint
 
 _BY_AGE = sorted(SIGNALS.values(), key=lambda s: s.since)
 _SCALARS = tuple(s for s in _BY_AGE if not s.dims)
@@ -51,42 +60,6 @@ _HEAD = struct.Struct("<BqBIB5s")
 
 The length is a varint of five bytes, which any reader takes and which has a fixed place.
 """
-
-
-def _signals_file() -> descriptor_pb2.FileDescriptorProto:
-    """The definition of the signals' message, with what each of them is as its comment."""
-    file = descriptor_pb2.FileDescriptorProto(
-        name="cdmisfa/block_signals.proto", package="cdmisfa", syntax="proto3"
-    )
-    definition = file.message_type.add(name="BlockSignals")
-    for place, signal in enumerate(_BY_AGE):
-        definition.field.add(
-            name=signal.name,
-            number=NUMBERS[signal.name],
-            type=_TYPES[signal.dtype],
-            label=_FIELD.LABEL_REPEATED if signal.dims else _FIELD.LABEL_OPTIONAL,
-        )
-        _comment(file, place, _sentence(signal))
-    definition.field.add(
-        name=SHAPES, number=NUMBERS[SHAPES], type=_FIELD.TYPE_UINT32, label=_FIELD.LABEL_REPEATED
-    )
-    arrays = ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS)
-    _comment(file, len(_BY_AGE), f"Sizes of the dimensions of {arrays}")
-    return file
-
-
-def _matrix_file() -> descriptor_pb2.FileDescriptorProto:
-    file = descriptor_pb2.FileDescriptorProto(
-        name="cdmisfa/matrix.proto", package="cdmisfa", syntax="proto3"
-    )
-    definition = file.message_type.add(name="Matrix")
-    for name, number, kind, label in (
-        ("t", 1, _FIELD.TYPE_SFIXED64, _FIELD.LABEL_OPTIONAL),
-        ("columns", 2, _FIELD.TYPE_FIXED32, _FIELD.LABEL_OPTIONAL),
-        ("values", 3, _FIELD.TYPE_DOUBLE, _FIELD.LABEL_REPEATED),
-    ):
-        definition.field.add(name=name, number=number, type=kind, label=label)
-    return file
 
 
 def encode_signals(signals: BlockSignals) -> bytes:
@@ -133,11 +106,7 @@ def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.f
 def decode_matrices(
     messages: Sequence[bytes], where: str = "record"
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Frames and rows of matrix messages of one size, at once where `encode_matrix` made them.
-
-    Raises:
-        LogDamagedError: one of them is no such message.
-    """
+    """Frames and rows of messages of one size, see `decode_matrix`; at once where it can be."""
     t, first = decode_matrix(messages[0], where)
     values = _HEAD.size, len(messages[0])
     known = encode_matrix(t, first) == messages[0]
@@ -201,6 +170,64 @@ def parsed(kind: Any, data: bytes, where: str) -> Any:
         raise LogDamagedError(f"{where}: not a {name} message, see cdmisfa verify") from error
 
 
+def spans(data: bytes) -> dict[int, Span]:
+    """Where the value of each field of a message stands, by the field's number.
+
+    Raises:
+        MalformedRecord: it is no message, or a field stands in it twice.
+    """
+    found: dict[int, Span] = {}
+    at = 0
+    while at < len(data):
+        key, at = _varint(data, at)
+        number, kind = key >> 3, key & 7
+        if kind == _VARINT:
+            end = _varint(data, at)[1]
+        elif kind == _LENGTH_DELIMITED:
+            length, at = _varint(data, at)
+            end = at + length
+        elif kind in _WIDTHS:
+            end = at + _WIDTHS[kind]
+        else:
+            raise MalformedRecord("a field of no known kind")
+        if end > len(data) or number in found:
+            raise MalformedRecord("a field runs over the end, or stands there twice")
+        found[number] = at, end
+        at = end
+    return found
+
+
+def alike(messages: Sequence[bytes], values: Sequence[Span]) -> NDArray[np.uint8] | None:
+    """Messages as (n, size) bytes, where they differ in these values alone; else None.
+
+    Args:
+        messages: at least one.
+        values: of the first message, not its shape: everything else must be the same in all.
+    """
+    size = len(messages[0])
+    if any(len(message) != size for message in messages):
+        return None
+    rows = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), size)
+    same = np.ones(size, dtype=bool)
+    for start, stop in values:
+        same[start:stop] = False
+    return rows if (rows[:, same] == rows[0, same]).all() else None
+
+
+def column(rows: NDArray[np.uint8], span: Span, dtype: str) -> NDArray[Any]:
+    """The values that stand at one place of n messages, (n, values of that place)."""
+    return np.ascontiguousarray(rows[:, span[0] : span[1]]).view(dtype)
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for k, byte in enumerate(data[at : at + _LONGEST]):
+        value |= (byte & 0x7F) << 7 * k
+        if byte < 0x80:
+            return value, at + k + 1
+    raise MalformedRecord("a number runs over the end")
+
+
 def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> NDArray[Any]:
     if len(shape) != len(signal.dims) or math.prod(shape) != len(values):
         raise LogDamagedError(
@@ -209,21 +236,26 @@ def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> N
     return np.array(values, dtype=signal.dtype).reshape(shape)
 
 
-def _comment(file: descriptor_pb2.FileDescriptorProto, field: int, text: str) -> None:
-    file.source_code_info.location.add(
-        path=[4, 0, 2, field], span=[field, 0, 0], leading_comments=f" {text}\n"
+def _file(name: str, stem: str, fields: Sequence[_Field]) -> descriptor_pb2.FileDescriptorProto:
+    """The definition of a message of our own, in a file of its own."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name=f"cdmisfa/{stem}.proto", package="cdmisfa", syntax="proto3"
     )
+    definition = file.message_type.add(name=name)
+    for place, (field, number, kind, many, comment) in enumerate(fields):
+        label = _FIELD.LABEL_REPEATED if many else _FIELD.LABEL_OPTIONAL
+        definition.field.add(name=field, number=number, type=kind, label=label)
+        if comment:
+            file.source_code_info.location.add(
+                path=[4, 0, 2, place], span=[place, 0, 0], leading_comments=f" {comment}\n"
+            )
+    return file
 
 
 def _sentence(signal: Signal) -> str:
-    parts = [signal.about.rstrip(".")]
-    if signal.symbol:
-        parts.append(f"symbol {signal.symbol}")
-    if signal.equation:
-        parts.append(f"equation {signal.equation}")
-    if signal.dims:
-        parts.append(f"dimensions {signal.dims}")
-    return "; ".join([*parts, f"unit {signal.unit}"]) + "."
+    facts = {"symbol": signal.symbol, "equation": signal.equation, "dimensions": signal.dims}
+    said = [f"{name} {value}" for name, value in facts.items() if value]
+    return "; ".join([signal.about.rstrip("."), *said, f"unit {signal.unit}"]) + "."
 
 
 def _tag(name: str, wire_type: int) -> bytes:
@@ -240,7 +272,20 @@ def _message_class(file: descriptor_pb2.FileDescriptorProto, name: str) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-_FILES = {SIGNALS_SCHEMA: _signals_file(), MATRIX_SCHEMA: _matrix_file()}
+_SIZES = ", ".join(f"{s.name} [{s.dims}]" for s in _ARRAYS)
+_SIGNAL_FIELDS: list[_Field] = [
+    *((s.name, NUMBERS[s.name], _TYPES[s.dtype], bool(s.dims), _sentence(s)) for s in _BY_AGE),
+    (SHAPES, NUMBERS[SHAPES], _FIELD.TYPE_UINT32, True, f"Sizes of the dimensions of {_SIZES}"),
+]
+_MATRIX_FIELDS: list[_Field] = [
+    ("t", 1, _FIELD.TYPE_SFIXED64, False, ""),
+    ("columns", 2, _FIELD.TYPE_FIXED32, False, ""),
+    ("values", 3, _FIELD.TYPE_DOUBLE, True, ""),
+]
+_FILES = {
+    SIGNALS_SCHEMA: _file("BlockSignals", "block_signals", _SIGNAL_FIELDS),
+    MATRIX_SCHEMA: _file("Matrix", "matrix", _MATRIX_FIELDS),
+}
 _SIGNALS, _MATRIX = (_message_class(file, name) for name, file in _FILES.items())
 
 SCHEMAS: Mapping[str, bytes] = {
@@ -252,12 +297,8 @@ SCHEMAS: Mapping[str, bytes] = {
 _TAGGED: tuple[Any, ...] = tuple(
     part for s in _SCALARS for part in (_tag(s.name, _WIRE[s.dtype]), None)
 )
-_STRUCT = struct.Struct(
-    "<"
-    + "".join(
-        f"{len(tag)}s{_CODES[s.dtype]}" for tag, s in zip(_TAGGED[::2], _SCALARS, strict=True)
-    )
-)
+_LAYOUT = (f"{len(tag)}s{_CODES[s.dtype]}" for tag, s in zip(_TAGGED[::2], _SCALARS, strict=True))
+_STRUCT = struct.Struct("<" + "".join(_LAYOUT))
 _ARRAY_TAGS = tuple(
     (s.name, np.dtype(s.dtype).newbyteorder("<"), _tag(s.name, _LENGTH_DELIMITED)) for s in _ARRAYS
 )

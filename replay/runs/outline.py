@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ LINES = ("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsi
 
 @dataclass(frozen=True, slots=True)
 class Saved:
-    """The iteration at whose end a module was saved."""
+    """What the record of the iteration at whose end a module was saved says, by its names."""
 
     module: int
     stream: int
@@ -33,11 +34,9 @@ class Saved:
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """The time in which one abstraction was learned.
+    """The blocks in which one abstraction was learned.
 
     Attributes:
-        module: its number.
-        blocks: of the phase.
         novel: how many of them the gate let through.
         visits: (S,) how many of them were of each stream.
     """
@@ -53,16 +52,13 @@ class Outline:
     """A run in short.
 
     Attributes:
-        header: what stands at the beginning of its log.
-        iterations: number of records.
-        frames: number of frames watched.
+        iterations: number of records; `frames` those watched.
         tau: frames of a block.
-        outputs: outputs of an abstraction.
+        outputs: of an abstraction.
         modules: most frozen modules in any iteration.
         visits: (S,) frames each stream was watched.
         saved: the saves, in order.
         last: the time since the last save.
-        policy: the last policy.
         lines: for each name of `LINES` its values, (n,) or (n J,).
     """
 
@@ -75,7 +71,6 @@ class Outline:
     visits: NDArray[np.int64]
     saved: tuple[Saved, ...]
     last: Phase | None
-    policy: tuple[int, ...]
     lines: dict[str, Float]
 
     def streams(self, most: int) -> list[int]:
@@ -108,7 +103,6 @@ class Tally:
         self._lines: dict[str, list[Float]] = {name: [] for name in LINES}
         self._saved: list[Saved] = []
         self._iterations = self._modules = self._tau = self._outputs = 0
-        self._policy: tuple[int, ...] = ()
         self._last: Phase | None = None
 
     def add(self, columns: SignalColumns) -> None:
@@ -120,7 +114,6 @@ class Tally:
         self._modules = max(self._modules, columns["y_frozen"].shape[1])
         self._saved += [_save_of(columns, i) for i in np.flatnonzero(columns["saved"]).tolist()]
         self._iterations += len(columns)
-        self._policy = tuple(columns["policy"][-1].tolist())
         self._last = self._phase(columns)
 
     def _phase(self, columns: SignalColumns) -> Phase:
@@ -148,7 +141,6 @@ class Tally:
             visits=self._visits.copy(),
             saved=tuple(self._saved),
             last=self._last,
-            policy=self._policy,
             lines={
                 name: np.concatenate([np.empty(0), *parts]) for name, parts in self._lines.items()
             },
@@ -156,12 +148,7 @@ class Tally:
 
 
 def read_outline(path: Path) -> Outline:
-    """Read a run through once.
-
-    Raises:
-        UsageError: there is no such run.
-        LogDamagedError: it cannot be read.
-    """
+    """Read a run through once; see `read_stretches`."""
     tally = Tally(read_header(path))
     for columns in read_columns(path, tally.header):
         tally.add(columns)
@@ -169,12 +156,6 @@ def read_outline(path: Path) -> Outline:
 
 
 def _save_of(columns: SignalColumns, place: int) -> Saved:
-    return Saved(
-        module=int(columns["module"][place]),
-        stream=int(columns["stream"][place]),
-        iteration=int(columns.iterations[place]),
-        t=int(columns.frames[place]),
-        policy=tuple(columns["policy"][place].tolist()),
-        eta=tuple(columns["eta"][place].tolist()),
-        eta_dot=tuple(columns["eta_dot"][place].tolist()),
-    )
+    found = ((field.name, columns[field.name][place].tolist()) for field in fields(Saved))
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in found}
+    return Saved(**values)

@@ -67,7 +67,7 @@ class LiveView(Sink):
         *,
         port: int | None = None,
     ) -> None:
-        outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest, 1), tau, outputs)
+        outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest), tau, outputs)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
         self._recording.set_log_time_enabled(False)
         if not rr.is_enabled(self._recording):
@@ -187,6 +187,5 @@ def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
         visits=np.zeros(streams, dtype=np.int64),
         saved=(),
         last=None,
-        policy=(),
         lines={name: np.empty(0) for name in LINES},
     )
