@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cdmisfa.cli.options import Command
+from cdmisfa.cli import options
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -24,37 +24,33 @@ def _height_and_width(
     return int(found[2]), int(found[1])
 
 
-def camera_options(command: Command) -> Command:
-    """`--topic`, `--size`, `--align` and `--rate`."""
-    for option in (
-        click.option(
-            "--rate",
-            type=click.FloatRange(1e-3, 1e6),
-            metavar="HZ",
-            help="Frames a second of camera logs; by default the first stream's.",
-        ),
-        click.option(
-            "--align",
-            type=click.Choice(["index", "time"]),
-            help="Put camera streams that differ on one clock: the i-th image of each, or the "
-            "last image at each time. By default they are refused.",
-        ),
-        click.option(
-            "--size",
-            callback=_height_and_width,
-            metavar="WxH",
-            help="Shrink camera images to this size; by default 128x48.",
-        ),
-        click.option(
-            "--topic",
-            "topics",
-            multiple=True,
-            metavar="TOPIC",
-            help="A topic of images in a log, one stream each; repeatable.",
-        ),
-    ):
-        command = option(command)
-    return command
+camera_options = options.together(
+    click.option(
+        "--topic",
+        "topics",
+        multiple=True,
+        metavar="TOPIC",
+        help="A topic of images in a log, one stream each; repeatable.",
+    ),
+    click.option(
+        "--size",
+        callback=_height_and_width,
+        metavar="WxH",
+        help="Shrink camera images to this size; by default 128x48.",
+    ),
+    click.option(
+        "--align",
+        type=click.Choice(["index", "time"]),
+        help="Put camera streams that differ on one clock: the i-th image of each, or the "
+        "last image at each time. By default they are refused.",
+    ),
+    click.option(
+        "--rate",
+        type=click.FloatRange(1e-3, 1e6),
+        metavar="HZ",
+        help="Frames a second of camera logs; by default the first stream's.",
+    ),
+)
 
 
 def say_about(source: FrameSource) -> None:

@@ -37,47 +37,58 @@ OUT = WrittenPath(path_type=Path)
 """Type of every option that says where something is written."""
 
 
-def as_json(command: Command) -> Command:
-    """`--json`: one JSON document on stdout instead of words."""
-    return click.option(
-        "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
-    )(command)
+as_json = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
+)
+
+seed = click.option(
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    default=0,
+    show_default=True,
+    help="Seed of every random choice.",
+)
+
+settings = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set a configuration key, as learner.nu=0.02; may be repeated.",
+)
+
+preset = click.option(
+    "--preset",
+    metavar="NAME",
+    help="Preset (icub, oscillatory) or a .toml file; by default the one of the source.",
+)
+
+force = click.option("--force", is_flag=True, help="Overwrite what is already there.")
+
+jobs = click.option(
+    "--jobs",
+    type=click.IntRange(1, 1024),
+    default=1,
+    show_default=True,
+    help="Parallel processes.",
+)
 
 
-def seed(command: Command) -> Command:
-    """`--seed`: where every random generator of the command starts."""
-    return click.option(
-        "--seed",
-        type=click.IntRange(0, 2**63 - 1),
-        default=0,
+def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Several options as one, in the order in which --help lists them."""
+    return lambda command: functools.reduce(lambda c, option: option(c), reversed(each), command)
+
+
+engine = together(
+    click.option(
+        "--engine",
+        type=click.Choice(["local", "dask"]),
+        default="local",
         show_default=True,
-        help="Seed of every random choice.",
-    )(command)
-
-
-def settings(command: Command) -> Command:
-    """`--set key=value`, any number of times."""
-    return click.option(
-        "--set",
-        "settings",
-        multiple=True,
-        metavar="KEY=VALUE",
-        help="Set a configuration key, as learner.nu=0.02; may be repeated.",
-    )(command)
-
-
-def preset(command: Command) -> Command:
-    """`--preset`: a named configuration or a TOML file."""
-    return click.option(
-        "--preset",
-        metavar="NAME",
-        help="Preset (icub, oscillatory) or a .toml file; by default the one of the source.",
-    )(command)
-
-
-def force(command: Command) -> Command:
-    """`--force`: permission to overwrite."""
-    return click.option("--force", is_flag=True, help="Overwrite what is already there.")(command)
+        help="Where to compute.",
+    ),
+    click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler that runs."),
+)
 
 
 def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:
@@ -85,41 +96,9 @@ def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]
     return click.option("-o", "--out", type=OUT, required=required, help=meaning)
 
 
-def jobs(command: Command) -> Command:
-    """`--jobs`: parallel processes."""
-    return click.option(
-        "--jobs",
-        type=click.IntRange(1, 1024),
-        default=1,
-        show_default=True,
-        help="Parallel processes.",
-    )(command)
-
-
-def engine(command: Command) -> Command:
-    """`--engine` and `--scheduler`: where trials are computed."""
-    for option in (
-        click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler that runs."),
-        click.option(
-            "--engine",
-            type=click.Choice(["local", "dask"]),
-            default="local",
-            show_default=True,
-            help="Where to compute.",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
 def path_argument(name: str) -> Callable[[Command], Command]:
     """A path; whether it exists is for the library to say, in its own words."""
     return click.argument(name, type=click.Path(path_type=Path))
-
-
-def place_argument(name: str) -> Callable[[Command], Command]:
-    """A path or a URL, as a text; whether it exists is for the library to say."""
-    return click.argument(name)
 
 
 def fetched_argument(name: str) -> Callable[[Command], Command]:

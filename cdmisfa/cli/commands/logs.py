@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command("info")
-@options.place_argument("path")
+@click.argument("path")
 @options.as_json
 @click.pass_context
 def info_command(ctx: click.Context, path: str, as_json: bool) -> None:
@@ -65,7 +65,7 @@ def _clock(ns: int | None) -> str:
 
 
 @click.command("verify")
-@options.place_argument("path")
+@click.argument("path")
 @options.as_json
 @click.pass_context
 def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
@@ -87,7 +87,7 @@ def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
 
 
 @click.command("recover")
-@options.place_argument("path")
+@click.argument("path")
 @options.out("The whole log to write.", required=True)
 @options.force
 @options.as_json
