@@ -14,6 +14,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from cdmisfa.experiments.documents import markdown
+
 RESULTS = Path(__file__).parent / "results"
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 
@@ -64,12 +66,6 @@ def platform_facts() -> dict[str, Any]:
     }
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
-
-
 def save(
     name: str,
     title: str,
@@ -102,7 +98,7 @@ def save(
 
 def section(document: Mapping[str, Any]) -> str:
     """The part of the page that shows one benchmark's results."""
-    tables = [table(t["header"], t["rows"]) for t in document["tables"]]
+    tables = [markdown(t["header"], t["rows"]) for t in document["tables"]]
     facts = ", ".join(f"{key} {value}" for key, value in document["platform"].items())
     return "\n\n".join(
         [f"## {document['title']}", document["note"], *tables, f"Measured on: {facts}."]

@@ -14,8 +14,8 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.checkpoint import Checkpoints, checkpoints
 from cdmisfa.experiments.loop import ENDINGS, Digest, learn
+from cdmisfa.experiments.resume import Checkpoints, checkpoints
 from cdmisfa.paper.demo import Shown
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter

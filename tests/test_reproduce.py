@@ -16,7 +16,7 @@ import pytest
 
 from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.core.errors import NotReproducedError, UsageError
-from cdmisfa.experiments.manifest import versions
+from cdmisfa.experiments.documents import versions
 from cdmisfa.paper import difficulty, icub, nonstationary, reproduce
 from cdmisfa.paper.reproduce import Request, Trial
 from recorder.world.oscillatory import OscillatorySource

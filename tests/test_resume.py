@@ -24,12 +24,13 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.checkpoint import (
+from cdmisfa.experiments.resume import (
+    SET_ASIDE,
     checkpoints,
+    differences,
     load_checkpoint,
     newest_covered,
 )
-from cdmisfa.experiments.manifest import SET_ASIDE, differences
 from cdmisfa.experiments.runs import RunResult, run
 from recorder.config import RecordConfig
 from recorder.recording import record_scene

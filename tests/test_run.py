@@ -16,8 +16,8 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.core.signals import SignalsHash
+from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import ENDINGS
-from cdmisfa.experiments.manifest import write_json
 from cdmisfa.experiments.runs import RunResult
 from cdmisfa.experiments.runs import run as run_it
 from recorder.world.oscillatory import OscillatorySource

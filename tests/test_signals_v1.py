@@ -18,7 +18,7 @@ from run_data import VECTOR, having, parts_of, rows_of, write_run
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
-from cdmisfa.experiments.manifest import refuse_difference
+from cdmisfa.experiments.resume import refuse_difference
 from replay.runs.compare import first_difference
 from replay.runs.log import read_header
 from replay.runs.messages import decode_signals, encode_signals

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, TypeVar, cast
 import click
 
 from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.experiments.documents import plain
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -142,35 +142,14 @@ def quoted(path: str | Path) -> str:
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """One JSON document on stdout; what JSON has no number for (NaN) becomes null."""
-    click.echo(json.dumps(_plain(document), allow_nan=False))
+    """One JSON document on stdout; see `plain`."""
+    click.echo(json.dumps(plain(document), allow_nan=False))
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """A plain table in aligned columns on stdout."""
-    click.echo(table(head, rows))
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """Rows of cells in aligned columns under a ruled head."""
+    """Rows of cells in aligned columns under a ruled head, on stdout."""
     cells = [[str(cell) for cell in row] for row in (head, *rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in cells]
-    lines.insert(1, "  ".join("-" * w for w in widths))
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def _plain(value: Any) -> Any:
-    match value:
-        case Mapping():
-            return {str(k): _plain(v) for k, v in value.items()}
-        case float():
-            return value if math.isfinite(value) else None
-        case Path():
-            return str(value)
-        case list() | tuple():
-            return [_plain(v) for v in value]
-        case _ if hasattr(value, "tolist"):
-            return _plain(value.tolist())
-        case _:
-            return value
+    cells.insert(1, ["-" * width for width in widths])
+    for row in cells:
+        click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())

@@ -23,15 +23,17 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.experiments.checkpoint import (
+from cdmisfa.experiments.documents import versions, write_json
+from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.resume import (
+    COMMAND,
+    SET_ASIDE,
     Checkpoints,
     checkpoints,
     newest_covered,
     restore,
     set_aside,
 )
-from cdmisfa.experiments.loop import Digest, learn
-from cdmisfa.experiments.manifest import COMMAND, SET_ASIDE, versions, write_json
 from cdmisfa.features.incsfa import strict
 from recorder.log.folder import held
 

@@ -16,8 +16,8 @@ from typing import Any, cast
 
 from cdmisfa.core.config import LearnerConfig, as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.engines import WorkerDied, run_all
-from cdmisfa.experiments.manifest import write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
 from cdmisfa.experiments.store import DONE, FAILED, TrialStore, code, identity

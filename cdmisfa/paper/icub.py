@@ -62,7 +62,7 @@ def recording_of(request: Request) -> Path:
     folder = request.folder.parent / "icub-recording"
     finished = folder / "finished.json"
     if not finished.exists():
-        from cdmisfa.experiments.manifest import write_json
+        from cdmisfa.experiments.documents import write_json
         from recorder.recording import record_scene
 
         views = record_scene(

@@ -11,9 +11,8 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -22,8 +21,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.registry import did_you_mean
+from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.engines import WorkerDied, run_all
-from cdmisfa.experiments.manifest import versions, write_json
 from cdmisfa.experiments.statistics import Summary, summary, wilson
 from cdmisfa.experiments.store import DONE, TrialStore, code, identity
 from recorder.log.whole import whole
@@ -106,7 +105,7 @@ def share(quantity: str, paper: str, good: int, n: int) -> Line:
 class Claim:
     """A qualitative statement of the paper, and whether it came out."""
 
-    text: str
+    claim: str
     holds: bool
     detail: str
 
@@ -209,26 +208,35 @@ def reproduce(
     findings = module.evaluate(trials)
     write_rows(request.folder / "rows.parquet", trials)
     figures = module.draw(trials, request.folder)
-    table = [_plain_line(line) for line in findings.lines]
-    document = {
-        "schema": 1,
-        "experiment": name,
-        "title": module.TITLE,
-        "quick": request.quick,
-        "trials": len(trials),
-        "reproduced": all(claim.holds for claim in findings.claims),
-        "claims": [
-            {"claim": c.text, "holds": c.holds, "detail": c.detail} for c in findings.claims
-        ],
-        "table": table,
-        "notes": list(findings.notes),
-        "figures": [figure.name for figure in figures],
-        "code": version,
-        "versions": versions(),
-    }
+    table = [
+        {
+            "quantity": line.quantity,
+            "paper": line.paper,
+            **asdict(line.ours),
+            "interval": line.interval,
+            "digits": line.digits,
+        }
+        for line in findings.lines
+    ]
+    document: dict[str, Any] = plain(
+        {
+            "schema": 1,
+            "experiment": name,
+            "title": module.TITLE,
+            "quick": request.quick,
+            "trials": len(trials),
+            "reproduced": all(claim.holds for claim in findings.claims),
+            "claims": [asdict(claim) for claim in findings.claims],
+            "table": table,
+            "notes": list(findings.notes),
+            "figures": [figure.name for figure in figures],
+            "code": version,
+            "versions": versions(),
+        }
+    )
     write_json(request.folder / "results.json", document)
     with whole(request.folder / "table.md") as partial:
-        partial.write_text(markdown_table(table), encoding="utf-8")
+        partial.write_text(markdown_table(document["table"]), encoding="utf-8")
     return document
 
 
@@ -318,41 +326,10 @@ HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
 
 def markdown_table(lines: Sequence[Mapping[str, Any]]) -> str:
     """The table of results.json as Markdown."""
-
-    def number(value: float | None, digits: int) -> str:
-        return "-" if value is None else f"{value:.{digits}f}"
-
     rows = []
     for line in lines:
-        digits = line["digits"]
-        low, high = line["interval"] or (None, None)
-        interval = "-"
-        if line["interval"]:
-            interval = f"{number(low, digits)} .. {number(high, digits)}"
-        rows.append(
-            (
-                line["quantity"],
-                line["paper"],
-                number(line["mean"], digits),
-                number(line["sd"], digits),
-                interval,
-                str(line["n"]),
-            )
-        )
-    cells = [HEAD, tuple("---" for _ in HEAD), *rows]
-    return "\n".join("| " + " | ".join(row) + " |" for row in cells) + "\n"
-
-
-def _plain_line(line: Line) -> dict[str, Any]:
-    def plain(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    return {
-        "quantity": line.quantity,
-        "paper": line.paper,
-        "mean": plain(line.ours.mean),
-        "sd": plain(line.ours.sd),
-        "n": line.ours.n,
-        "interval": [plain(v) for v in line.interval] if line.interval else None,
-        "digits": line.digits,
-    }
+        values = (line["mean"], line["sd"], *(line["interval"] or ()))
+        mean, sd, *bounds = ("-" if v is None else f"{v:.{line['digits']}f}" for v in values)
+        interval = " .. ".join(bounds) or "-"
+        rows.append((line["quantity"], line["paper"], mean, sd, interval, line["n"]))
+    return markdown(HEAD, rows) + "\n"

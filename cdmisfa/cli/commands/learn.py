@@ -100,7 +100,7 @@ def learn_command(
     if not source:
         learn_as_begun(ctx, out if resume else None)
         return
-    from cdmisfa.experiments.manifest import command_of
+    from cdmisfa.experiments.resume import command_of
     from cdmisfa.experiments.runs import RunExhaustedError, run
     from cdmisfa.experiments.sources import CameraOptions, open_source
 
@@ -153,18 +153,17 @@ def learn_command(
 
 def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
     """Resume a run with the command that began it; options that are given win."""
-    from cdmisfa.experiments.manifest import read_command
+    from cdmisfa.experiments.resume import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")
         raise click.MissingParameter(ctx=ctx, param=source)
     words, begun = read_command(run)
-    given = {
-        name
-        for name in begun
-        if ctx.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    kept = {
+        name: value
+        for name, value in begun.items()
+        if ctx.get_parameter_source(name) is not click.core.ParameterSource.COMMANDLINE
     }
-    kept = {name: value for name, value in begun.items() if name not in given}
     ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
 
 
@@ -204,16 +203,11 @@ class Reporter(Sink):
 
 def show(result: RunResult, *, as_json: bool) -> None:
     """Print what a run came to."""
-    if as_json:
-        options.print_json(result.as_json())
-    else:
-        click.echo(summary(result))
-
-
-def summary(result: RunResult) -> str:
-    """What a run came to, in words for a person."""
     from cdmisfa.experiments.loop import ENDINGS
 
+    if as_json:
+        options.print_json(result.as_json())
+        return
     rows = [
         (
             module.index,
@@ -224,10 +218,12 @@ def summary(result: RunResult) -> str:
         )
         for module in result.modules
     ]
-    head = ("module", "stream", "iteration", "policy", "eta")
-    lines = [options.table(head, rows)] if rows else ["no module was learned"]
-    lines.append(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
-    lines.append(f"signals sha256 {result.signals_sha256}")
+    if rows:
+        options.print_table(("module", "stream", "iteration", "policy", "eta"), rows)
+    else:
+        click.echo("no module was learned")
+    click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
+    click.echo(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
-        lines.append(f"run {result.run}    look at it: cdmisfa view {options.quoted(result.run)}")
-    return "\n".join(lines)
+        look = f"look at it: cdmisfa view {options.quoted(result.run)}"
+        click.echo(f"run {result.run}    {look}")

@@ -7,12 +7,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.progress import Bar, bar
+
+if TYPE_CHECKING:
+    from cdmisfa.paper.reproduce import Request
 
 
 @click.command("reproduce")
@@ -48,7 +51,7 @@ def reproduce_command(
     """
     from cdmisfa.core.errors import UsageError
     from cdmisfa.paper.page import write_page
-    from cdmisfa.paper.reproduce import NAMES, Request, check, reproduce
+    from cdmisfa.paper.reproduce import NAMES, Request, check
 
     root = out or Path("reproduction")
     if name is None and page is None:
@@ -56,26 +59,10 @@ def reproduce_command(
     names = NAMES if name == "all" else (name,) if name else ()
     documents: list[dict[str, Any]] = []
     for each in names:
-        request = Request(trials, quick, recording, root / each, jobs, force)
         if each == "icub" and recording is None:
             click.echo(f"icub: records the scene into {root}/icub-recording first", err=True)
-        started, finished = time.monotonic(), [0]
-        with bar(each, "trials") as shown:
-
-            def told(done: int, total: int, shown: Bar = shown, seen: list[int] = finished) -> None:
-                seen.append(done)
-                shown.update(done, total)
-
-            document = reproduce(each, request, engine=engine, scheduler=scheduler, progress=told)
-        seconds = time.monotonic() - started
-        ran = finished[-1] - finished[1]
-        click.echo(
-            f"{each}: {document['trials']} trials, {ran} of them now, {seconds:.1f} s, "
-            f"{ran / seconds:.1f} trials/s, "
-            f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}",
-            err=True,
-        )
-        documents.append(document)
+        request = Request(trials, quick, recording, root / each, jobs, force)
+        documents.append(_reproduce(each, request, engine=engine, scheduler=scheduler))
     if page is not None:
         write_page(root, page)
         click.echo(f"page {page}", err=True)
@@ -87,6 +74,30 @@ def reproduce_command(
         check(document)
 
 
+def _reproduce(
+    name: str, request: Request, *, engine: str, scheduler: str | None
+) -> dict[str, Any]:
+    """Reproduce an experiment, and say on stderr how it went."""
+    from cdmisfa.paper.reproduce import reproduce
+
+    started, finished = time.monotonic(), list[int]()
+    with bar(name, "trials") as shown:
+
+        def progress(done: int, total: int) -> None:
+            finished.append(done)
+            shown.update(done, total)
+
+        document = reproduce(name, request, engine=engine, scheduler=scheduler, progress=progress)
+    seconds, ran = time.monotonic() - started, finished[-1] - finished[0]
+    click.echo(
+        f"{name}: {document['trials']} trials, {ran} of them now, {seconds:.1f} s, "
+        f"{ran / seconds:.1f} trials/s, "
+        f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}",
+        err=True,
+    )
+    return document
+
+
 def _words(documents: list[dict[str, Any]]) -> str:
     from cdmisfa.paper.reproduce import markdown_table
 
@@ -96,9 +107,7 @@ def _words(documents: list[dict[str, Any]]) -> str:
             f"{'yes' if c['holds'] else 'NO '}  {c['claim']}: {c['detail']}"
             for c in document["claims"]
         ]
-        parts.append(
-            "\n".join([document["title"], "", markdown_table(document["table"]), *claims, ""])
-        )
+        parts += [document["title"], "", markdown_table(document["table"]), *claims, ""]
     return "\n".join(parts)
 
 

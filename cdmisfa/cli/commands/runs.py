@@ -10,6 +10,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.core.errors import NotReproducedError
+from cdmisfa.experiments.documents import markdown
 
 
 @click.command("compare")
@@ -123,9 +124,9 @@ def export_command(
 
 
 @click.command("signals")
-@click.option("--markdown", is_flag=True, help="Print the page docs/signals.md.")
+@click.option("--markdown", "as_page", is_flag=True, help="Print the page docs/signals.md.")
 @options.as_json
-def signals_command(markdown: bool, as_json: bool) -> None:
+def signals_command(as_page: bool, as_json: bool) -> None:
     """List every signal that a run records."""
     from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
 
@@ -137,16 +138,13 @@ def signals_command(markdown: bool, as_json: bool) -> None:
         return
     columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
     rows = [[signal[column] for column in columns] for signal in signals]
-    if markdown:
+    if as_page:
         click.echo(_page(SCHEMA_VERSION, columns, rows))
     else:
         options.print_table(columns, rows)
 
 
 def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
-    def line(cells: list[Any]) -> str:
-        return "| " + " | ".join(str(cell).replace("|", r"\|") for cell in cells) + " |"
-
     return "\n".join(
         [
             "# Signals",
@@ -160,8 +158,6 @@ def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
             "paper's number. `show` is how the viewer shows it. `since` is the first version of",
             "the record with it: in a run of an older one it is NaN.",
             "",
-            line(list(columns)),
-            line(["---"] * len(columns)),
-            *(line([f"`{row[0]}`", *row[1:]]) for row in rows),
+            markdown(columns, [[f"`{row[0]}`", *row[1:]] for row in rows]),
         ]
     )

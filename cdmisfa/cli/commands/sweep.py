@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -41,21 +42,13 @@ MOST_SEEDS = 1_000_000
 @click.pass_context
 def sweep_command(
     ctx: click.Context,
+    /,
     source: tuple[str, ...],
     out: Path,
     grid: tuple[str, ...],
     seeds: str,
-    preset: str | None,
-    settings: tuple[str, ...],
-    max_iterations: int | None,
-    max_modules: int | None,
-    loop: bool,
-    jobs: int,
-    engine: str,
-    scheduler: str | None,
-    keep_logs: bool,
-    retry_failed: bool,
     as_json: bool,
+    **each: Any,
 ) -> None:
     """Learn from a source many times, over a grid of settings and seeds.
 
@@ -74,17 +67,8 @@ def sweep_command(
             out,
             grid=parse_grid(grid),
             seeds=parse_seeds(seeds),
-            preset=preset,
-            settings=settings,
-            loop=loop,
-            max_iterations=max_iterations,
-            max_modules=max_modules,
-            jobs=jobs,
-            engine=engine,
-            scheduler=scheduler,
-            keep_logs=keep_logs,
-            retry_failed=retry_failed,
             progress=progress,
+            **each,
         )
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if report.outdated:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -40,10 +41,9 @@ def view_command(
     web: bool,
     screenshot: Path | None,
     at: int | None,
-    every: int,
-    all_views: Path | None,
     memory_limit: str,
     force: bool,
+    **frames: Any,
 ) -> None:
     """Open a run in the Rerun viewer, or save, serve or picture it.
 
@@ -74,12 +74,12 @@ def view_command(
     from replay.viewer.window import open_window, serve
 
     if save is not None:
-        build_view(run, save, every=every, all_views=all_views, force=force)
+        build_view(run, save, force=force, **frames)
         click.echo(f"view {save}", err=True)
     elif screenshot is not None:
-        draw(run, screenshot, at=at, every=every, all_views=all_views, force=force)
+        draw(run, screenshot, at=at, force=force, **frames)
         click.echo(f"picture {screenshot}", err=True)
     elif web:
-        serve(run, every=every, all_views=all_views, memory_limit=memory_limit)
+        serve(run, memory_limit=memory_limit, **frames)
     else:
-        open_window(run, every=every, all_views=all_views, memory_limit=memory_limit)
+        open_window(run, memory_limit=memory_limit, **frames)

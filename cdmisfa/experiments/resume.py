@@ -1,7 +1,7 @@
-"""Checkpoints of a run: a learner's state on disk, from which the run is resumed.
+"""What a run is resumed from: the command that began it, its log, and its checkpoints.
 
-A checkpoint is one file of plain arrays and a JSON text, written whole or not at all.
-It holds no signals: those are in the run's log, which is always flushed first. So a
+A checkpoint is a learner's state in one file of plain arrays and a JSON text, written whole or
+not at all. It holds no signals: those are in the run's log, which is always flushed first. So a
 run that was stopped anywhere is resumed from the newest checkpoint that its log covers.
 """
 
@@ -12,7 +12,7 @@ import dataclasses
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,35 @@ from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.manifest import SET_ASIDE, log_to_resume, refuse_difference, versions
+from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
+from cdmisfa.experiments.documents import versions
+from recorder.log.manifest import Manifest, found_path, kept_path
 from recorder.log.whole import partial_path, whole
+from recorder.world.scenes import SCENES
+
+COMMAND = "command"
+"""Key of a manifest: the command that began the run, which may differ when it is resumed."""
+
+OPTIONS = (
+    "seed",
+    "preset",
+    "settings",
+    "algorithm",
+    "loop",
+    "salvage",
+    "follow",
+    "topics",
+    "size",
+    "align",
+    "rate",
+)
+"""What of a command makes a run what it is, besides its source."""
+
+SET_ASIDE = "run.before.mcap.partial"
+"""The log of a run that is being resumed, until the new one has taken over what counts."""
 
 SCHEMA = 1
-"""Version of the file; rises when the state of a learner changes its meaning."""
+"""Version of a checkpoint; rises when the state of a learner changes its meaning."""
 
 KEPT = 2
 """Checkpoints that a run's folder keeps: the newest, and one in case its log was lost."""
@@ -37,6 +60,44 @@ KEPT = 2
 _HEAD = "checkpoint"
 _MODULES = "modules."
 _INTEGERS = ("index", "stream", "iteration")
+
+
+def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
+    """The command that begins a run, as JSON values; paths are kept relative to its folder.
+
+    Args:
+        source: as on the command line.
+        options: of the command; of them those in `OPTIONS` are kept.
+        run: the folder.
+    """
+    kept = {name: options[name] for name in OPTIONS if name in options}
+    preset = kept.get("preset")
+    if preset is not None and preset.endswith(".toml"):
+        kept["preset"] = kept_path(preset, run)
+    return Manifest(tuple(source), kept).as_json(run, SCENES)
+
+
+def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """The command that began a run: its source and its options.
+
+    Raises:
+        UsageError: there is no run, or it does not say.
+        LogDamagedError: its log cannot be read.
+    """
+    from replay.runs.log import read_header
+
+    begun = Manifest.from_json(read_header(log_to_resume(run)).manifest.get(COMMAND), run)
+    if begun is None:
+        raise UsageError(f"{run} does not say what it learns from: name its source")
+    options = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in begun.options.items()
+        if name in OPTIONS
+    }
+    preset = options.get("preset")
+    if preset is not None and str(preset).endswith(".toml"):
+        options["preset"] = found_path(str(preset), run)
+    return begun.source, options
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,24 +254,36 @@ def restore(learner: Learner, checkpoint: Checkpoint) -> None:
         ) from error
 
 
-def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> Path | None:
+def log_to_resume(run: Path) -> Path:
+    """The log of a run that was stopped, wherever it is.
+
+    Raises:
+        UsageError: there is no run.
+    """
+    from replay.runs.folders import RUN_FILE
+
+    finished = run / RUN_FILE
+    for found in (run / SET_ASIDE, partial_path(finished), finished):
+        if found.is_file():
+            return found
+    raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to resume")
+
+
+def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
     """Move the log of a run that is to be resumed out of the way, after checking that it may.
 
-    Returns:
-        Where it is now; None where the run was stopped before its log said anything.
+    A log that said nothing before the run was stopped stays.
 
     Raises:
         UsageError: there is no run, or it was made with another configuration or source.
     """
     from replay.runs.folders import RUN_FILE
 
-    aside = run / SET_ASIDE
     found = log_to_resume(run)
     if found == partial_path(run / RUN_FILE) and not checkpoints(run) and not _has_header(found):
-        return None
+        return
     refuse_difference(run, found, spec, manifest)
-    os.replace(found, aside)
-    return aside
+    os.replace(found, run / SET_ASIDE)
 
 
 def _has_header(log: Path) -> bool:
@@ -221,3 +294,40 @@ def _has_header(log: Path) -> bool:
     except (LogDamagedError, UsageError):
         return False
     return True
+
+
+def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
+    """Refuse to resume with another configuration, seed or source, naming the first difference.
+
+    Raises:
+        UsageError: something differs.
+    """
+    from replay.runs.log import read_header
+
+    header = read_header(log)
+    before = {
+        "signals": header.schema,
+        **header.manifest,
+        "spec": dataclasses.asdict(header.spec),
+        COMMAND: None,
+    }
+    now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec), COMMAND: None}
+    for key, old, new in differences(_json(before), _json(now)):
+        raise UsageError(
+            f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: resume with "
+            "what it was made with, or choose another folder"
+        )
+
+
+def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two JSON values differ: dotted key, the value before, the value now."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in sorted({*before, *now}):
+            where = f"{key}.{name}" if key else name
+            yield from differences(before.get(name), now.get(name), where)
+    elif before != now:
+        yield key, before, now
+
+
+def _json(value: Any) -> Any:
+    return json.loads(json.dumps(value))

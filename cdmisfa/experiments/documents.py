@@ -1,0 +1,62 @@
+"""How results are written down: JSON values and files, Markdown tables, what they depend on."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from recorder.log.whole import whole
+
+PACKAGES = ("cdmisfa", "numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: paths as texts, arrays as lists, None where it has no number."""
+    match value:
+        case Mapping():
+            return {str(k): plain(v) for k, v in value.items()}
+        case float():
+            return value if math.isfinite(value) else None
+        case Path():
+            return str(value)
+        case list() | tuple():
+            return [plain(v) for v in value]
+        case _ if hasattr(value, "tolist"):
+            return plain(value.tolist())
+        case _:
+            return value
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Rows of cells as a table of Markdown; its last line has no end."""
+    lines = (head, ["---"] * len(head), *rows)
+    cells = ([str(cell).replace("|", r"\|") for cell in line] for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages a result may depend on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a JSON document, whole or not at all.
+
+    Raises:
+        LogWriteError: the file cannot be written.
+    """
+    text = json.dumps(document, indent=2) + "\n"
+    with whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
