@@ -12,6 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,12 +46,19 @@ class World:
 
     def __init__(self, scene: IcubConfig, *, robot_seen: bool = False) -> None:
         with silenced():
-            self._bullet, models = _import_simulator()
-            path = _robot_file(models, scene.robot)
-            self._client = self._bullet.connect(self._bullet.DIRECT)
+            self._bullet, models = _start_simulator()
+            bullet = self._bullet
+            # Looked up once: they are called for every frame.
+            self._move = partial(bullet.resetBasePositionAndOrientation, ornObj=_UPRIGHT)
+            self._see = partial(
+                bullet.getCameraImage,
+                shadow=0,
+                renderer=bullet.ER_TINY_RENDERER,
+                flags=bullet.ER_NO_SEGMENTATION_MASK,
+            )
             try:
-                self._build(scene, path, robot_seen)
-            except self._bullet.error as error:
+                self._build(scene, _robot_file(models, scene.robot), robot_seen)
+            except bullet.error as error:
                 self.close()
                 raise CdmisfaError(
                     f"PyBullet cannot build the scene: {error}; check scene.robot"
@@ -73,18 +81,13 @@ class World:
 
     def turn_head(self, yaw: float) -> None:
         """Turn the robot's head; degrees, to the left. Only pictures from outside show it."""
-        self._bullet.resetJointState(
-            self._robot, self._neck_joint, math.radians(yaw), physicsClientId=self._client
-        )
+        self._bullet.resetJointState(self._robot, self._neck_joint, math.radians(yaw))
 
     @contextlib.contextmanager
     def only(self, *, table: bool) -> Iterator[None]:
         """Within this context just the table, or just the objects, can be seen."""
         hidden = self._objects if table else [self._table]
-        poses = [
-            self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)[0]
-            for body in hidden
-        ]
+        poses = [self._bullet.getBasePositionAndOrientation(body)[0] for body in hidden]
         for body in hidden:
             self._move(body, _AWAY)
         try:
@@ -122,46 +125,31 @@ class World:
         Raises:
             CdmisfaError: the simulator refuses.
         """
-        bullet = self._bullet
         try:
-            image = bullet.getCameraImage(
-                width,
-                height,
-                view,
-                projection,
-                lightDirection=light,
-                shadow=0,
-                renderer=bullet.ER_TINY_RENDERER,
-                flags=bullet.ER_NO_SEGMENTATION_MASK,
-                physicsClientId=self._client,
-            )
-        except bullet.error as error:
+            image = self._see(width, height, view, projection, lightDirection=light)
+        except self._bullet.error as error:
             raise CdmisfaError(f"PyBullet cannot draw: {error}") from error
         colours = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
         return colours, np.asarray(image[3], dtype=np.float32).reshape(height, width)
 
     def close(self) -> None:
         """End the simulator; harmless when called twice."""
-        if self._client >= 0:
-            self._bullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        with contextlib.suppress(self._bullet.error):
+            self._bullet.disconnect()
 
     def _build(self, scene: IcubConfig, path: str, robot_seen: bool) -> None:
-        bullet, client = self._bullet, self._client
+        bullet = self._bullet
         # Without merging, no link of this robot has a state: it has too many fixed joints.
         self._robot = bullet.loadURDF(
             path,
             useFixedBase=True,
             flags=bullet.URDF_MERGE_FIXED_LINKS | bullet.URDF_IGNORE_COLLISION_SHAPES,
-            physicsClientId=client,
         )
-        joints = range(bullet.getNumJoints(self._robot, physicsClientId=client))
+        joints = range(bullet.getNumJoints(self._robot))
         if not robot_seen:
             for link in (-1, *joints):
-                bullet.changeVisualShape(
-                    self._robot, link, rgbaColor=(0, 0, 0, 0), physicsClientId=client
-                )
-        infos = [bullet.getJointInfo(self._robot, i, physicsClientId=client) for i in joints]
+                bullet.changeVisualShape(self._robot, link, rgbaColor=(0, 0, 0, 0))
+        infos = [bullet.getJointInfo(self._robot, i) for i in joints]
         neck = next((info for info in infos if info[1] == NECK_YAW), None)
         if neck is None:
             raise UsageError(f"scene.robot {scene.robot} has no neck: choose a whole robot")
@@ -173,7 +161,7 @@ class World:
                     f"scene.eyes.yaw has {yaw:g}: the neck of {scene.robot} turns "
                     f"from {low:.0f} to {high:.0f} degrees"
                 )
-        place = bullet.getLinkState(self._robot, self._neck_joint, physicsClientId=client)[4]
+        place = bullet.getLinkState(self._robot, self._neck_joint)[4]
         # To the micrometre: the rest is rounding noise of the simulator's float32.
         self.neck = np.array([round(part, 6) for part in place])
         self._add_bodies(scene)
@@ -197,18 +185,9 @@ class World:
         self._heights = (top + box.half_size, top + cylinder.height / 2, top + sphere.radius)
 
     def _body(self, shape: int, colour: tuple[float, ...], **size: Any) -> int:
-        visual = self._bullet.createVisualShape(
-            shape, rgbaColor=(*colour, 1.0), physicsClientId=self._client, **size
-        )
-        body: int = self._bullet.createMultiBody(
-            baseMass=0, baseVisualShapeIndex=visual, physicsClientId=self._client
-        )
+        visual = self._bullet.createVisualShape(shape, rgbaColor=(*colour, 1.0), **size)
+        body: int = self._bullet.createMultiBody(baseMass=0, baseVisualShapeIndex=visual)
         return body
-
-    def _move(self, body: int, position: tuple[float, ...]) -> None:
-        self._bullet.resetBasePositionAndOrientation(
-            body, position, _UPRIGHT, physicsClientId=self._client
-        )
 
 
 @contextlib.contextmanager
@@ -217,37 +196,41 @@ def silenced() -> Iterator[None]:
 
     The simulator prints tens of kilobytes of warnings past Python's streams.
     """
-    c_library = ctypes.CDLL(None)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    c_library.fflush(None)
-    saved = [os.dup(1), os.dup(2)]
+    _flush()
+    saved = {number: os.dup(number) for number in (1, 2)}
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
+    for number in saved:
+        os.dup2(nowhere, number)
     os.close(nowhere)
     try:
         yield
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        c_library.fflush(None)
-        for number, copy in zip((1, 2), saved, strict=True):
+        _flush()
+        for number, copy in saved.items():
             os.dup2(copy, number)
             os.close(copy)
 
 
-def _import_simulator() -> tuple[Any, Any]:
+def _flush() -> None:
+    """Print what Python and C have not printed yet."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    ctypes.CDLL(None).fflush(None)
+
+
+def _start_simulator() -> tuple[Any, Any]:
+    """A PyBullet server without a window, and the package of the robots' models."""
     try:
         import icub_models
         import pybullet
+        from pybullet_utils import bullet_client
     except ImportError as error:
         raise CdmisfaError(
             f"the icub scene needs the package {error.name}, which is not installed: "
             "use Python 3.11 and `pip install pybullet icub-models`; "
             "recordings and the oscillatory scene work without it"
         ) from error
-    return pybullet, icub_models
+    return bullet_client.BulletClient(pybullet.DIRECT), icub_models
 
 
 def _robot_file(models: Any, name: str) -> str:
