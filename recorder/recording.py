@@ -218,11 +218,7 @@ def _identity(
     settings: RecordConfig,
     scene: OpenScene | None,
 ) -> Identity:
-    """What a recording of a source states.
-
-    Raises:
-        UsageError: no recording can hold such frames, or a view cannot have its name.
-    """
+    """What a recording of a source states; refused where no recording can hold it."""
     spec = replace(source.spec, streams=tuple(names or source.spec.streams))
     for name in spec.streams:
         if not _FILE_NAME.fullmatch(name) or spec.streams.count(name) > 1:

@@ -28,7 +28,8 @@ class LogFile:
     """One MCAP file: chunked, indexed, with CRCs and repeated schemas and channels.
 
     As a context manager it finishes the file on success and leaves the flushed
-    `.partial` on an exception. The same calls give the same bytes.
+    `.partial` on an exception. The same calls give the same bytes. What writes raises a
+    `LogWriteError` where the disk does not take it, or did not take something before.
 
     Attributes:
         path: the file's name once it is finished.
@@ -90,11 +91,7 @@ class LogFile:
         return self._stream.tell()
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Register a message schema; the same schema gets the same id.
-
-        Returns:
-            The schema's id.
-        """
+        """Register a message schema, and return its id; the same schema gets the same."""
         key = (name, encoding, data)
         if key not in self._schemas:
             self._schemas[key] = self._writer.register_schema(name, encoding, data)
@@ -108,30 +105,18 @@ class LogFile:
         encoding: str = "protobuf",
         metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Register a channel of messages on a topic; schema 0 is none.
-
-        Returns:
-            The channel's id.
-        """
+        """Register a channel of messages on a topic, and return its id; schema 0 is none."""
         return self._writer.register_channel(topic, encoding, schema, dict(metadata or {}))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a named string map at once, outside the chunks.
-
-        Raises:
-            LogWriteError: the disk does not take it.
-        """
+        """Write a named string map at once, outside the chunks."""
         self._writer.add_metadata(name, dict(values))
         self._stream.flush()
 
     def add_attachment(
         self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
     ) -> None:
-        """Write a named file at once, outside the chunks; times in nanoseconds.
-
-        Raises:
-            LogWriteError: the disk does not take it.
-        """
+        """Write a named file at once, outside the chunks; times in nanoseconds."""
         self._writer.add_attachment(create_time, log_time, name, media_type, data)
         self._stream.flush()
 
@@ -151,9 +136,6 @@ class LogFile:
             data: the encoded message.
             sequence: the publisher's counter.
             publish_time: nanoseconds; the log time where none is given.
-
-        Raises:
-            LogWriteError: the disk does not take it, now or at any time before.
         """
         self._stream.check()
         if self._chunk_start is None:
@@ -165,11 +147,7 @@ class LogFile:
         self._writer.add_message(channel, log_time, data, published, sequence)
 
     def flush(self) -> None:
-        """Close the chunk in progress and hand everything to the operating system.
-
-        Raises:
-            LogWriteError: the disk does not take it.
-        """
+        """Close the chunk in progress and hand everything to the operating system."""
         self._stream.check()
         self._chunk_start = None
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -178,7 +156,6 @@ class LogFile:
         """Write the index, make the file durable and give it its name.
 
         Raises:
-            LogWriteError: any of it failed; the `.partial` stays.
             UsageError: a file of that name appeared meanwhile; the `.partial` stays.
         """
         try:

@@ -93,12 +93,7 @@ def read_recording(folder: Path) -> Manifest:
 
 
 def keep_recording(folder: Path, views: Sequence[str], manifest: Manifest | None = None) -> None:
-    """Keep how some views of a recording are begun, beside what is known of the others.
-
-    Args:
-        folder: of the recording.
-        views: the views.
-        manifest: of these views; None where they are finished.
+    """Keep how some views are begun, or that they are finished, beside what the others are.
 
     Raises:
         LogWriteError: the disk does not take it.

@@ -28,7 +28,6 @@ from recorder.log.viewfacts import Identity, ViewFacts
 from recorder.log.whole import partial_path
 
 _DAMAGE = (McapError, ValueError, struct.error, OSError, OverflowError, MemoryError, KeyError)
-_RECORD_LIMIT = 2**30
 
 
 class FramesHeld(NamedTuple):
@@ -99,7 +98,7 @@ def resume_view(
         folder: of the recording.
         view: name of the view.
         identity: what is recorded.
-        split: where its parts end.
+        split: where parts end.
         there: all of the view's files, and what they hold.
         frames: how many the view shall have; no file has more.
 
@@ -199,15 +198,11 @@ def messages(path: Path) -> Iterator[tuple[Channel, Message]]:
 def _undamaged(path: Path, read: Callable[[NonSeekingReader], Iterator[Any]]) -> Iterator[Any]:
     """What a reader of a log gives, up to where the log is damaged or torn."""
     with contextlib.suppress(*_DAMAGE), path.open("rb") as file:
-        yield from read(NonSeekingReader(file, validate_crcs=True, record_size_limit=_RECORD_LIMIT))
+        yield from read(NonSeekingReader(file, validate_crcs=True, record_size_limit=2**30))
 
 
 def _refuse_other(path: Path, facts: ViewFacts) -> None:
-    """Refuse to resume a log of something else.
-
-    Raises:
-        UsageError: it states other facts.
-    """
+    """Refuse to resume a log that states other facts."""
     records = _undamaged(path, NonSeekingReader.iter_metadata)
     record = next((m for m in records if m.name == METADATA), None)
     if record is None:

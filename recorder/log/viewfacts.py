@@ -22,7 +22,6 @@ from recorder.log.messages import SCHEMA_VERSION
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
-
 SLOWEST: Final = 1e-3
 FASTEST: Final = 1e6
 """Frames a second that a recording can have."""

@@ -111,11 +111,7 @@ class ViewLog:
             self.t += 1
 
     def copy(self, path: Path, stop: int) -> None:
-        """Take over the frames before `stop` of an earlier log of the same part.
-
-        Raises:
-            LogWriteError: the disk does not take it.
-        """
+        """Take over the frames before `stop` of an earlier log of the same part."""
         for channel, message in messages(path):
             if message.sequence >= stop:
                 break
@@ -136,12 +132,8 @@ class ViewParts:
     Where a part ends depends on its frames only, not on the blocks they came in.
 
     Args:
-        folder: of the recording.
-        view: name of the view.
-        identity: what is recorded.
-        settings: how it is written.
+        folder, view, identity, settings, pose: as for `ViewLog`.
         split: where parts end; None for a single file.
-        pose: of the head in this view, where there is a head.
         parts: file and number of frames of each part that is done; more are added.
         first: first frame of the part that is next.
     """

@@ -78,10 +78,6 @@ class Eyes:
     """Renders what both eyes see in each view, side by side.
 
     Hides the world's table for good, since it is already in every eye's background.
-
-    Args:
-        eyes: the head and its cameras.
-        world: what there is to see.
     """
 
     def __init__(self, eyes: EyesConfig, world: World) -> None:

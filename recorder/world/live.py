@@ -20,11 +20,7 @@ TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 
 
 class LiveSource(SeekableSource):
-    """What the robot's eyes see, rendered when it is asked for.
-
-    Args:
-        scene: the world; a seed of None is 0.
-        record: the clock of the frames.
+    """What the robot's eyes see in a scene, rendered when it is asked for, on a clock.
 
     Raises:
         CdmisfaError: the simulator is not installed.

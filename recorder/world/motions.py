@@ -67,12 +67,7 @@ def reflect(values: Float, limits: Range) -> Float:
 
 
 class Motions:
-    """Where all objects are, frame after frame.
-
-    Args:
-        scene: the objects.
-        seed: of their motions.
-    """
+    """Where all objects of a scene are, frame after frame, as a seed moves them."""
 
     def __init__(self, scene: IcubConfig, seed: int) -> None:
         self._scene = scene
@@ -97,11 +92,7 @@ class Motions:
         self._t = t
 
     def take(self, n: int) -> Float:
-        """The positions of the next n frames.
-
-        Returns:
-            (n, objects, 2): x and y of every object in the paper's coordinates, metres.
-        """
+        """(n, objects, 2) x and y in the next n frames, the paper's coordinates, metres."""
         parts = []
         while n > 0:
             self.seek(self._t)

@@ -68,11 +68,9 @@ class World:
                 raise
 
     def place(self, positions: NDArray[np.float64]) -> None:
-        """Put the objects where they are in a frame.
+        """Put the objects at (objects, 2) positions, x and y in the paper's coordinates.
 
-        Args:
-            positions: (objects, 2) x and y in the paper's coordinates, whose y is to the
-                robot's left, while the root frame's is to its right.
+        Its y is to the robot's left, the root frame's to its right.
         """
         for body, height, (x, y) in zip(
             self._objects, self._heights, positions.tolist(), strict=True
@@ -117,10 +115,7 @@ class World:
         height: int,
         light: tuple[float, float, float],
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """What a camera sees.
-
-        Returns:
-            (height, width, 4) colours and (height, width) depth.
+        """What a camera sees: (height, width, 4) colours and (height, width) depth.
 
         Raises:
             CdmisfaError: the simulator refuses.
