@@ -14,7 +14,7 @@ from typing import Any
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import as_table
-from cdmisfa.core.errors import CdmisfaError, LogWriteError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.log.folder import cleared, refuse_existing, view_logs
 from recorder.log.manifest import Manifest, keep_recording, read_recording
@@ -308,10 +308,6 @@ def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = Fa
         raise UsageError(f"{path}: the picture is a PNG, name it .png")
     if path.is_dir() or (path.exists() and not force):
         raise UsageError(f"{path} exists: choose another name or overwrite with --force")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogWriteError(f"{path.parent} cannot be made: {error.strerror}") from error
     image = draw(config)
     with whole(path) as partial:
         image.save(partial, format="PNG", optimize=True)

@@ -65,5 +65,6 @@ def test_what_makes_no_sense_in_it_is_passed_over(tmp_path: Path, noted: str) ->
 
 def test_a_disk_that_does_not_take_it_is_named(tmp_path: Path) -> None:
     values: dict[str, Any] = {"frames": {"a": 1}, "split": {}}
+    (tmp_path / "nowhere").write_text("a file")
     with pytest.raises(LogWriteError, match=r"nowhere/recording\.json cannot be written"):
         keep_recording(tmp_path / "nowhere", ["a"], Manifest((), values))
