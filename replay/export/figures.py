@@ -47,10 +47,7 @@ STYLE: dict[Any, Any] = {
 def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) -> list[Path]:
     """Draw every figure of a run, as PNG and as SVG, and return their paths.
 
-    Args:
-        path: the run.
-        out: folder of the figures; by default `figures` in the run's folder.
-        force: replace existing figures.
+    They go to the folder `out`, by default to `figures` in the run's folder.
 
     Raises:
         UsageError: there is no such run, or a figure exists and `force` is not set.
@@ -97,7 +94,7 @@ def convergence(history: History) -> Figure | None:
         bottom.annotate(name, textcoords="offset points", ha="right", **where)
     top.set_ylabel("slowness η\n[cycles/frame]")
     bottom.set_ylabel("change η̇\n[1/frame]")
-    _finish(bottom)
+    _finish(bottom, bottom)
     return figure
 
 
@@ -132,7 +129,7 @@ def decision(history: History) -> Figure | None:
     for axes in (watched, reward, policy, epsilon):
         for save in outline.saved:
             axes.axvline(save.iteration, color=_css(VERMILLION), linewidth=0.8)
-    _finish(epsilon, legends=(watched,))
+    _finish(epsilon, watched)
     return figure
 
 
@@ -212,10 +209,9 @@ def _panels(*heights: float) -> tuple[Figure, list[Axes]]:
     return figure, list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
 
 
-def _finish(last: Axes, legends: tuple[Axes, ...] = ()) -> None:
+def _finish(last: Axes, explained: Axes) -> None:
     last.set_xlabel("iteration")
-    for axes in legends or (last,):
-        axes.legend(loc="upper right", ncols=4, fontsize=7)
+    explained.legend(loc="upper right", ncols=4, fontsize=7)
 
 
 def _css(rgb: Rgb) -> tuple[float, ...]:

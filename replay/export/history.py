@@ -35,8 +35,6 @@ class Output:
     """What a frozen module says about its own stream.
 
     Attributes:
-        module: its index, from 1.
-        stream: the one it was learned on.
         t: (n,) frames at which that stream was watched after the save.
         y: (n,) its first output there.
         truth: (n, D) what the world knows at these frames; D may be 0.

@@ -54,12 +54,8 @@ Stats = dict[str, list[Any]]
 def write_lerobot(source: RecordedSource, folder: Path, *, name: str, lossless: bool) -> int:
     """Write a recording as a LeRobot dataset, and return how many frames it has.
 
-    Args:
-        source: the recording. Images become videos `observation.images.VIEW`, values
-            `observation.VIEW`; numbers become float32, as LeRobot's own.
-        folder: the dataset's.
-        name: of the dataset, for its card.
-        lossless: keep every value of the images.
+    Images become videos `observation.images.VIEW`, values `observation.VIEW`; numbers become
+    float32, as LeRobot's own. The dataset's card calls it by `name`.
 
     Raises:
         UsageError: the frame rate is not a whole number, which LeRobot's format asks for, or

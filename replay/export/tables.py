@@ -38,12 +38,8 @@ _CSV = {"float64": "double", "int64": "integer", "bool": "boolean"}
 def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> int:
     """Write a run's signals to a file, and return how many iterations there are.
 
-    Args:
-        run: the run.
-        out: the file.
-        form: one of `TABLES`. CSV leaves out the outputs frame by frame; npz fills arrays
-            that grow with the modules up with NaN.
-        force: replace an existing file of notes beside a CSV file.
+    CSV leaves out the outputs frame by frame; npz fills arrays that grow with the modules up
+    with NaN. `force` replaces an existing file of notes beside a CSV file.
 
     Raises:
         UsageError: no such run, or the notes exist and `force` is not set.

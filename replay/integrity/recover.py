@@ -198,11 +198,10 @@ def _compare(dst: Path, source: LogReader, tallies: dict[int, _Tally]) -> None:
     """Read the new log with every checksum and compare it with what was written."""
     with LogReader(dst) as reader:
         found = {number: _Tally() for number in reader.channels}
-        numbers = dict(zip(sorted(reader.channels), sorted(tallies), strict=True))
         for _, table in reader.tables(ordered=False):
             _tally(found, table)
         if reader.missing or reader.problems or len(reader.metadata) != len(source.metadata):
             raise LogDamagedError(f"{dst}: the recovered log is not whole; check the disk")
-    for number, tally in found.items():
-        if tally.digest.digest() != tallies[numbers[number]].digest.digest():
-            raise LogDamagedError(f"{dst}: differs from what was recovered; check the disk")
+    read, written = ([one[n].digest.digest() for n in sorted(one)] for one in (found, tallies))
+    if read != written:
+        raise LogDamagedError(f"{dst}: differs from what was recovered; check the disk")

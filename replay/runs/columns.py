@@ -88,11 +88,7 @@ def columns_of_records(records: Sequence[BlockSignals]) -> Iterator[SignalColumn
 
 
 def columns_of_messages(messages: Sequence[bytes], decode: Decode) -> Iterator[SignalColumns]:
-    """The records in messages as arrays, bit for bit what `decode` makes of each.
-
-    Raises:
-        LogDamagedError: from `decode`.
-    """
+    """The records in messages as arrays, bit for bit what `decode` makes of each."""
     for _, group in groupby(messages, key=len):
         same_size = list(group)
         whole = _at_once(same_size, decode(same_size[0]))

@@ -14,17 +14,11 @@ from replay.mcap.reader import LogReader
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
 
-MANIFEST_FILE = "run.json"
-"""Name of the file that says how a run was begun and what came of it."""
-
 METADATA = "cdmisfa.run"
 """Name of the metadata record that makes a log that of a run."""
 
 REQUEST = "sweep.json"
 """File of a sweep that names the trials it was asked for last."""
-
-TRIALS = "trials"
-"""Folder of a sweep that holds its runs."""
 
 
 def run_log(path: Path) -> Path:
@@ -60,7 +54,7 @@ def is_run(path: Path) -> bool:
 def read_manifest(folder: Path) -> Mapping[str, Any]:
     """How a run was begun and what came of it; empty where nothing readable says so."""
     try:
-        document = json.loads((folder / MANIFEST_FILE).read_text("utf-8"))
+        document = json.loads((folder / "run.json").read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, Mapping) else {}
@@ -77,7 +71,7 @@ def runs_in(folder: Path) -> list[Path]:
     folder = Path(folder)
     if not folder.is_dir() or is_run(folder):
         return []
-    trials = list((folder / TRIALS).iterdir()) if (folder / TRIALS).is_dir() else []
+    trials = list((folder / "trials").glob("*"))
     if is_sweep(folder):
         wanted = _requested(folder / REQUEST)
         trials = [trial for trial in trials if trial.name.removesuffix(PARTIAL) in wanted]

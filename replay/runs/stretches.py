@@ -50,11 +50,8 @@ class Stretch:
     """What a log holds of some consecutive iterations.
 
     Attributes:
-        signals: the records, in order.
-        watched: frames that were watched.
         truth: what the world knew, (n, D).
         phi: (t, (J, I)) weights of the abstraction.
-        events: what happened.
     """
 
     signals: tuple[SignalColumns, ...]

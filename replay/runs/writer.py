@@ -33,9 +33,6 @@ from replay.runs.messages import (
 NEVER_NS = 2**62
 """More log time than any run has."""
 
-CHUNK_BYTES = 1024 * 1024
-"""Size at which a chunk of the log is closed."""
-
 TOGETHER = 500
 """Records that are decoded at once."""
 
@@ -47,10 +44,9 @@ class RunWriter(Sink):
     """Writes run.mcap: to the end with `finish`, or to wherever it was `abandon`ed.
 
     Args:
-        path: the file's name.
+        path: the file's name once it is finished.
         spec: what the source delivers.
-        manifest: what the run was started with, JSON values: `config` by sections, `seed`,
-            `source`.
+        manifest: what the run was started with, see `RunHeader`, as JSON values.
         force: overwrite what is there.
         watched_every: keep every this many frames of images; vectors are all kept.
         phi_every: keep the weights every this many iterations, and on each save.
@@ -70,19 +66,12 @@ class RunWriter(Sink):
         watched_every: int = 10,
         phi_every: int = 50,
     ) -> None:
-        self.spec = spec
+        self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
         self._phi_every = max(phi_every, 1)
         # The learner is quicker than the log's clock: what waits is flushed by the wall's. Of
         # images zstd leaves a tenth less than lz4, and takes twice as long.
-        self._log = LogFile(
-            path,
-            force=force,
-            library="cdmisfa",
-            compression="lz4",
-            chunk_size=CHUNK_BYTES,
-            flush_ns=NEVER_NS,
-        )
+        self._log = LogFile(path, force=force, compression="lz4", flush_ns=NEVER_NS)
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
             METADATA,
@@ -106,11 +95,6 @@ class RunWriter(Sink):
             self._add_channel(WATCHED_TOPIC, encoder.schema, encoder.schema_data())
         else:
             self._add_channel(WATCHED_TOPIC, MATRIX_SCHEMA)
-
-    @property
-    def path(self) -> Path:
-        """The file's name once it is finished."""
-        return self._log.path
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Write what one iteration gave; see `Sink`."""
