@@ -29,12 +29,13 @@ from replay.runs.messages import (
     encode_signals,
     iteration_of,
 )
+from replay.runs.stretches import ITERATIONS
 
 NEVER_NS = 2**62
 """More log time than any run has."""
 
-TOGETHER = 500
-"""Records that are decoded at once."""
+CHUNK_BYTES = 1024 * 1024
+"""Size at which a chunk of the log is closed."""
 
 FLUSH_SECONDS = 1.0
 """Longest time for which something that was written waits for the operating system."""
@@ -71,7 +72,9 @@ class RunWriter(Sink):
         self._phi_every = max(phi_every, 1)
         # The learner is quicker than the log's clock: what waits is flushed by the wall's. Of
         # images zstd leaves a tenth less than lz4, and takes twice as long.
-        self._log = LogFile(path, force=force, compression="lz4", flush_ns=NEVER_NS)
+        self._log = LogFile(
+            path, force=force, compression="lz4", chunk_size=CHUNK_BYTES, flush_ns=NEVER_NS
+        )
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
             METADATA,
@@ -139,7 +142,7 @@ class RunWriter(Sink):
                         break
                     taken.append(entry.data)
                 self._log.write(self._channels[topic], entry.log_time, entry.data, entry.sequence)
-                if len(taken) >= TOGETHER:
+                if len(taken) >= ITERATIONS:
                     yield from _records(taken, where)
                     taken = []
         yield from _records(taken, where)
