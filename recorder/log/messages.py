@@ -37,7 +37,6 @@ IMAGE_ENCODING = "mono8"
 IMAGE_SCHEMA = "foxglove.RawImage"
 VECTOR_SCHEMA = "cdmisfa.Vector"
 TRUTH_SCHEMA = "cdmisfa.GroundTruth"
-POSE_SCHEMA = "foxglove.PoseInFrame"
 
 MAX_TRUTH = 1000
 """Most columns of ground truth: their tags then take at most two bytes."""
