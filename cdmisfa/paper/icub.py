@@ -18,10 +18,12 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import learn
-from cdmisfa.experiments.statistics import correlation, summary
+from cdmisfa.experiments.statistics import correlation
 from cdmisfa.paper import panels
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Request, Settings, Trial, share
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, learned
+from replay.recordings.source import RecordedSource
 
 TITLE = "Curiosity-driven, vision-enabled iCub"
 
@@ -62,7 +64,6 @@ def recording_of(request: Request) -> Path:
     folder = request.folder.parent / "icub-recording"
     finished = folder / "finished.json"
     if not finished.exists():
-        from cdmisfa.experiments.documents import write_json
         from recorder.recording import record_scene
 
         views = record_scene(
@@ -78,8 +79,6 @@ def recording_of(request: Request) -> Path:
 
 def identity(path: str) -> dict[str, Any]:
     """What a recording is, wherever it lies."""
-    from replay.recordings.source import RecordedSource
-
     with contextlib.closing(RecordedSource(path)) as source:
         described: dict[str, Any] = json.loads(json.dumps(source.describe(), default=str))
     return {key: value for key, value in described.items() if key not in ("path", "files")}
@@ -92,12 +91,10 @@ def open_world(settings: Settings) -> FrameSource:
         from recorder.world.scenes import open_scene
 
         return open_scene("icub", IcubConfig(seed=settings["seed"]))
-    from replay.recordings.source import RecordedSource
-
     return RecordedSource(settings["recording"])
 
 
-def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def run(settings: Settings) -> Ran:
     """One trial: 1400 iterations, or as many as the recording has."""
     with contextlib.closing(open_world(settings)) as source:
         return watch(source, learner_config(), settings["seed"], ITERATIONS)
@@ -139,19 +136,14 @@ class Curves(Sink):
         self.arrays |= {name: np.stack(values) for name, values in self._curves.items()}
 
 
-def watch(
-    source: FrameSource, config: LearnerConfig, seed: int, iterations: int
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def watch(source: FrameSource, config: LearnerConfig, seed: int, iterations: int) -> Ran:
     """Learn from a source, and keep the curves and each module's last outputs."""
     learner = open_learner(config, source.spec, seed)
     curves = Curves(learner.tau, source.spec.truth)
     with contextlib.suppress(LogExhaustedError):
         learn(source, learner, (curves,), max_iterations=iterations, max_modules=iterations)
-    modules = learner.modules
     row = {
-        "streams": [m.stream for m in modules],
-        "policies": ["".join(map(str, m.policy.tolist())) for m in modules],
-        "saved_at": [m.iteration for m in modules],
+        **learned(learner.modules),
         "correlation": curves.encoded,
         "iterations": learner.iteration,
     }
@@ -165,22 +157,20 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     good = sum(f[:2] == OPTIMAL for f in found)
     ended = sum(len(f) == 2 for f in found)
     lines = [
-        share("trials with both modules and policies optimal", "10 of 10", good, n),
-        share("trials without a third module", "10 of 10", ended, n),
-        Line("iterations in all", "-", summary([t.row["iterations"] for t in trials]), digits=0),
+        Line.share("trials with both modules and policies optimal", "10 of 10", good, n),
+        Line.share("trials without a third module", "10 of 10", ended, n),
+        Line.measured("iterations in all", [t.row["iterations"] for t in trials], digits=0),
     ]
     for i, name in enumerate(OBJECTS):
-        saved = [t.row["saved_at"][i] for t in trials if len(t.row["saved_at"]) > i]
-        encoded = [t.row["correlation"][i] for t in trials if len(t.row["correlation"]) > i]
-        lines.append(Line(f"module {i + 1} saved at iteration", "-", summary(saved), digits=0))
-        lines.append(
-            Line(f"correlation of module {i + 1} with {name}", "encodes it", summary(encoded))
-        )
+        module = f"module {i + 1}"
+        follows = f"correlation of {module} with {name}"
+        lines += [
+            Line.of_module(f"{module} saved at iteration", trials, "saved_at", i, digits=0),
+            Line.of_module(follows, trials, "correlation", i, "encodes it"),
+        ]
     claims = [
-        Claim(
-            "object 1 with [0,1,1], then object 3 with [1,1,0]", good == n, f"{good} of {n} trials"
-        ),
-        Claim("no third module is learned", ended == n, f"{ended} of {n} trials"),
+        Claim.of_all("object 1 with [0,1,1], then object 3 with [1,1,0]", good, n),
+        Claim.of_all("no third module is learned", ended, n),
     ]
     return Findings(lines, claims)
 
@@ -188,10 +178,9 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
 def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     """Value function, policy, eta-dot; the modules' outputs over time and against the objects."""
     drawn, axes = panels.figure(1, 3)
-    values = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
-    panels.per_stream(axes[0, 0], values, "c", "Q(s, stay) - Q(s, switch)")
-    panels.policies(axes[0, 1], [t.arrays["policy"] for t in trials], "d", "policy, mean and SD")
-    panels.eta_dot(axes[0, 2], [t.arrays["eta_dot"] for t in trials], learner_config().delta, "e")
+    panels.values(axes[0, 0], trials, "c")
+    panels.policies(axes[0, 1], trials, "d", "policy, mean and SD")
+    panels.eta_dot(axes[0, 2], trials, learner_config().delta, "e")
     paths = panels.save(drawn, folder, "icub")
     outputs, axes = panels.figure(2, 2)
     for i, name in enumerate(OBJECTS):

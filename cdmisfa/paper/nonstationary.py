@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.experiments.statistics import Midpoint, Summary, logistic_midpoint
+from cdmisfa.experiments.trial import Swap, run_trial
 from cdmisfa.paper import panels
 from cdmisfa.paper.oscillatory import learner_config
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Request, Settings, Trial
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, groups
 
 TITLE = "Non-stationary environments"
 
@@ -59,10 +59,8 @@ def plan(request: Request) -> list[dict[str, Any]]:
     ]
 
 
-def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def run(settings: Settings) -> Ran:
     """Streams zero, x2, x3; the first becomes x1 when epsilon falls below epsilon^c."""
-    from cdmisfa.experiments.trial import Swap, run_trial
-
     config = learner_config(
         **{settings["key"]: settings["value"]},
         epsilon_decay=DECAY,
@@ -76,7 +74,7 @@ def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         max_modules=1,
         swap=Swap(settings["epsilon_c"], 0, "x1"),
     )
-    policy = result.modules[0].policy.tolist() if result.modules else list(result.final_policy)
+    policy = result.modules[0].policy if result.modules else result.final_policy
     row = {
         "policy": "".join(map(str, policy)),
         "saved": bool(result.modules),
@@ -86,21 +84,10 @@ def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     return row, {}
 
 
-def groups(trials: Sequence[Trial]) -> Iterator[tuple[str, float, list[Trial]]]:
-    """Trials of each column of the tables, in order."""
-    keys = dict.fromkeys((t.settings["key"], t.settings["value"]) for t in trials)
-    for key, value in keys:
-        yield (
-            key,
-            value,
-            [t for t in trials if (t.settings["key"], t.settings["value"]) == (key, value)],
-        )
-
-
 def point_of_no_return(trials: Sequence[Trial]) -> Midpoint:
     """Epsilon^d: the midpoint of "converged to the new optimum" against epsilon^c."""
     return logistic_midpoint(
-        [t.settings["epsilon_c"] for t in trials], [t.row["policy"] == NEW for t in trials]
+        [t.settings["epsilon_c"] for t in trials], [_is_new(t) for t in trials]
     )
 
 
@@ -108,44 +95,29 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     """Late changes must leave the old optimum; epsilon^d must be lower for a smaller sigma."""
     lines: list[Line] = []
     points: dict[str, dict[float, Midpoint]] = {}
-    early_new: dict[float, float] = {}
-    for key, value, group in groups(trials):
-        point = point_of_no_return(group)
-        points.setdefault(key, {})[value] = point
+    for (key, value), group in groups(trials, "key", "value").items():
+        point = points.setdefault(key, {})[value] = point_of_no_return(group)
         inside = CHANGES[-1] <= point.value <= CHANGES[0]
         shown = Summary(point.value if inside else math.nan, math.nan, point.n)
-        lines.append(
-            Line(
-                f"epsilon^d at {key} = {value:g}",
-                f"{COLUMNS[key][value]:g}",
-                shown,
-                (point.low, point.high),
-            )
-        )
-        neither = np.mean([t.row["policy"] not in (OLD, NEW) for t in group])
-        lines.append(
-            Line(
-                f"share of trials in neither optimum at {key} = {value:g}",
-                "0",
-                Summary(float(neither), math.nan, len(group)),
-            )
-        )
-        if key == "sigma":
-            first = max(t.settings["epsilon_c"] for t in group)
-            early_new[value] = float(
-                np.mean([t.row["policy"] == NEW for t in group if t.settings["epsilon_c"] == first])
-            )
+        neither = float(np.mean([t.row["policy"] not in (OLD, NEW) for t in group]))
+        at, bounds = f"at {key} = {value:g}", (point.low, point.high)
+        share = Summary(neither, math.nan, len(group))
+        lines += [
+            Line(f"epsilon^d {at}", f"{COLUMNS[key][value]:g}", shown, bounds),
+            Line(f"share of trials in neither optimum {at}", "0", share),
+        ]
     sigma = points["sigma"]
     order = [_rank(sigma[s]) for s in sorted(sigma, reverse=True)]
-    last = min(t.settings["epsilon_c"] for t in trials)
-    late = [t for t in trials if t.settings["epsilon_c"] == last and t.settings["key"] == "sigma"]
-    kept = sum(t.row["policy"] != NEW for t in late)
-    small = min(sigma)
+    changes = [t.settings["epsilon_c"] for t in trials]
+    early, last = groups(trials, "key", "value", "epsilon_c"), min(changes)
+    followed = np.mean([_is_new(t) for t in early["sigma", min(sigma), max(changes)]])
+    late = groups(trials, "key", "epsilon_c")["sigma", last]
+    kept = sum(not _is_new(t) for t in late)
     claims = [
         Claim(
             "a change while epsilon is large is followed, at the smallest sigma",
-            early_new[small] >= 0.8,
-            f"{early_new[small]:.0%} of the trials with epsilon^c = 1",
+            bool(followed >= 0.8),
+            f"{followed:.0%} of the trials with epsilon^c = 1",
         ),
         Claim(
             "a change while epsilon is small is not followed",
@@ -159,14 +131,12 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
         ),
     ]
     if "tau" in points:
-        tau = {value: _rank(point) for value, point in points["tau"].items()}
-        short = min(tau)
-        others = [v for value, v in tau.items() if value != short]
+        shortest, *others = (_rank(points["tau"][value]) for value in sorted(points["tau"]))
         claims.append(
             Claim(
-                f"epsilon^d is higher at tau = {short:g} than at the others",
-                all(tau[short] > v for v in others),
-                _in_words([tau[value] for value in sorted(tau)]),
+                f"epsilon^d is higher at tau = {min(points['tau']):g} than at the others",
+                all(shortest > v for v in others),
+                _in_words([shortest, *others]),
             )
         )
     notes = [
@@ -175,6 +145,10 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
         *_differences(points),
     ]
     return Findings(lines, claims, notes)
+
+
+def _is_new(trial: Trial) -> bool:
+    return bool(trial.row["policy"] == NEW)
 
 
 def _differences(points: Mapping[str, Mapping[float, Midpoint]]) -> list[str]:
@@ -203,25 +177,17 @@ def _rank(point: Midpoint) -> float:
 
 def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     """Policy against epsilon^c for the smallest and the largest sigma, and both tables."""
-    sigmas = sorted({t.settings["value"] for t in trials if t.settings["key"] == "sigma"})
+    by_sigma = {
+        v: group for (k, v), group in groups(trials, "key", "value").items() if k == "sigma"
+    }
+    sigmas = sorted(by_sigma)
     chosen = (0.0001 if 0.0001 in sigmas else sigmas[0], sigmas[-1])
     drawn, axes = panels.figure(1, 2)
     for panel, sigma, letter in zip(axes[0], chosen, "ab", strict=True):
-        group = [t for t in trials if t.settings["key"] == "sigma" and t.settings["value"] == sigma]
-        epsilons = sorted({t.settings["epsilon_c"] for t in group})
-        mean = np.array(
-            [
-                np.mean(
-                    [
-                        list(map(int, t.row["policy"]))
-                        for t in group
-                        if t.settings["epsilon_c"] == e
-                    ],
-                    axis=0,
-                )
-                for e in epsilons
-            ]
-        )
+        by_change = groups(by_sigma[sigma], "epsilon_c")
+        epsilons = [epsilon for (epsilon,) in sorted(by_change)]
+        policies = [[[*map(int, t.row["policy"])] for t in by_change[e,]] for e in epsilons]
+        mean = np.array([np.mean(policy, axis=0) for policy in policies])
         for s in range(mean.shape[1]):
             panel.plot(
                 epsilons,
@@ -233,7 +199,7 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
                 color=panels.COLOURS[s],
                 label=panels.STREAM_NAMES[s],
             )
-        point = point_of_no_return(group)
+        point = point_of_no_return(by_sigma[sigma])
         if math.isfinite(point.value):
             panel.axvline(
                 point.value, color="grey", linestyle="-.", linewidth=1, label=r"$\epsilon^d$"

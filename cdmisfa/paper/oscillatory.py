@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.statistics import summary
+from cdmisfa.experiments.trial import run_trial
 from cdmisfa.features.slowness import instantaneous_slowness
 from cdmisfa.paper import panels
-from cdmisfa.paper.reproduce import Arrays, Claim, Findings, Line, Request, Settings, Trial, share
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, learned
 from recorder.world.oscillatory import one_period
 
 TITLE = "Oscillatory streams"
@@ -38,27 +38,21 @@ def plan(request: Request) -> list[dict[str, Any]]:
     return [{"seed": seed} for seed in range(request.count(20, 4))]
 
 
-def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def run(settings: Settings) -> Ran:
     """One trial until three modules are learned."""
-    from cdmisfa.experiments.trial import run_trial
-
     result = run_trial(
         learner_config(), seed=settings["seed"], max_iterations=MAX_ITERATIONS, curves=True
     )
-    curves: Arrays = result.curves or {}
+    curves: Any = result.curves
     found = tuple((m.stream, tuple(m.policy.tolist())) for m in result.modules)
     row = {
         "optimal": found == OPTIMAL,
         "iterations": result.iterations,
-        "streams": [m.stream for m in result.modules],
-        "policies": ["".join(map(str, m.policy.tolist())) for m in result.modules],
-        "saved_at": [m.iteration for m in result.modules],
+        **learned(result.modules),
         "eta": [slowness_on(m) for m in result.modules],
     }
-    return row, {
-        **{name: curves[name].astype(np.float32) for name in ("eta_dot", "R", "Q")},
-        "policy": curves["policy"].astype(np.int8),
-    }
+    arrays = {name: curves[name].astype(np.float32) for name in ("eta_dot", "R", "Q")}
+    return row, {**arrays, "policy": curves["policy"].astype(np.int8)}
 
 
 def expanded_period(stream: int) -> NDArray[np.float64]:
@@ -75,31 +69,20 @@ def slowness_on(module: Module) -> float:
 def evaluate(trials: Sequence[Trial]) -> Findings:
     """Every trial must learn x1, x2, x3 in this order with the optimal policies."""
     good, n = sum(bool(t.row["optimal"]) for t in trials), len(trials)
+    iterations = [t.row["iterations"] for t in trials]
     lines = [
-        share("trials with order and policies optimal", "20 of 20", good, n),
-        Line(
-            "iterations until the third module",
-            "-",
-            summary([t.row["iterations"] for t in trials]),
-            digits=0,
-        ),
+        Line.share("trials with order and policies optimal", "20 of 20", good, n),
+        Line.measured("iterations until the third module", iterations, digits=0),
     ]
     for i, frequency in enumerate((4, 3, 2)):
-        saved = [t.row["saved_at"][i] for t in trials if len(t.row["saved_at"]) > i]
-        eta = [t.row["eta"][i] for t in trials if len(t.row["eta"]) > i]
-        lines.append(Line(f"module {i + 1} saved at iteration", "-", summary(saved), digits=0))
-        lines.append(
-            Line(
-                f"slowness of module {i + 1} on its stream (paper: its frequency)",
-                f"{frequency / 500:.4f}",
-                summary(eta),
-                digits=4,
-            )
-        )
-    claim = Claim(
-        "modules x1, x2, x3 in this order, policies [0,1,1], [1,0,1], [1,1,0]",
-        good == n,
-        f"{good} of {n} trials",
+        module, paper = f"module {i + 1}", f"{frequency / 500:.4f}"
+        slowness = f"slowness of {module} on its stream (paper: its frequency)"
+        lines += [
+            Line.of_module(f"{module} saved at iteration", trials, "saved_at", i, digits=0),
+            Line.of_module(slowness, trials, "eta", i, paper, digits=4),
+        ]
+    claim = Claim.of_all(
+        "modules x1, x2, x3 in this order, policies [0,1,1], [1,0,1], [1,1,0]", good, n
     )
     return Findings(lines, [claim])
 
@@ -107,20 +90,15 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
 def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     """The paper's four panels, and the saved policies of each module."""
     drawn, axes = panels.figure(2, 2)
-    delta = learner_config().delta
-    panels.eta_dot(axes[0, 0], [t.arrays["eta_dot"] for t in trials], delta, "a")
-    panels.per_stream(
-        axes[0, 1], [t.arrays["R"] for t in trials], "b", "R, stay entries", each=True
-    )
-    values = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
-    panels.per_stream(axes[1, 0], values, "c", "Q(s, stay) - Q(s, switch)")
-    panels.policies(axes[1, 1], [t.arrays["policy"] for t in trials], "d", "policy, mean and SD")
+    panels.eta_dot(axes[0, 0], trials, learner_config().delta, "a")
+    panels.rewards(axes[0, 1], trials, "b", "R, stay entries")
+    panels.values(axes[1, 0], trials, "c")
+    panels.policies(axes[1, 1], trials, "d", "policy, mean and SD")
     paths = panels.save(drawn, folder, "oscillatory")
     bars, axes = panels.figure(1, 3, width=2.3)
     for i in range(3):
-        saved = [list(map(int, t.row["policies"][i])) for t in trials if len(t.row["policies"]) > i]
+        words = [t.row["policies"][i] for t in trials if len(t.row["policies"]) > i]
+        saved = [np.array([*map(int, word)]) for word in words]
         if saved:
-            panels.policy_bars(
-                axes[0, i], [np.array(p) for p in saved], "abc"[i], f"module {i + 1}"
-            )
+            panels.policy_bars(axes[0, i], saved, "abc"[i], f"module {i + 1}")
     return paths + panels.save(bars, folder, "oscillatory-policies")

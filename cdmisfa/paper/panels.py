@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from cdmisfa.paper.reproduce import Trial
+
 Float = NDArray[np.float64]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -27,19 +29,12 @@ MARKERS = (("o", 7), ("s", 5), ("^", 3))
 """Marks and their sizes that stay apart where they lie on each other; one for each stream."""
 
 
-def figure(rows: int, columns: int, *, width: float = 3.4, height: float = 2.4) -> tuple[Any, Any]:
-    """A figure of panels and its (rows, columns) axes.
-
-    Args:
-        rows: of panels.
-        columns: of panels.
-        width: of a panel, inches.
-        height: of a panel, inches.
-    """
+def figure(rows: int, columns: int, *, width: float = 3.4) -> tuple[Any, Any]:
+    """A figure of panels, each `width` inches wide, and its (rows, columns) axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drawn = Figure(figsize=(columns * width, rows * height), layout="constrained")
+    drawn = Figure(figsize=(columns * width, rows * 2.4), layout="constrained")
     FigureCanvasAgg(drawn)
     return drawn, drawn.subplots(rows, columns, squeeze=False)
 
@@ -81,9 +76,9 @@ def mean_sd(stacked: Float) -> tuple[Float, Float]:
     return mean, np.where(count > 0, np.sqrt(square), np.nan)
 
 
-def eta_dot(axes: Axes, curves: Sequence[NDArray[Any]], delta: float, letter: str) -> None:
+def eta_dot(axes: Axes, trials: Sequence[Trial], delta: float, letter: str) -> None:
     """Derivative of slowness over iterations: every trial, their mean dashed, and delta."""
-    stacked = stack([np.max(np.asarray(c), axis=-1) for c in curves])
+    stacked = stack([np.max(t.arrays["eta_dot"], axis=-1) for t in trials])
     for row in stacked:
         axes.plot(row, color=COLOURS[0], alpha=0.25, linewidth=0.5)
     axes.plot(mean_sd(stacked)[0], color="black", linestyle="--", linewidth=0.9, label="mean")
@@ -93,38 +88,46 @@ def eta_dot(axes: Axes, curves: Sequence[NDArray[Any]], delta: float, letter: st
     label(axes, letter, "iteration", r"$|\dot\eta|$")
 
 
-def per_stream(
+def band(
     axes: Axes,
-    curves: Sequence[NDArray[Any]],
-    letter: str,
-    y: str,
+    mean: Float,
+    sd: Float,
+    stream: int,
     *,
-    each: bool = False,
-    names: Sequence[str] = STREAM_NAMES,
+    x: NDArray[Any] | None = None,
+    within: tuple[float, float] = (-np.inf, np.inf),
+    alpha: float = 0.2,
 ) -> None:
-    """One colour a stream: every trial where `each`, else mean and a band of one SD.
+    """One SD around a stream's mean, as far as it is `within` what can be."""
+    low, high = np.clip(mean - sd, *within), np.clip(mean + sd, *within)
+    at = np.arange(len(mean)) if x is None else x
+    axes.fill_between(at, low, high, color=COLOURS[stream], alpha=alpha, linewidth=0)
 
-    Args:
-        axes: panel.
-        curves: (N, S) of each trial.
-        letter: of the panel.
-        y: name of the axis.
-        each: draw every trial.
-        names: of the streams.
-    """
+
+def rewards(axes: Axes, trials: Sequence[Trial], letter: str, y: str) -> None:
+    """Every trial's R, and the mean."""
+    _per_stream(axes, [t.arrays["R"] for t in trials], letter, y, each=True)
+
+
+def values(axes: Axes, trials: Sequence[Trial], letter: str) -> None:
+    """By how much staying is worth more than switching, mean and SD."""
+    gains = [t.arrays["Q"][:, :, 0] - t.arrays["Q"][:, :, 1] for t in trials]
+    _per_stream(axes, gains, letter, "Q(s, stay) - Q(s, switch)")
+
+
+def _per_stream(
+    axes: Axes, curves: Sequence[NDArray[Any]], letter: str, y: str, *, each: bool = False
+) -> None:
+    """One colour a stream: every trial's (N, S) where `each`, else mean and a band of one SD."""
     stacked = stack(curves)
     mean, sd = mean_sd(stacked)
-    steps = np.arange(stacked.shape[1])
     for s in range(stacked.shape[2]):
-        colour = COLOURS[s % len(COLOURS)]
         if each:
             for row in stacked[:, :, s]:
-                axes.plot(row, color=colour, alpha=0.25, linewidth=0.4)
+                axes.plot(row, color=COLOURS[s], alpha=0.25, linewidth=0.4)
         else:
-            axes.fill_between(
-                steps, mean[:, s] - sd[:, s], mean[:, s] + sd[:, s], color=colour, alpha=0.2, lw=0
-            )
-        axes.plot(mean[:, s], color=colour, linewidth=1.0, label=names[s])
+            band(axes, mean[:, s], sd[:, s], s)
+        axes.plot(mean[:, s], color=COLOURS[s], linewidth=1.0, label=STREAM_NAMES[s])
     settled = stacked[:, 30:] if stacked.shape[1] > 60 else stacked
     low, high = np.nanquantile(settled, 0.001), np.nanquantile(settled, 0.999)
     if high > low:
@@ -133,26 +136,16 @@ def per_stream(
     label(axes, letter, "iteration", y)
 
 
-def policies(axes: Axes, curves: Sequence[NDArray[Any]], letter: str, y: str) -> None:
-    """Mean policy over iterations, a line a stream, and a band of one SD within what can be.
-
-    Args:
-        axes: panel.
-        curves: (N, S) of each trial, 0 stay and 1 switch.
-        letter: of the panel.
-        y: name of the axis.
-    """
-    mean, sd = mean_sd(stack(curves))
-    steps = np.arange(len(mean))
+def policies(axes: Axes, trials: Sequence[Trial], letter: str, y: str) -> None:
+    """Mean policy over iterations, a line a stream, and a band of one SD within what can be."""
+    mean, sd = mean_sd(stack([t.arrays["policy"] for t in trials]))
     for s in range(mean.shape[1]):
-        colour, width = COLOURS[s % len(COLOURS)], (1.8, 1.4, 1.4)[s % 3]
-        low, high = np.clip(mean[:, s] - sd[:, s], 0, 1), np.clip(mean[:, s] + sd[:, s], 0, 1)
-        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+        band(axes, mean[:, s], sd[:, s], s, within=(0, 1), alpha=0.15)
         axes.plot(
             mean[:, s],
-            color=colour,
-            linewidth=width,
-            linestyle=DASHES[s % 3],
+            color=COLOURS[s],
+            linewidth=1.4 if s else 1.8,
+            linestyle=DASHES[s],
             label=STREAM_NAMES[s],
         )
     axes.legend(fontsize=6)
@@ -168,10 +161,10 @@ def stay_to_switch(axes: Axes) -> None:
 
 def policy_bars(axes: Axes, policies: Sequence[NDArray[Any]], letter: str, title: str) -> None:
     """Share of trials whose policy leaves each stream: 0 all stay, 1 all switch."""
-    stacked = np.asarray(policies, dtype=float)
-    for s in range(stacked.shape[1]):
-        axes.bar(s, stacked[:, s].mean(), color=COLOURS[s], width=0.7)
-        axes.plot([s - 0.35, s + 0.35], [stacked[:, s].mean()] * 2, color=COLOURS[s], linewidth=2)
-    axes.set_xticks(range(stacked.shape[1]), STREAM_NAMES[: stacked.shape[1]])
+    mean = np.mean(policies, axis=0)
+    for s, height in enumerate(mean):
+        axes.bar(s, height, color=COLOURS[s], width=0.7)
+        axes.plot([s - 0.35, s + 0.35], [height, height], color=COLOURS[s], linewidth=2)
+    axes.set_xticks(range(len(mean)), STREAM_NAMES[: len(mean)])
     stay_to_switch(axes)
     label(axes, letter, title, "policy, mean over trials")

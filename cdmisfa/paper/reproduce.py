@@ -17,9 +17,12 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
-from numpy.typing import NDArray
+import pyarrow
+from numpy.typing import ArrayLike, NDArray
+from pyarrow import parquet
 
 from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
+from cdmisfa.core.modules import Module
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.engines import WorkerDied, run_all
@@ -35,6 +38,8 @@ SETTING = "set_"
 
 Settings = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[Any]]
+Ran = tuple[dict[str, Any], Arrays]
+"""A trial's row, in plain values, and its arrays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +100,37 @@ class Line:
     interval: tuple[float, float] | None = None
     digits: int = 3
 
+    @classmethod
+    def measured(
+        cls, quantity: str, values: ArrayLike, paper: str = "-", *, digits: int = 3
+    ) -> Line:
+        """What was measured once or more."""
+        return cls(quantity, paper, summary(values), digits=digits)
 
-def share(quantity: str, paper: str, good: int, n: int) -> Line:
-    """The line about how many of n trials did what is named."""
-    return Line(quantity, paper, summary([1.0] * good + [0.0] * (n - good)), wilson(good, n))
+    @classmethod
+    def of_module(
+        cls,
+        quantity: str,
+        trials: Sequence[Trial],
+        key: str,
+        number: int,
+        paper: str = "-",
+        *,
+        digits: int = 3,
+    ) -> Line:
+        """What the rows say under a key of a module, counted from 0, where there is one."""
+        values = [t.row[key][number] for t in trials if len(t.row[key]) > number]
+        return cls.measured(quantity, values, paper, digits=digits)
+
+    @classmethod
+    def share(cls, quantity: str, paper: str, good: int, n: int) -> Line:
+        """How many of n trials did what is named."""
+        return cls(quantity, paper, summary([1.0] * good + [0.0] * (n - good)), wilson(good, n))
+
+    def as_json(self) -> dict[str, Any]:
+        """The line as results.json has it."""
+        known = {"quantity": self.quantity, "paper": self.paper, **asdict(self.ours)}
+        return {**known, "interval": self.interval, "digits": self.digits}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +140,11 @@ class Claim:
     claim: str
     holds: bool
     detail: str
+
+    @classmethod
+    def of_all(cls, claim: str, good: int, n: int) -> Claim:
+        """That all of n trials did what is named."""
+        return cls(claim, good == n, f"{good} of {n} trials")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +156,23 @@ class Findings:
     notes: Sequence[str] = field(default=())
 
 
+def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Trial]]:
+    """The trials whose settings have the same values of some keys, by these, in order."""
+    found: dict[tuple[Any, ...], list[Trial]] = {}
+    for trial in trials:
+        found.setdefault(tuple(trial.settings[key] for key in keys), []).append(trial)
+    return found
+
+
+def learned(modules: Sequence[Module]) -> dict[str, list[Any]]:
+    """What a row says of the modules of a trial; a policy as "011", 0 stay and 1 switch."""
+    return {
+        "streams": [m.stream for m in modules],
+        "policies": ["".join(map(str, m.policy)) for m in modules],
+        "saved_at": [m.iteration for m in modules],
+    }
+
+
 class Experiment(Protocol):
     """What the module of an experiment offers."""
 
@@ -127,7 +181,7 @@ class Experiment(Protocol):
     def plan(self, request: Request) -> list[dict[str, Any]]:
         """Settings of every trial, as JSON values."""
 
-    def run(self, settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    def run(self, settings: Settings) -> Ran:
         """One trial: its row and its arrays. Called in another process, maybe elsewhere."""
 
     def evaluate(self, trials: Sequence[Trial]) -> Findings:
@@ -197,7 +251,8 @@ def reproduce(
             row, arrays = result
             point = {"id": names[i], "status": DONE, "point": planned[i], "code": version}
             store.add({**point, "result": row})
-            write_arrays(curves[i], arrays)
+            with whole(curves[i], sync=False) as partial, open(partial, "wb") as file:
+                np.savez_compressed(file, **cast(dict[str, Any], arrays))
             if progress is not None:
                 progress(done, len(planned))
         rows = [store.rows[n] for n in names]
@@ -206,18 +261,10 @@ def reproduce(
         for row, path in zip(rows, curves, strict=True)
     ]
     findings = module.evaluate(trials)
-    write_rows(request.folder / "rows.parquet", trials)
+    table = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
+    with whole(request.folder / "rows.parquet") as partial:
+        parquet.write_table(pyarrow.Table.from_pylist(table), partial)
     figures = module.draw(trials, request.folder)
-    table = [
-        {
-            "quantity": line.quantity,
-            "paper": line.paper,
-            **asdict(line.ours),
-            "interval": line.interval,
-            "digits": line.digits,
-        }
-        for line in findings.lines
-    ]
     document: dict[str, Any] = plain(
         {
             "schema": 1,
@@ -227,7 +274,7 @@ def reproduce(
             "trials": len(trials),
             "reproduced": all(claim.holds for claim in findings.claims),
             "claims": [asdict(claim) for claim in findings.claims],
-            "table": table,
+            "table": [line.as_json() for line in findings.lines],
             "notes": list(findings.notes),
             "figures": [figure.name for figure in figures],
             "code": version,
@@ -240,7 +287,7 @@ def reproduce(
     return document
 
 
-def run_one(task: tuple[str, Settings]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def run_one(task: tuple[str, Settings]) -> Ran:
     """One trial of the named experiment, for any process to call."""
     name, settings = task
     return experiment(name).run(settings)
@@ -258,33 +305,17 @@ def check(document: Mapping[str, Any]) -> None:
         raise NotReproducedError(f"{document['experiment']} did not come out: {words}")
 
 
-def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write what figures show of a trial, whole or not at all."""
-    with whole(path, sync=False) as partial, open(partial, "wb") as file:
-        np.savez_compressed(file, **cast(dict[str, Any], arrays))
-
-
 def read_arrays(path: Path) -> Arrays:
-    """Read them back.
+    """What was kept of a trial for the figures.
 
     Raises:
         UsageError: the file is damaged.
     """
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files}
+            return dict(stored)
     except Exception as error:
         raise UsageError(f"{path} is damaged: delete it, and the trial is run again") from error
-
-
-def write_rows(path: Path, trials: Sequence[Trial]) -> None:
-    """The raw rows, settings and results side by side, as parquet."""
-    import pyarrow
-    from pyarrow import parquet
-
-    rows = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
-    with whole(path) as partial:
-        parquet.write_table(pyarrow.Table.from_pylist(rows), partial)
 
 
 def _keep_results(folder: Path, planned: Sequence[Settings]) -> None:
@@ -293,9 +324,6 @@ def _keep_results(folder: Path, planned: Sequence[Settings]) -> None:
     Raises:
         UsageError: they do, or cannot be read.
     """
-    import pyarrow
-    from pyarrow import parquet
-
     path = folder / "rows.parquet"
     if not path.is_file():
         return
