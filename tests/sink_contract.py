@@ -39,6 +39,8 @@ class SinkContract:
         sink = self.open(tmp_path, source, learner)
         with sink if hasattr(sink, "__exit__") else contextlib.nullcontext():
             yield source, learner, sink
+        if hasattr(sink, "abandon"):  # a log whose run did not finish it
+            sink.abandon()
 
     def test_it_is_a_sink(self, opened) -> None:
         assert isinstance(opened[2], Sink)

@@ -231,7 +231,7 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         write_json(path, {"a": object()})
     assert json.loads(path.read_text()) == {"a": 1}
     with pytest.raises(CdmisfaError, match="cannot be written"):
-        write_json(tmp_path / "none" / "a.json", {})
+        write_json(path / "b.json", {})
 
 
 def test_the_folder_is_held_until_the_view_is_built(
