@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 from benchmarks.report import interleaved, ratio, save
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.incsfa import Params, State, gram, new_state, parameters, strict
+from cdmisfa.features.incsfa import gram, strict
+from cdmisfa.features.incsfa.state import Params, State, new_state, parameters
 from recorder.world.oscillatory import one_period
 
 PIXELS = 6144

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import interleaved, ratio, save
-from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules, think
+from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules
 from cdmisfa.agents.gate import NOVEL
+from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.compiled import compiled
 from cdmisfa.core.config import LearnerConfig

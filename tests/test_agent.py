@@ -10,21 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cdmisfa.agents.agent import (
-    IDLE_EPSILON,
-    OUTCOME,
-    Agent,
-    begin_abstraction,
-    has_gap,
-    mean_change,
-    new_agent,
-    ready_to_save,
-    recent_variance,
-    rules,
-    think,
-)
+from cdmisfa.agents.agent import OUTCOME, Agent, begin_abstraction, new_agent, rules
 from cdmisfa.agents.gate import CONSTANT, NOVEL
+from cdmisfa.agents.iteration import IDLE_EPSILON, has_gap, mean_change, think
 from cdmisfa.agents.policy import action_values
+from cdmisfa.agents.saving import ready_to_save, recent_variance
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.signals import DENSE_STREAMS
 from cdmisfa.features.slowness import instantaneous_slowness
@@ -137,17 +127,17 @@ def test_the_weight_change_is_compared_with_the_last_novel_block() -> None:
 
 def test_gaps() -> None:
     bench = Bench()
-    assert has_gap(bench.agent, 0, 0)
+    assert has_gap(bench.agent.memory, 0, 0)
     bench.step()
-    assert not has_gap(bench.agent, 0, TAU)
-    assert has_gap(bench.agent, 1, TAU)
-    assert has_gap(bench.agent, 0, TAU + 1)
+    assert not has_gap(bench.agent.memory, 0, TAU)
+    assert has_gap(bench.agent.memory, 1, TAU)
+    assert has_gap(bench.agent.memory, 0, TAU + 1)
     bench.step(known_by=1)
-    assert has_gap(bench.agent, 0, 2 * TAU)
+    assert has_gap(bench.agent.memory, 0, 2 * TAU)
     bench.step()
-    assert not has_gap(bench.agent, 0, 3 * TAU)
+    assert not has_gap(bench.agent.memory, 0, 3 * TAU)
     begin_abstraction(bench.agent, 1.2)
-    assert has_gap(bench.agent, 0, 3 * TAU)
+    assert has_gap(bench.agent.memory, 0, 3 * TAU)
 
 
 def test_the_mean_change_leaves_out_what_has_none() -> None:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expanded_size, quadratic
 
 
@@ -34,5 +35,5 @@ def test_pixels_count_a_255th():
 
 def test_no_expansion_keeps_the_size_and_an_unknown_one_is_refused():
     assert expanded_size("none", 6144) == 6144
-    with pytest.raises(ValueError, match="cubic"):
+    with pytest.raises(UsageError, match="no expansion 'cubic': there are none, quadratic"):
         expanded_size("cubic", 2)

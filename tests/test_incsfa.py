@@ -6,8 +6,11 @@ import pytest
 from cdmisfa.core.blocks import freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.incsfa import IncSFA, copy_into, gram, new_state, parameters, project, strict
-from cdmisfa.features.incsfa.state import PIXEL, State, rank_floor
+from cdmisfa.core.frames import PIXEL
+from cdmisfa.features.incsfa import gram, strict
+from cdmisfa.features.incsfa.abstraction import IncSFA
+from cdmisfa.features.incsfa.state import State, copy_into, new_state, parameters, rank_floor
+from cdmisfa.features.projection import project
 from cdmisfa.features.sfa import batch_sfa, direction_cosine, slowness
 from recorder.world.oscillatory import OscillatorySource, one_period
 

@@ -1,4 +1,4 @@
-"""The gating system: is a block novel, and is the abstraction ready to be saved?"""
+"""The gate: is a block novel, known to a frozen module, or empty?"""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.agents.roc import known_to
 from cdmisfa.core.compiled import compiled
-from cdmisfa.features.incsfa.projection import project
+from cdmisfa.features.projection import outputs
 from cdmisfa.features.slowness import instantaneous_slowness
 
 Float = NDArray[np.float64]
@@ -111,21 +111,6 @@ def verdict(y_frozen: Float, band_mean: Float, band_sd: Float, eta_inst: Float) 
 
 
 @compiled
-def mean_output(phi: Float, mean: Float) -> Float:
-    """What phi gives out on the mean input, (J,): the offset of a centred projection.
-
-    Args:
-        phi: (J, I) weights.
-        mean: (I,) mean of the input.
-    """
-    offset = np.zeros(phi.shape[0])
-    for j in range(phi.shape[0]):
-        for i in range(phi.shape[1]):
-            offset[j] += phi[j, i] * mean[i]
-    return offset
-
-
-@compiled
 def recognise(
     frozen: Frozen,
     roc_error: float,
@@ -150,13 +135,13 @@ def recognise(
         eta_inst: (M, J) written: their instantaneous slowness.
         roc_error_frozen: (M,) written: their clustering error; NaN but for CD-MISFA 1.0.
     """
-    modules, n, outputs = y_frozen.shape
+    modules, n, J = y_frozen.shape
     if modules > 0:
-        y = project(frozen.phi, frozen.offset, x)
+        y = outputs(frozen.phi, frozen.offset, x)
         for m in range(modules):
             for t in range(n):
-                for j in range(outputs):
-                    y_frozen[m, t, j] = y[t, m * outputs + j]
+                for j in range(J):
+                    y_frozen[m, t, j] = y[t, m * J + j]
     known_by = verdict(y_frozen, frozen.band_mean, frozen.band_sd, eta_inst)
     roc_error_frozen[:] = np.nan
     if frozen.counts.shape[1] > 0:

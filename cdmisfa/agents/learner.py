@@ -6,30 +6,27 @@ blocks give the same signals, bit for bit.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.agent import (
-    OUTCOME,
-    begin_abstraction,
-    has_gap,
-    mean_change,
-    new_agent,
-    rules,
-    think,
-)
-from cdmisfa.agents.gate import Frozen, mean_output, recognise
+from cdmisfa.agents.agent import OUTCOME, begin_abstraction, new_agent, rules
+from cdmisfa.agents.gate import Frozen
+from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.policy import action_values
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.expansion import expanded_size, quadratic
+from cdmisfa.core.expansion import expand, expanded_size
+from cdmisfa.core.frames import PIXEL
 from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.features.incsfa import IncSFA, project
+from cdmisfa.features.feature import Feature, MakeFeature
+from cdmisfa.features.incsfa.abstraction import IncSFA
+from cdmisfa.features.projection import mean_output
 
 Float = NDArray[np.float64]
 
@@ -43,6 +40,12 @@ MAX_INPUTS = 2_000_000
 
 class CuriousLearner:
     """The paper's agent: adaptive abstraction, gating system and curiosity-driven learner.
+
+    Args:
+        config: what it is told.
+        spec: the source it learns from.
+        seed: where its random generators start.
+        feature: makes its adaptive abstractions.
 
     Attributes:
         config: what it was told.
@@ -66,13 +69,21 @@ class CuriousLearner:
         (100, 1)
     """
 
-    def __init__(self, config: LearnerConfig, spec: SourceSpec, seed: int) -> None:
+    def __init__(
+        self,
+        config: LearnerConfig,
+        spec: SourceSpec,
+        seed: int,
+        *,
+        feature: MakeFeature = IncSFA,
+    ) -> None:
         self.config = config
         self.spec = spec
         self.seed = seed
         self.modules: list[Module] = []
+        self._feature = feature
         self._n_inputs = self._count_inputs()
-        self.scale = 1.0 / 255.0 if spec.dtype == "uint8" else 1.0
+        self.scale = PIXEL if spec.dtype == "uint8" else 1.0
         self.policy_rng = np.random.Generator(
             np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
         )
@@ -115,6 +126,11 @@ class CuriousLearner:
         return self.abstraction.phi.copy()
 
     @property
+    def kernel(self) -> Any:
+        """The adaptive abstraction as compiled code takes it; None where it cannot."""
+        return getattr(self.abstraction, "kernel", None)
+
+    @property
     def over(self) -> bool:
         """Whether exploration has ended long ago and still nothing converged."""
         return bool(self.agent.memory["idle"][0] > self.config.patience)
@@ -129,12 +145,15 @@ class CuriousLearner:
         )
 
     def restore(self, state: LearnerState) -> None:
-        """Go on from a state of a learner with the same configuration, spec and seed.
+        """Go to a state of a learner with the same configuration, spec and seed.
 
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
-        self.modules = list(state.modules)
+        self.modules = [
+            dataclasses.replace(module, expansion=self.config.expansion, scale=self.scale)
+            for module in state.modules
+        ]
         self._freeze()
         self.abstraction = self._new_abstraction()
         for name, own in self._arrays().items():
@@ -151,43 +170,29 @@ class CuriousLearner:
             block: tau frames of the stream the learner asked for.
 
         Raises:
+            UsageError: it is no block.
             ValueError: the block is of another stream, length, frame shape or type.
             CdmisfaError: it holds a value that is no finite number.
         """
-        self._check(block)
-        agent = self.agent
-        frames = block.frames.reshape(len(block), -1)
-        x = quadratic(frames) if self.config.expansion == "quadratic" else frames
+        frames = self._checked(block)
         outputs, count = self.config.outputs, len(self.modules)
         y_frozen = np.empty((count, len(block), outputs))
         eta_frozen, roc_error_frozen = np.empty((count, outputs)), np.empty(count)
-        known_by = recognise(
+        y = iterate(
+            self.agent,
+            self.rules,
+            self.out,
             self.frozen,
-            self.rules.roc_error,
-            block.stream,
+            self.abstraction,
             frames,
-            x,
+            expand(self.config.expansion, frames),
             self.scale,
+            block.t,
+            self.policy_rng.random(3),
             y_frozen,
             eta_frozen,
             roc_error_frozen,
-        )
-        y = np.full((len(block), outputs), np.nan)
-        xi = np.nan
-        if known_by == 0:
-            gap = has_gap(agent, block.stream, block.t)
-            xi = mean_change(self.abstraction.update(x, gap))
-            phi = self.abstraction.phi
-            y = project(phi, mean_output(phi, self.abstraction.mean), x)
-        think(
-            agent,
-            self.rules,
-            self.out,
-            known_by,
-            xi,
-            y,
-            block.t + len(block),
-            self.policy_rng.random(3),
+            np.full((len(block), outputs), np.nan),
         )
         signals = self._signals(block, y, y_frozen, eta_frozen, roc_error_frozen)
         if self.out["saved"][0]:
@@ -217,8 +222,16 @@ class CuriousLearner:
             )
         return inputs
 
-    def _check(self, block: Block) -> None:
-        """Refuse a block that was not asked for, or that would spoil every estimate."""
+    def _checked(self, block: Block) -> NDArray[Any]:
+        """The frames of a block as rows.
+
+        A block that was not asked for is refused, as is one that would spoil every estimate.
+        """
+        if not isinstance(block, Block):
+            raise UsageError(
+                f"{type(block).__name__} given: a learner takes the blocks of a source, as "
+                "source.take(learner.stream, learner.tau) gives them"
+            )
         if block.stream != self.stream or len(block) != self.tau:
             raise ValueError(
                 f"the learner asked for {self.tau} frames of stream {self.stream}, "
@@ -235,6 +248,7 @@ class CuriousLearner:
                 f"stream {self.spec.streams[block.stream]} holds a value that is no finite number "
                 f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
             )
+        return block.frames.reshape(len(block), -1)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Every array that changes in place, by name."""
@@ -288,6 +302,8 @@ class CuriousLearner:
             band_sd=np.sqrt(agent.gate_variance),
             eta=agent.eta.copy(),
             policy=agent.policy.copy(),
+            expansion=self.config.expansion,
+            scale=self.scale,
             centres=agent.centres.copy(),
             counts=agent.counts.copy(),
         )
@@ -309,7 +325,8 @@ class CuriousLearner:
             counts=np.array([m.counts for m in modules]).reshape(count, *agent.counts.shape),
         )
 
-    def _new_abstraction(self) -> IncSFA:
+    def _new_abstraction(self) -> Feature:
         key = (WEIGHTS_KEY, len(self.modules))
         seed = np.random.SeedSequence(self.seed, spawn_key=key)
-        return IncSFA(self.config, self._n_inputs, np.random.Generator(np.random.PCG64(seed)))
+        rng = np.random.Generator(np.random.PCG64(seed))
+        return self._feature(self.config, self._n_inputs, rng)

@@ -5,15 +5,25 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.extending import overload
+
+from cdmisfa.core.splicing import Splicing
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-MARKS = (b"@compiled", b"@inlined", b"@reordered", b"@_intrinsic")
+MARKS = (
+    b"@compiled",
+    b"@inlined",
+    b"@splicing",
+    b"@reordered",
+    b"@in_compiled_code",
+    b"@_intrinsic",
+)
 """What files that hold compiled functions contain."""
 
 
@@ -27,12 +37,31 @@ def inlined(function: Function) -> Function:
     return _compile(function, forceinline=True)
 
 
+def spliced(function: Function) -> Function:
+    """Write a function's body into the compiled ones that call it, and compile it with them."""
+    return _compile(function, inline="always")
+
+
+def splicing(function: Function) -> Function:
+    """Compile strictly a function that calls `spliced` ones in a hot loop."""
+    return _compile(function, pipeline_class=Splicing)
+
+
 def reordered(function: Function) -> Function:
     """Compile with sums in whichever order is fastest on this processor, and keep the result.
 
     One machine gives the same bits every time; other processors may differ in the last ones.
     """
     return _compile(function, fastmath={"reassoc", "contract"})
+
+
+def in_compiled_code(function: Callable[..., Any]) -> Callable[[Function], Function]:
+    """Say what compiled code does where it calls a plain function.
+
+    The decorated function gets the types of the arguments, and returns the function to compile
+    for them, or None where it has none.
+    """
+    return cast(Callable[[Function], Function], overload(function, strict=False, inline="always"))
 
 
 def _compile(function: Function, **options: Any) -> Function:
@@ -52,7 +81,20 @@ def kept_while_sources_last(dispatcher: Any) -> Any:
     kept: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if hasattr(kept, "_source_stamp"):
         kept._source_stamp = (kept._source_stamp, _sources())
+        kept._load_index = partial(_index_or_none, kept._load_index)
     return dispatcher
+
+
+def _index_or_none(load: Callable[[], Any]) -> Any:
+    """What is on disk, or nothing where it cannot be read.
+
+    Numba unpickles the names of classes before it looks at the stamp: after a move they may lead
+    to modules that are no longer there.
+    """
+    try:
+        return load()
+    except Exception:
+        return {}
 
 
 @cache

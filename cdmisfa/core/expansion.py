@@ -1,51 +1,77 @@
-"""Nonlinear expansion of the input, so that linear features of it are nonlinear ones."""
+"""Nonlinear expansions of the input, so that linear features of it are nonlinear ones."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.frames import as_frames
+from cdmisfa.core.registry import Registry
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """How frames are expanded.
+
+    Attributes:
+        size: length of an expanded frame, from that of a frame.
+        function: (n, I) uint8 pixels, which count 1/255 each, or float64 values, in C order and
+            not to be written -> (n, size(I)) pixels or values. A row depends on its frame only.
+    """
+
+    size: Callable[[int], int]
+    function: Callable[[NDArray[Any]], NDArray[Any]]
+
+
+@cache
+def _compiled() -> Callable[[NDArray[Any]], NDArray[Any]]:
+    from cdmisfa.core.quadratic import inputs_and_products  # a configuration needs only its name
+
+    return inputs_and_products
+
+
+EXPANSIONS: Registry[Expansion] = Registry(
+    "expansion",
+    {
+        "none": Expansion(lambda n: n, lambda frames: frames),
+        "quadratic": Expansion(lambda n: n + n * (n + 1) // 2, lambda frames: _compiled()(frames)),
+    },
+)
+"""Every expansion, by the name that `learner.expansion` takes; `EXPANSIONS.add` adds one."""
 
 
 def expanded_size(kind: str, n_inputs: int) -> int:
     """Length of an expanded frame.
 
     Args:
-        kind: "none" or "quadratic", as `learner.expansion`.
+        kind: a name in `EXPANSIONS`.
         n_inputs: length I of a frame.
 
     Raises:
-        ValueError: there is no such expansion.
+        UsageError: there is no such expansion.
     """
-    if kind == "none":
-        return n_inputs
-    if kind == "quadratic":
-        return n_inputs + n_inputs * (n_inputs + 1) // 2
-    raise ValueError(f"no expansion {kind!r}: there are none, quadratic")
+    return EXPANSIONS[kind].size(n_inputs)
 
 
-@compiled
-def quadratic(frames: NDArray[Any]) -> NDArray[np.float64]:
-    """All inputs, then all products of two: (x1, x2, x1^2, x1 x2, x2^2) for two inputs.
+def expand(kind: str, frames: Any) -> NDArray[Any]:
+    """Expanded frames, ready for compiled code.
 
     Args:
-        frames: (n, I) values, or uint8 pixels, which count 1/255 each.
+        kind: a name in `EXPANSIONS`.
+        frames: (n, I) uint8 pixels, which count 1/255 each, or float64 values.
 
-    Returns:
-        (n, I + I (I + 1) / 2).
+    Raises:
+        UsageError: there is no such expansion, these are no frames, or it gives none.
     """
-    n, size = frames.shape
-    scale = 1.0 / 255.0 if frames.itemsize == 1 else 1.0
-    out = np.empty((n, size + size * (size + 1) // 2))
-    for t in range(n):
-        for i in range(size):
-            out[t, i] = frames[t, i] * scale
-        column = size
-        for i in range(size):
-            for j in range(i, size):
-                out[t, column] = out[t, i] * out[t, j]
-                column += 1
-    return out
+    expansion, rows = EXPANSIONS[kind], as_frames(frames)
+    return as_frames(expansion.function(rows), expansion.size(rows.shape[1]))
+
+
+def quadratic(frames: Any) -> NDArray[np.float64]:
+    """All inputs, then all products of two: (x1, x2, x1^2, x1 x2, x2^2) for two inputs."""
+    return expand("quadratic", frames)

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import prod
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import expand, expanded_size
+from cdmisfa.core.frames import PIXEL, UINT8, as_array
+
+CHUNK = 1024
+"""Frames that are turned into values at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +33,9 @@ class Module:
         policy: (S,) 0 stay, 1 switch, for each stream.
         centres: (S, C, tau, J) centres of the clusters; empty but for CD-MISFA 1.0.
         counts: (S, C) what each centre has seen; empty but for CD-MISFA 1.0.
+        expansion: how its input was expanded; "" where modules.npz is from before that was
+            kept, see `expansion_of`.
+        scale: what one step of a uint8 counts: 1/255, or 1 where it learned from values.
     """
 
     index: int
@@ -37,3 +49,51 @@ class Module:
     policy: NDArray[np.int64]
     centres: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
     counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    expansion: str = ""
+    scale: float = PIXEL
+
+    def transform(self, frames: Any) -> NDArray[np.float64]:
+        """Outputs on frames, y = phi (x - mean).
+
+        Args:
+            frames: (n, I) or (n, height, width), uint8 or values; it scales the former and
+                expands both as it learned them.
+
+        Returns:
+            (n, J).
+
+        Raises:
+            UsageError: these are no frames as it learned from.
+        """
+        array = as_array(frames)
+        if array.dtype != UINT8 and array.dtype.kind != "f":
+            raise UsageError(f"frames of {array.dtype} given: give uint8 pixels or float values")
+        if array.ndim < 2:
+            raise UsageError(f"frames of shape {array.shape} given: give (n, values)")
+        n, size = len(array), prod(array.shape[1:])
+        expansion = self.expansion_of(size)
+        if expansion is None and self.expansion_of(array.size) is not None:
+            raise UsageError(
+                f"a single frame of shape {array.shape} given: give (n, values), as frame[None]"
+            )
+        if expansion is None:
+            raise UsageError(
+                f"frames of {size} values given: this module has {self.phi.shape[1]} weights an "
+                "output, give frames of the size that it learned from"
+            )
+        rows = array.reshape(n, size)
+        unit = self.scale if array.dtype == UINT8 else 1.0
+        y = np.empty((n, len(self.phi)))
+        for start in range(0, n, CHUNK):
+            x = expand(expansion, rows[start : start + CHUNK].astype(np.float64) * unit)
+            y[start : start + CHUNK] = (x - self.mean) @ self.phi.T
+        return y
+
+    def expansion_of(self, size: int) -> str | None:
+        """The expansion that makes this module's inputs of frames of so many values, if any.
+
+        A module that does not say how its input was expanded was learned when there were only
+        "none" and "quadratic": then it is the one whose width fits.
+        """
+        kinds = (self.expansion,) if self.expansion else ("none", "quadratic")
+        return next((k for k in kinds if expanded_size(k, size) == self.phi.shape[1]), None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.agents.agent import think
+from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.compiled import needs_compiling

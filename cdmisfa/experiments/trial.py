@@ -13,17 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.agent import OUTCOME, Agent, Rules, has_gap, mean_change, think
-from cdmisfa.agents.gate import NOVEL, Frozen, mean_output, recognise
+from cdmisfa.agents.agent import OUTCOME, Agent, Rules
+from cdmisfa.agents.gate import Frozen
+from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.policy import action_values
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.compiled import spliced, splicing
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.expansion import quadratic
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import expand
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
-from cdmisfa.features.incsfa import Params, State, project
-from cdmisfa.features.incsfa.strict import update
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
 
 Float = NDArray[np.float64]
@@ -93,14 +94,16 @@ class TrialResult:
     curves: Curves | None
 
 
-@compiled
+_iterate = spliced(iterate)
+
+
+@splicing
 def run_iterations(
     agent: Agent,
     rules: Rules,
     out: NDArray[np.void],
     frozen: Frozen,
-    state: State,
-    params: Params,
+    feature: Any,
     frames: Float,
     x: Float,
     tau: int,
@@ -117,12 +120,11 @@ def run_iterations(
     """Iterate until a module is to be saved, a swap is due, patience ends or the draws do.
 
     Args:
-        agent: changed in place, as are out and state.
+        agent: changed in place, as are out and feature.
         rules: constants.
         out: (1,) of `OUTCOME`.
         frozen: the frozen modules.
-        state: the adaptive abstraction.
-        params: its constants.
+        feature: the adaptive abstraction's kernel.
         frames: (S, PERIOD + tau, I) one period of every stream and the block that overlaps it.
         x: the same, expanded.
         tau: frames of a block.
@@ -143,31 +145,27 @@ def run_iterations(
     modules, outputs = frozen.band_mean.shape
     y_frozen = np.empty((modules, tau, outputs))
     eta_frozen, roc_error_frozen = np.empty((modules, outputs)), np.empty(modules)
-    xi_block = np.empty(tau)
-    y = np.full((tau, outputs), np.nan)
+    no_output = np.full((tau, outputs), np.nan)
     for k in range(len(uniforms)):
         stream = memory["stream"]
         t = clock + k * tau
         start = t % PERIOD
-        shown = frames[stream, start : start + tau]
-        block = x[stream, start : start + tau]
-        known_by = recognise(
+        _iterate(
+            agent,
+            rules,
+            out,
             frozen,
-            rules.roc_error,
-            stream,
-            shown,
-            block,
+            feature,
+            frames[stream, start : start + tau],
+            x[stream, start : start + tau],
             1.0,
+            t,
+            uniforms[k],
             y_frozen,
             eta_frozen,
             roc_error_frozen,
+            no_output,
         )
-        xi = np.nan
-        if known_by == NOVEL:
-            update(state, params, block, has_gap(agent, stream, t), xi_block)
-            xi = mean_change(xi_block)
-            y = project(state.phi, mean_output(state.phi, state.mean), block)
-        think(agent, rules, out, known_by, xi, y, t + tau, uniforms[k])
         if len(outcomes) > 0:
             outcomes[k] = out[0]
             eta_dot[k] = agent.eta_dot
@@ -203,8 +201,15 @@ def run_trial(
         max_modules: end after so many modules; by default as many as there are streams.
         swap: an abrupt change.
         curves: keep what every iteration came to.
+
+    Raises:
+        UsageError: the learner, or the feature it learns with, has no compiled code.
     """
-    learner = CuriousLearner(config, OscillatorySource(streams).spec, seed)
+    learner = open_learner(config, OscillatorySource(streams).spec, seed)
+    if not isinstance(learner, CuriousLearner) or learner.kernel is None:
+        raise UsageError(
+            f"learner.algorithm {config.algorithm} has no compiled trials: use learn for it"
+        )
     tables = [one_period(name) for name in streams]
     frames, x = _expand(config, tables)
     limit = max_modules if max_modules is not None else len(streams)
@@ -223,8 +228,7 @@ def run_trial(
             learner.rules,
             learner.out,
             learner.frozen,
-            learner.abstraction.state,
-            learner.abstraction.params,
+            learner.kernel,
             frames,
             x,
             config.tau,
@@ -259,9 +263,7 @@ def _expand(config: LearnerConfig, tables: Sequence[Float]) -> tuple[Float, Floa
     """One period of every stream and the tau frames after it, as shown and as learned from."""
     index = np.arange(PERIOD + config.tau) % PERIOD
     frames = np.stack([table[index] for table in tables])
-    if config.expansion == "none":
-        return frames, frames
-    return frames, np.stack([quadratic(table) for table in frames])
+    return frames, np.stack([expand(config.expansion, table) for table in frames])
 
 
 def _records(n: int, outputs: int, streams: int) -> dict[str, NDArray[Any]]:

@@ -5,7 +5,9 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "cdmisfa.features.incsfa": "IncSFA",
+        "cdmisfa.features.feature": "Feature",
+        "cdmisfa.features.incsfa.abstraction": "IncSFA",
+        "cdmisfa.features.projection": "project",
         "cdmisfa.features.sfa": "batch_sfa",
     },
 )

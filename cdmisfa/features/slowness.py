@@ -57,18 +57,22 @@ def instantaneous_slowness(y: Float) -> float:
 
     Equation: 4
     """
-    n = len(y)
-    mean = 0.0
-    for k in range(n):
-        mean += y[k]
-    mean /= n
+    mean, _, derivative = block_moments(y)
+    return slowness(derivative, block_variance(y, mean))
+
+
+@compiled
+def block_variance(y: Float, mean: float) -> float:
+    """Variance of one output over a block, about its mean there.
+
+    Args:
+        y: (n,) output over the block.
+        mean: as `block_moments` has it.
+    """
     variance = 0.0
-    derivative = 0.0
-    for k in range(n):
+    for k in range(len(y)):
         variance += (y[k] - mean) ** 2
-        if k > 0:
-            derivative += (y[k] - y[k - 1]) ** 2
-    return slowness(derivative / max(n - 1, 1), variance / n)
+    return variance / len(y)
 
 
 @compiled

@@ -200,7 +200,7 @@ def _outputs(
     module: Module, source: SeekableSource
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Outputs (n, J) of a module on its own view, and what was true then (n, D)."""
-    from cdmisfa.features.incsfa import project
+    from cdmisfa.features.projection import project
 
     source.seek(0)
     block = source.take(module.stream, SCORED_FRAMES)

@@ -130,7 +130,7 @@ def _view(recording: str, stream: int, count: int) -> NDArray[Any]:
 
 def compare(task: Task, seed: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Frames until IncSFA's slowest output stays in the direction of batch SFA's."""
-    from cdmisfa.features.incsfa import IncSFA
+    from cdmisfa.features.incsfa.abstraction import IncSFA
 
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     sfa = IncSFA(task.config, task.frames.shape[1], rng)

@@ -23,10 +23,10 @@ MAX_BYTES = 4 * 1024**3
 """Largest array that is read; asked for before anything is decompressed."""
 
 _NUMBERS = ("index", "stream", "iteration")
-_OPTIONAL = tuple(
-    f.name for f in dataclasses.fields(Module) if f.default_factory is not dataclasses.MISSING
+_OPTIONAL = ("centres", "counts", "expansion", "scale")  # not in every version's files
+_ARRAYS = tuple(
+    f.name for f in dataclasses.fields(Module) if f.name not in (*_NUMBERS, "expansion", "scale")
 )
-_ARRAYS = tuple(f.name for f in dataclasses.fields(Module) if f.name not in _NUMBERS)
 
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:
@@ -81,6 +81,12 @@ def _module(stored: Any, index: int) -> Module:
         if array.dtype.kind not in "fi":
             raise ValueError(f"{name} is no array of numbers")
         values[name] = array
+    for name, kind, of_type in (("expansion", "U", str), ("scale", "f", float)):
+        if _key(index, name) in stored.files:
+            array = stored[_key(index, name)]
+            if array.dtype.kind != kind:
+                raise ValueError(f"{name} is no {of_type.__name__}")
+            values[name] = of_type(array.item())
     outputs, size = values["phi"].shape
     for name, shape in {
         "mean": (size,),

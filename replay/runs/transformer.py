@@ -12,15 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.expansion import expanded_size, quadratic
 from cdmisfa.core.modules import Module
 from replay.runs.modules import load_modules
-
-CHUNK = 1024
-"""Frames that are turned into floats at once."""
-
-PIXEL = 1.0 / 255.0
-"""What one step of a uint8 pixel counts."""
 
 
 class SlowFeatures:
@@ -65,8 +58,8 @@ class SlowFeatures:
         """Outputs of the module on frames, y = phi (x - mean).
 
         Args:
-            X: (n, I) values, or (n, height, width) pixels, of which uint8 count 1/255 each.
-                Frames that the learner expanded are expanded in the same way.
+            X: (n, I) values, or (n, height, width) pixels, of which uint8 count 1/255 each
+                where it learned from pixels. They are expanded as they were for the learner.
 
         Returns:
             (n, J).
@@ -74,21 +67,7 @@ class SlowFeatures:
         Raises:
             UsageError: these are no frames as the module learned from.
         """
-        frames = np.asarray(X)
-        if frames.ndim < 2 or frames.dtype.kind not in "fiub":
-            raise UsageError(f"frames of shape {frames.shape} given: give (n, values) numbers")
-        frames = frames.reshape(len(frames), int(np.prod(frames.shape[1:])))
-        values, weights = frames.shape[1], self.components_.shape[1]
-        if weights not in (values, expanded_size("quadratic", values)):
-            raise UsageError(
-                f"frames of {values} values given: this module has {weights} weights an output, "
-                "give frames of the size that it learned from"
-            )
-        y = np.empty((len(frames), len(self.components_)))
-        for i in range(0, len(frames), CHUNK):
-            x = _inputs(frames[i : i + CHUNK], expand=values != weights)
-            y[i : i + CHUNK] = (x - self.mean_) @ self.components_.T
-        return y
+        return self.module.transform(X)
 
     def fit(self, X: Any = None, y: Any = None) -> NoReturn:
         """Refuse: a frozen module does not learn.
@@ -128,10 +107,3 @@ class SlowFeatures:
             transformer_tags=TransformerTags(),
             requires_fit=False,
         )
-
-
-def _inputs(frames: NDArray[Any], *, expand: bool) -> NDArray[np.float64]:
-    """Frames as the module's input: scaled, and expanded where it was learned so."""
-    if expand:
-        return np.asarray(quadratic(np.ascontiguousarray(frames)))
-    return np.asarray(frames, dtype=np.float64) * (PIXEL if frames.dtype == np.uint8 else 1.0)

@@ -96,7 +96,7 @@ def _simulator() -> Iterator[Check]:
 
 def _kernel_cache() -> Iterator[Check]:
     try:
-        from cdmisfa.agents.agent import think
+        from cdmisfa.agents.iteration import think
         from cdmisfa.features.incsfa import strict
         from replay.recordings import kernels
     except ImportError:  # said of the package that is missing

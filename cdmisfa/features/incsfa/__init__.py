@@ -1,7 +1,11 @@
 """Incremental slow feature analysis."""
 
-from cdmisfa.features.incsfa.abstraction import IncSFA
-from cdmisfa.features.incsfa.projection import project
-from cdmisfa.features.incsfa.state import Params, State, copy_into, new_state, parameters
+from cdmisfa.core.faces import face
 
-__all__ = ["IncSFA", "Params", "State", "copy_into", "new_state", "parameters", "project"]
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "cdmisfa.features.incsfa.abstraction": "IncSFA",
+        "cdmisfa.features.incsfa.state": "Params State copy_into new_state parameters",
+    },
+)

@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.compiled import in_compiled_code
 from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.frames import as_frames
+from cdmisfa.features.feature import feed
 from cdmisfa.features.incsfa import gram, strict
-from cdmisfa.features.incsfa.state import Float, new_state, parameters
+from cdmisfa.features.incsfa.state import Float, Params, State, new_state, parameters
 
 MANY_INPUTS = 200
 """From here on the Gram kernel is faster, hence taken; the choice depends on nothing else."""
+
+
+class Strict(NamedTuple):
+    """An abstraction as compiled code takes it, to be learned by `strict.update`."""
+
+    phi: Float
+    mean: Float
+    state: State
+    params: Params
+
+
+class Gram(NamedTuple):
+    """An abstraction as compiled code takes it, to be learned by `gram.update`."""
+
+    phi: Float
+    mean: Float
+    state: State
+    params: Params
+
+
+UPDATES: Any = {Strict: strict.update, Gram: gram.update}
 
 
 class IncSFA:
@@ -20,7 +44,7 @@ class IncSFA:
 
     Attributes:
         state: every array the abstraction consists of.
-        params: constants of the rule.
+        kernel: the same with the constants of the rule, for compiled code.
 
     Example:
         >>> sfa = IncSFA(LearnerConfig(), 5, np.random.default_rng(0))
@@ -30,8 +54,8 @@ class IncSFA:
 
     def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
         self.state = new_state(rng, n_inputs, config)
-        self.params = parameters(config)
-        self._kernel = gram.update if n_inputs >= MANY_INPUTS else strict.update
+        kind = Gram if n_inputs >= MANY_INPUTS else Strict
+        self.kernel = kind(self.state.phi, self.state.mean, self.state, parameters(config))
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
         """Learn from consecutive frames.
@@ -42,11 +66,13 @@ class IncSFA:
 
         Returns:
             xi, (n,): change of phi at each frame, NaN at the first after a gap.
+
+        Raises:
+            UsageError: these are no frames of I values.
         """
-        xi = np.empty(len(frames))
-        frames = frames.view()
-        frames.flags.writeable = False  # numba compiles read-only and writable arrays apart
-        self._kernel(self.state, self.params, frames, gap, xi)
+        rows = as_frames(frames, len(self.state.mean))
+        xi = np.empty(len(rows))
+        UPDATES[type(self.kernel)](self.state, self.kernel.params, rows, gap, xi)
         return xi
 
     @property
@@ -58,3 +84,17 @@ class IncSFA:
     def mean(self) -> Float:
         """Running mean of the input, (I,)."""
         return self.state.mean
+
+
+@in_compiled_code(feed)
+def _feed(feature: Any, frames: Any, gap: Any) -> Any:
+    update = UPDATES.get(getattr(feature, "instance_class", None))
+    if update is None:
+        return None
+
+    def feed_kernel(feature: Any, frames: Any, gap: Any) -> Any:
+        xi = np.empty(len(frames))
+        update(feature.state, feature.params, frames, gap, xi)
+        return xi
+
+    return feed_kernel

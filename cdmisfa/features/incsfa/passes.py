@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.compiled import compiled, reordered
+from cdmisfa.core.frames import PIXEL, UINT8
 from cdmisfa.features.incsfa.lanes import LANES, add, load, store
-from cdmisfa.features.incsfa.state import PIXEL, Float, State, mean_rate
+from cdmisfa.features.incsfa.state import Float, State, mean_rate
 
 GROUP = 4
 """Frames applied in one pass."""
@@ -53,7 +54,7 @@ def centre_tile(
         u: (GROUP, TILE) receives the centred frames; rows beyond `count` become 0.
     """
     width = min(TILE, mean.shape[0] - start)
-    scale = PIXEL if frames.itemsize == 1 else 1.0
+    scale = PIXEL if frames.dtype == UINT8 else 1.0
     m = mean[start : start + width]
     for s in range(count):
         rate = mean_rate(n + s + 1, window)

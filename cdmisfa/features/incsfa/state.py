@@ -17,9 +17,6 @@ from cdmisfa.core.config import LearnerConfig
 
 Float = NDArray[np.float64]
 
-PIXEL = 1.0 / 255.0
-"""What uint8 frames are multiplied with."""
-
 RANK_TOLERANCE = 1e-10
 """Share of the largest whitening variance below which a component is rounding noise.
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.compiled import compiled, inlined
+from cdmisfa.core.frames import PIXEL, UINT8
 from cdmisfa.features.incsfa.state import (
-    PIXEL,
     Float,
     Params,
     State,
@@ -171,7 +171,7 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
     """
     n_frames, D = frames.shape
     K = state.d.shape[0]
-    pixel = PIXEL if frames.itemsize == 1 else 1.0
+    pixel = PIXEL if frames.dtype == UINT8 else 1.0
     nu, window = params.nu, params.mean_window
     mean, v, d, w = state.mean, state.v, state.d, state.w  # a look-up in the loop costs 10 ns
     z_prev, phi, counts = state.z_prev, state.phi, state.counts
