@@ -20,7 +20,6 @@ from replay.mcap.records import (
     Bytes,
     Fields,
     MalformedRecord,
-    chunk_header,
 )
 from replay.mcap.segments import Definitions, Segment
 from replay.mcap.tables import MessageTable, Spans, indexed_table, walked_table
@@ -38,7 +37,7 @@ class Chunks:
         file: the log.
         definitions: take in what the chunks define.
         note: told (where, what) of an index that contradicts its chunk, and is not used.
-        cache_bytes: decoded chunks that are kept.
+        cache_bytes: of decoded chunks that are kept.
     """
 
     def __init__(
@@ -168,11 +167,11 @@ def confirm(file: Store, segment: Segment) -> None:
     opcode, length = RECORD_HEADER.unpack_from(head)
     if opcode != Opcode.CHUNK:
         raise MalformedRecord("the summary points to something that is no chunk")
-    header = chunk_header(head[RECORD_HEADER.size :])
-    found = Segment.of_chunk(segment.offset, header)
+    found = Segment.of_chunk(segment.offset, head[RECORD_HEADER.size :])
     found.indexes = segment.indexes
-    stated = replace(segment, crc=header.crc, stated=False)
-    if length != header.length + header.stored or found != stated:
+    end = found.data_offset + found.stored
+    stated = replace(segment, crc=found.crc, stated=False)
+    if segment.offset + RECORD_HEADER.size + length != end or found != stated:
         raise MalformedRecord("it is not the chunk that the summary names")
     for part in segment.indexes:
         raw = Fields(file.read(part.offset - INDEX_HEADER, INDEX_HEADER), "a message index")
@@ -180,5 +179,5 @@ def confirm(file: Store, segment: Segment) -> None:
         size = 16 * part.count
         if fields != [Opcode.MESSAGE_INDEX, size + 6, part.channel, size]:
             raise MalformedRecord("its message index is not the one that the summary names")
-    segment.crc = header.crc
+    segment.crc = found.crc
     segment.stated = False

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.chunks import Chunks
-from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema, Statistics
-from replay.mcap.segments import Attachment, Message, Metadata, Problem, Segment
+from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
+from replay.mcap.segments import Attachment, Message, Problem, Segment
 from replay.mcap.tables import MessageTable, in_order, within
 from replay.mcap.walk import Structure
 from replay.storage.location import Location, Url, location
@@ -36,6 +36,13 @@ class LogReader:
         path: the file.
         problems: what was found damaged and left out (with `salvage`), and an index that
             contradicts its chunk.
+        by_index: only the summary was read, and no chunk before it is asked for.
+        profile: the writer's profile, as "ros2".
+        library: what wrote the file.
+        complete: the file has its end.
+        data_complete: every message is there, if not the summary behind them.
+        metadata: the metadata records.
+        statistics: what the summary says the file holds, or None.
     """
 
     def __init__(
@@ -68,8 +75,7 @@ class LogReader:
             self._structure = Structure(self._file, self._refuse, by_index=by_index)
             definitions = self._structure.definitions
             self._chunks = Chunks(self._file, definitions, self._note, cache_bytes)
-            self._time_tail()
-            self._check_data_crc()
+            self._settle()
         except MalformedRecord as error:
             self._file.close()
             raise LogDamagedError(f"{self.path}: {error}") from None
@@ -83,26 +89,6 @@ class LogReader:
     def size(self) -> int:
         """Bytes of the file."""
         return self._file.size
-
-    @property
-    def by_index(self) -> bool:
-        """Whether only the summary was read, and no chunk before it is asked for."""
-        return self._structure.by_index
-
-    @property
-    def profile(self) -> str:
-        """The writer's profile, as "ros2"."""
-        return self._structure.profile
-
-    @property
-    def library(self) -> str:
-        """What wrote the file."""
-        return self._structure.library
-
-    @property
-    def complete(self) -> bool:
-        """Whether the file has its end."""
-        return self._structure.complete
 
     @property
     def missing(self) -> str:
@@ -119,28 +105,12 @@ class LogReader:
         return [f"{self.path}: {text}" for text in (self.missing, *problems) if text]
 
     @property
-    def data_complete(self) -> bool:
-        """Whether every message is there, if not the summary behind them."""
-        return self._structure.data_crc is not None
-
-    @property
-    def statistics(self) -> Statistics | None:
-        """What the summary says the file holds."""
-        summary = self._structure.summary
-        return summary.statistics if summary else None
-
-    @property
     def segments(self) -> list[Segment]:
         """Chunks, and messages outside chunks, in file order."""
         tail = self._structure.tail
         if tail is None or (tail.crc and not self.salvage):
             return self._structure.segments
         return [*self._structure.segments, tail]
-
-    @property
-    def metadata(self) -> list[Metadata]:
-        """The metadata records."""
-        return self._structure.metadata
 
     @property
     def attachments(self) -> list[Attachment]:
@@ -309,8 +279,7 @@ class LogReader:
         self._chunks.forget(same)
         self._failed &= same
         self._defined, self._searched = min(self._defined, kept), False
-        self._time_tail()
-        self._check_data_crc()
+        self._settle()
         return True
 
     def close(self) -> None:
@@ -339,13 +308,20 @@ class LogReader:
         if problem not in self.problems:
             self.problems.append(problem)
 
-    def _time_tail(self) -> None:
-        """Find the times of a chunk that was still open, whose header states none."""
-        tail = self._structure.tail
+    def _settle(self) -> None:
+        """Take over what the walk found, with the times of a chunk whose header states none yet."""
+        structure = self._structure
+        self.by_index, self.complete = structure.by_index, structure.complete
+        self.profile, self.library = structure.profile, structure.library
+        self.data_complete = structure.data_crc is not None
+        self.metadata = structure.metadata
+        self.statistics = structure.summary.statistics if structure.summary else None
+        tail = structure.tail
         if tail is not None and tail in self.segments:
             table = self.table(tail)
             if table is not None and len(table):
                 tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
+        self._check_data_crc()
 
     def _check_data_crc(self) -> None:
         structure = self._structure
@@ -354,7 +330,7 @@ class LogReader:
         if self._file.crc(0, structure.data_end) == structure.data_crc:
             return
         if not self.salvage:
-            self._check()
+            self._search()  # an error that names the chunk says more
         self._refuse("data section", "its CRC does not match: damaged")
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
@@ -387,12 +363,9 @@ class LogReader:
         if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
             self._search()
 
-    def _check(self) -> None:
-        for segment in self.segments:
-            self.table(segment)
-
     def _search(self) -> None:
         """Decode every chunk: a definition may stand in one that holds no message of it."""
         if not self._searched:
             self._searched = True
-            self._check()
+            for segment in self.segments:
+                self.table(segment)

@@ -66,30 +66,13 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class ChunkHeader:
-    """What stands before the messages of a chunk; `size` is decompressed, `stored` is not."""
-
-    start: int
-    end: int
-    size: int
-    crc: int
-    compression: str
-    stored: int
-    length: int
-
-
-@dataclass(frozen=True, slots=True)
 class Statistics:
-    """What the writer says the file holds."""
+    """How much the writer says the file holds."""
 
     messages: int
-    schemas: int
-    channels: int
     attachments: int
     metadata: int
     chunks: int
-    start: int
-    end: int
     per_channel: dict[int, int] = field(hash=False)
 
 
@@ -156,41 +139,28 @@ def channel(content: bytes | memoryview) -> Channel:
     )
 
 
-def chunk_header(content: bytes | memoryview) -> ChunkHeader:
-    """Parse what stands before a chunk's data; `length` is the size of that part."""
-    fields = Fields(content, "a chunk")
-    start, end, size = fields.integer(8), fields.integer(8), fields.integer(8)
-    crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
-    return ChunkHeader(start, end, size, crc, compression, stored, fields.at)
-
-
 def statistics(content: bytes | memoryview) -> Statistics:
     """Parse a Statistics record."""
     fields = Fields(content, "the statistics")
-    messages, schemas, channels = fields.integer(8), fields.integer(2), fields.integer(4)
+    messages = fields.integer(8)
+    fields.take(2 + 4)  # schemas and channels
     attachments, metadata, chunks = fields.integer(4), fields.integer(4), fields.integer(4)
-    start, end = fields.integer(8), fields.integer(8)
+    fields.take(8 + 8)  # first and last log time
     raw = fields.take(fields.integer(4))
     if len(raw) % 10:
         raise MalformedRecord("the statistics hold a broken count per channel")
     counts = np.frombuffer(raw, np.dtype([("channel", "<u2"), ("messages", "<u8")]))
     per_channel = {int(row["channel"]): int(row["messages"]) for row in counts}
-    return Statistics(
-        messages, schemas, channels, attachments, metadata, chunks, start, end, per_channel
-    )
+    return Statistics(messages, attachments, metadata, chunks, per_channel)
 
 
-def walk(
-    data: memoryview, start: int = 0, stop: int | None = None
-) -> Iterator[tuple[int, int, int]]:
+def walk(data: memoryview, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
     """Each record within a chunk as (opcode, place of its first byte, place after its last).
 
     Raises:
         MalformedRecord: a record runs over the end, or the opcode 0.
     """
-    stop = len(data) if stop is None else stop
     unpack = RECORD_HEADER.unpack_from
-    at = start
     while at < stop:
         if stop - at < RECORD_HEADER.size:
             raise MalformedRecord(f"{stop - at} bytes at its end are no record")

@@ -11,7 +11,7 @@ from replay.mcap.records import (
     MAX_DEFINITION,
     RECORD_HEADER,
     Channel,
-    ChunkHeader,
+    Fields,
     MalformedRecord,
     Schema,
     channel,
@@ -64,10 +64,13 @@ class Segment:
     stated: bool = False
 
     @classmethod
-    def of_chunk(cls, offset: int, header: ChunkHeader) -> Segment:
+    def of_chunk(cls, offset: int, content: bytes | memoryview) -> Segment:
         """A chunk whose record stands at a place in the file, by what it says of itself."""
-        data, h = offset + RECORD_HEADER.size + header.length, header
-        return cls(offset, data, h.stored, h.size, h.compression, h.crc, h.start, h.end, True)
+        fields = Fields(content, "a chunk")
+        start, end, size = fields.integer(8), fields.integer(8), fields.integer(8)
+        crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
+        data = offset + RECORD_HEADER.size + fields.at
+        return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
 
     @property
     def stop(self) -> int:

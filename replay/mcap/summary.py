@@ -94,8 +94,7 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
 def _take_records(file: Store, summary: Summary, stop: int, definitions: Definitions) -> None:
     at = summary.begin
     while at < stop:
-        head = file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
-        opcode, length = RECORD_HEADER.unpack(head)
+        opcode, length = header_at(file, at)
         content, end = at + RECORD_HEADER.size, at + RECORD_HEADER.size + length
         if opcode == 0 or end > stop:
             raise MalformedRecord(f"no record at byte {at}")
@@ -112,6 +111,13 @@ def _take_records(file: Store, summary: Summary, stop: int, definitions: Definit
         elif opcode <= Opcode.DATA_END and opcode != Opcode.SUMMARY_OFFSET:
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
         at = end
+
+
+def header_at(file: Store, at: int) -> tuple[int, int]:
+    """Opcode and length of the record at a place of the file, 0 where it ends before."""
+    head = file.peek(at, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+    opcode, length = RECORD_HEADER.unpack(head)
+    return opcode, length
 
 
 def definition(file: Store, content: int, length: int) -> bytes:

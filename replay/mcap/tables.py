@@ -64,23 +64,6 @@ class MessageTable:
         at = int(self.at[row])
         return self.data[at : at + int(self.size[row])].tobytes()
 
-    def gather(self, at: NDArray[np.int64], size: int) -> Bytes:
-        """Copy `size` bytes from each of n places in `data`, (n, size).
-
-        Raises:
-            MalformedRecord: one lies outside the data.
-        """
-        if len(at) == 0 or size == 0:
-            return np.empty((len(at), size), np.uint8)
-        if at.min() < 0 or at.max() + size > len(self.data):
-            raise MalformedRecord("a message is shorter than its fields")
-        return windows(self.data, size)[at]
-
-
-def windows(data: Bytes, size: int) -> Bytes:
-    """View every `size` consecutive bytes of B bytes, (B - size + 1, size)."""
-    return np.ndarray((max(len(data) - size + 1, 0), size), np.uint8, data, 0, (1, 1))
-
 
 def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
     """Build the table of the message records that begin at n places of a chunk.
@@ -93,7 +76,8 @@ def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
     width = MESSAGE_HEADER.itemsize
     if offsets.min() < 0 or offsets.max() + width > len(data):
         raise MalformedRecord("a message lies outside its chunk")
-    headers = windows(data, width)[offsets].view(MESSAGE_HEADER)[:, 0]
+    windows = np.ndarray((len(data) - width + 1, width), np.uint8, data, 0, (1, 1))
+    headers = windows[offsets].view(MESSAGE_HEADER)[:, 0]
     if (headers["opcode"] != Opcode.MESSAGE).any():
         raise MalformedRecord("a message index points to something else than a message")
     length = headers["length"]
@@ -119,7 +103,7 @@ def walked_table(raw: Bytes, *, cut: bool = False) -> tuple[MessageTable, Spans]
     offsets: list[int] = []
     definitions: Spans = []
     try:
-        for opcode, at, end in walk(raw.data):
+        for opcode, at, end in walk(raw.data, 0, len(raw)):
             if opcode == Opcode.MESSAGE:
                 if end - at < MESSAGE_HEADER.itemsize:
                     raise MalformedRecord("a message is shorter than its own header")

@@ -22,12 +22,12 @@ from replay.mcap.records import (
     RECORD_HEADER,
     Fields,
     MalformedRecord,
-    chunk_header,
 )
 from replay.mcap.segments import Attachment, Definitions, IndexPart, Metadata, Refuse, Segment
 from replay.mcap.summary import (
     Summary,
     definition,
+    header_at,
     read_summary,
     stated_segments,
     stated_spans,
@@ -144,9 +144,7 @@ class Structure:
 
     def _record_at(self, start: int, stop: int | None, opcode: Opcode) -> None:
         """Take in a record that the summary names."""
-        found, length = RECORD_HEADER.unpack(
-            self._file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
-        )
+        found, length = header_at(self._file, start)
         if found != opcode or stop not in (None, start + RECORD_HEADER.size + length):
             raise MalformedRecord(f"at byte {start} is no {opcode.name} record")
         self._at = start
@@ -207,9 +205,8 @@ class Structure:
             return
         self._last_chunk = None
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self.definitions.add(
-                opcode, definition(self._file, content, length), f"byte {self._at}"
-            )
+            record = definition(self._file, content, length)
+            self.definitions.add(opcode, record, f"byte {self._at}")
             return
         self._close_loose()
         if opcode == Opcode.CHUNK:
@@ -234,23 +231,22 @@ class Structure:
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
 
     def _chunk(self, content: int, length: int) -> Segment:
-        header = chunk_header(self._file.peek(content, min(length, _CHUNK_HEADER)))
-        if header.length + header.stored > length:
-            raise MalformedRecord("a chunk's length is not that of its data")
-        return Segment.of_chunk(self._at, header)
+        head = self._file.peek(content, min(length, _CHUNK_HEADER))
+        return _fitting(Segment.of_chunk(self._at, head), content + length)
 
     def _cut_chunk(self, content: int, length: int, limit: int) -> None:
         try:
-            header = chunk_header(self._file.peek(content, min(_CHUNK_HEADER, limit - content)))
-            check_size(header.compression, 0)
+            head = self._file.peek(content, min(limit - content, _CHUNK_HEADER))
+            tail = Segment.of_chunk(self._at, head)
+            check_size(tail.compression, 0)
         except MalformedRecord:
             return
-        if length != _OPEN_LENGTH and header.length + header.stored > length:
-            raise MalformedRecord("a chunk's length is not that of its data")
-        self.tail = Segment.of_chunk(self._at, header)
-        self.tail.stored, self.tail.cut = limit - self.tail.data_offset, True
         if length == _OPEN_LENGTH:
-            self.tail.size, self.tail.crc = MAX_CHUNK, 0
+            tail.size, tail.crc = MAX_CHUNK, 0
+        else:
+            _fitting(tail, content + length)
+        tail.stored, tail.cut = limit - tail.data_offset, True
+        self.tail = tail
 
     def _message_index(self, content: int, length: int) -> None:
         chunk = self._last_chunk
@@ -362,3 +358,14 @@ class Structure:
         for what, (said, there) in found.items():
             if said != there:
                 self._refuse("summary", f"it states {said} {what}, there are {there}")
+
+
+def _fitting(chunk: Segment, end: int) -> Segment:
+    """A chunk whose data does not run over the end of its record.
+
+    Raises:
+        MalformedRecord: it does.
+    """
+    if chunk.data_offset + chunk.stored > end:
+        raise MalformedRecord("a chunk's length is not that of its data")
+    return chunk
