@@ -68,6 +68,13 @@ class ViewFacts:
     versions: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict, compare=False)
 
+    @property
+    def spec(self) -> SourceSpec:
+        """What the file's view delivers, without a length."""
+        return SourceSpec(
+            (self.view,), self.frame_shape, self.dtype, self.truth, self.fps, self.start_ns
+        )
+
     def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
         """Log times of frames, as `SourceSpec.time_ns` gives them."""
         return times_of(frames, self.fps, self.start_ns).astype(np.uint64)

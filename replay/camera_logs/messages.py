@@ -21,7 +21,7 @@ Decoder = Callable[[bytes], Bytes]
 
 
 def image_decoder(schema: str, encoding: str) -> Decoder | None:
-    """Find the decoder for messages of a schema in an encoding, or None."""
+    """The decoder for messages of a schema in an encoding, or None."""
     return _DECODERS.get((schema, encoding))
 
 

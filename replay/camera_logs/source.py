@@ -195,11 +195,7 @@ class ForeignSource(SeekableSource):
         return frame
 
     def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows]]:
-        """When frame 0 is, and which image of each stream every frame shows.
-
-        Raises:
-            UsageError: `align` is needed, or puts nothing on the clock.
-        """
+        """When frame 0 is, and which image of each stream every frame shows."""
         if align == "time":
             start, stop = overlap(self._times)
             if stop < start:
@@ -212,12 +208,7 @@ class ForeignSource(SeekableSource):
         return int(self._times[0][0]), by_index(self._times)
 
     def _refuse_unequal(self) -> None:
-        """Refuse streams that are not on one clock, or not on the one asked for.
-
-        Raises:
-            UsageError: they differ in number, by more than half a step, or in their rate; it
-                says what would work.
-        """
+        """Refuse streams that are not on one clock, or not of the rate asked for."""
         first = self._times[0]
         for stream, times in zip(self._streams[1:], self._times[1:], strict=True):
             reason = unlike(first, times)
@@ -234,7 +225,7 @@ class ForeignSource(SeekableSource):
                 )
 
     def _command(self) -> str:
-        """Give a command that takes these streams."""
+        """A command that takes these streams."""
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
@@ -246,11 +237,9 @@ class ForeignSource(SeekableSource):
 
 def _pairs(files: Sequence[Location], topics: Sequence[str]) -> list[tuple[Location, str | None]]:
     if len(files) == 1:
-        return [(files[0], topic) for topic in topics] or [(files[0], None)]
-    if not topics:
-        return [(file, None) for file in files]
-    if len(topics) == 1:
-        return [(file, topics[0]) for file in files]
+        return [(files[0], topic) for topic in topics or [None]]
+    if len(topics) < 2:
+        return [(file, topics[0] if topics else None) for file in files]
     if len(topics) != len(files):
         raise UsageError(
             f"{len(files)} logs and {len(topics)} topics: name one log, or one --topic for each; "

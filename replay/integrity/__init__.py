@@ -8,6 +8,7 @@ __getattr__, __dir__, __all__ = face(
         "replay.integrity.info": "LogInfo describe",
         "replay.integrity.verify": "LogCheck check_log",
         "replay.integrity.recover": "Recovery recover_log",
-        "replay.integrity.survey": "Problem kind_of",
+        "replay.integrity.survey": "kind_of",
+        "replay.mcap.segments": "Problem",
     },
 )

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from replay.integrity.survey import SCHEMA, Crc, Kind, Problem, survey
+from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel
+from replay.mcap.segments import Problem
 from replay.runs.folders import METADATA, RUN_FILE, read_manifest
 from replay.runs.log import record_version
 from replay.runs.messages import missing

@@ -12,8 +12,9 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.logfile import LogFile
 from recorder.log.whole import PARTIAL
-from replay.integrity.survey import SCHEMA, ChannelSurvey, Problem, problems_of
+from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
 from replay.mcap.reader import LogReader
+from replay.mcap.segments import Problem
 from replay.mcap.tables import MessageTable
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
@@ -82,7 +83,7 @@ def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) ->
     place, dst = location(src), Path(dst)
     with fetched(place) as copy:
         found = _recover(copy, dst, force)
-    return replace(found, lost=tuple(lost.moved(copy, place) for lost in found.lost))
+    return replace(found, lost=tuple(moved(lost, copy, place) for lost in found.lost))
 
 
 def _recover(src: Path, dst: Path, force: bool) -> Recovery:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -14,7 +14,7 @@ from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import METADATA as RECORDING
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
-from replay.mcap.segments import Segment
+from replay.mcap.segments import Problem, Segment
 from replay.runs.folders import METADATA as RUN
 from replay.storage.location import Location
 
@@ -24,18 +24,6 @@ SCHEMA: Final = 1
 Kind = Literal["recording", "run", "foreign"]
 Crc = Literal["ok", "absent", "bad", "unchecked"]
 Times = NDArray[np.uint64]
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """Something that is wrong with a log, or was lost of it."""
-
-    where: str
-    what: str
-
-    def moved(self, copy: Path, place: Location) -> Problem:
-        """The same one with what was copied called by its own name."""
-        return replace(self, where=self.where.replace(str(copy), str(place)))
 
 
 @dataclass(slots=True)
@@ -79,6 +67,11 @@ def _crc(reader: LogReader, decoded: bool) -> Crc:
     if not decoded:
         return "unchecked"
     return "absent" if reader.crc_absent() else "ok"
+
+
+def moved(problem: Problem, copy: Path, place: Location) -> Problem:
+    """A problem with what was copied called by its own name."""
+    return Problem(problem.where.replace(str(copy), str(place)), problem.what)
 
 
 def problems_of(reader: LogReader) -> tuple[Problem, ...]:

@@ -9,8 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.integrity.survey import SCHEMA, Crc, Kind, Problem, survey
+from replay.integrity.survey import SCHEMA, Crc, Kind, moved, survey
 from replay.mcap.reader import LogReader
+from replay.mcap.segments import Problem
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.storage.listing import log_files
@@ -67,7 +68,7 @@ def check_log(path: str | Location) -> LogCheck:
                 views.append(file)
         if views:
             problems += _check_views(views, alone=copy.is_file())
-    unique = dict.fromkeys(problem.moved(copy, place) for problem in problems)
+    unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
     return LogCheck(tuple(unique), tuple(files))
 
 

@@ -119,7 +119,7 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A damage: where it is, and what it is."""
+    """Something that is wrong with a log, or was lost of it."""
 
     where: str
     what: str

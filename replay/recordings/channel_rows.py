@@ -61,7 +61,6 @@ class ChannelRows:
         facts: the clock of the recording.
 
     Attributes:
-        channel: as given.
         spans: the frames that are there; one, except where gaps and damage are left out.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -58,7 +59,7 @@ class FollowedSource(SeekableSource):
         self._taken = False
         self._seen: object = None
         self._source: RecordedSource | None = None
-        self._wait(lambda: self._source is not None, "frame 0")
+        self._wait(0, "frame 0")
         self._t = self._now.t
         self._spec = replace(self._now.spec, length=None)
 
@@ -86,7 +87,7 @@ class FollowedSource(SeekableSource):
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
-        self._wait(lambda: self._end >= self._t + n, f"frame {self._t + n - 1}")
+        self._wait(self._t + n, f"frame {self._t + n - 1}")
         self._now.seek(self._t)
         block = self._now.take(stream, n)
         self._t += n
@@ -100,7 +101,7 @@ class FollowedSource(SeekableSource):
             LogExhaustedError: the recording ended before it, or its recorder is gone.
             ValueError: t lies before the recording's first frame.
         """
-        self._wait(lambda: self._end >= t, f"frame {t}")
+        self._wait(t, f"frame {t}")
         self._now.seek(t)
         self._t = t
 
@@ -125,26 +126,27 @@ class FollowedSource(SeekableSource):
             raise LogExhaustedError(f"{self._path}: it was given up before its first frame")
         return self._source
 
-    @property
-    def _end(self) -> int:
-        return self._now.first_frame + self._now.frames
+    def _reaches(self, end: int) -> bool:
+        """Whether the frames before an end are there, and the recording is."""
+        source = self._source
+        return source is not None and source.first_frame + source.frames >= end
 
-    def _wait(self, ready: Callable[[], bool], what: str) -> None:
-        """Look at the files until something is there, they are finished or nothing comes.
+    def _wait(self, end: int, what: str) -> None:
+        """Look at the files until an end is reached, they are finished or nothing comes.
 
         Raises:
             LogExhaustedError: nothing came in time, or waiting was to stop.
             UsageError: there is no recording.
             LogDamagedError: a file is damaged.
         """
-        if self._source is not None and ready():
+        if self._reaches(end):
             return
         deadline = time.monotonic() + self._timeout
         while not self.stop():
             finished = self.finished
             before = self._frames()
             error = self._look()
-            if self._source is not None and ready():
+            if self._reaches(end):
                 return
             if finished:
                 if error is not None:
@@ -166,18 +168,10 @@ class FollowedSource(SeekableSource):
         return self._source.frames if self._source is not None else 0
 
     def _look(self) -> CdmisfaError | None:
-        """Take in what was added to the files.
-
-        Returns:
-            Why it cannot be (yet).
-        """
+        """Take in what was added to the files; give why that cannot be (yet)."""
         try:
-            seen = [
-                (path, path.stat().st_size)
-                for path in log_files(self._path)
-                if isinstance(path, Path)
-            ]
-            if seen == self._seen and self._source is not None:
+            seen = [(path, os.stat(str(path)).st_size) for path in log_files(self._path)]
+            if seen == self._seen:
                 return None
             if self._source is None:
                 self._source = RecordedSource(self._path)

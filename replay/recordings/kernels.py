@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.compiled import compiled
+from replay.mcap.records import Bytes
 
-Bytes = NDArray[np.uint8]
 Places = NDArray[np.int64]
 
 MAX_PARTS = 64

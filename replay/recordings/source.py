@@ -6,7 +6,8 @@ import bisect
 import functools
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,12 +60,10 @@ class RecordedSource(SeekableSource):
             UsageError: no such recording.
             LogDamagedError: a file is damaged, or the files contradict each other.
         """
-        self.warnings: tuple[str, ...] = ()
         self._loop = loop
         self._paths = paths
         self._files = [path for path in log_files(paths) if not _only_begun(path)]
         self._hashes: list[dict[str, Any]] | None = None
-        self._views: list[list[ViewFile]] = []
         opened: list[ViewFile] = []
         try:
             for path in self._files:
@@ -92,7 +91,7 @@ class RecordedSource(SeekableSource):
         try:
             for path in log_files(self._paths):
                 view = before.get(path.name.removesuffix(PARTIAL))
-                if view is not None and isinstance(path, Path) and view.is_at(path):
+                if view is not None and isinstance(path, Path) and view.reader.is_at(path):
                     view.refresh(path)
                     opened.append(view)
                 elif not _only_begun(path):
@@ -179,10 +178,7 @@ class RecordedSource(SeekableSource):
     def describe(self) -> Mapping[str, Any]:
         """The recording's views with the SHA-256 of their files, and what was recorded."""
         if self._hashes is None:
-            self._hashes = [
-                {"name": v.facts.view, "frames": v.count, **identity(v.path, v.reader)}
-                for v in self._all()
-            ]
+            self._hashes = self._described(lambda view: identity(view.path, view.reader))
         return {
             "kind": "recording",
             **self.scene(),
@@ -194,16 +190,13 @@ class RecordedSource(SeekableSource):
 
     def describe_files(self) -> list[dict[str, Any]]:
         """The views' files as far as they are known, with the SHA-256 of these bytes."""
-        return [
-            {
-                "name": view.facts.view,
-                "frames": view.count,
+        return self._described(
+            lambda view: {
                 "file": view.path.name,
                 "bytes": view.reader.size,
                 "sha256": view.reader.digest(),
             }
-            for view in self._all()
-        ]
+        )
 
     def scene(self) -> Mapping[str, str]:
         """What was recorded: the scene, its seed and the checksum of its configuration."""
@@ -215,6 +208,12 @@ class RecordedSource(SeekableSource):
         for view in self._all():
             view.close()
 
+    def _described(self, identify: Callable[[ViewFile], dict[str, Any]]) -> list[dict[str, Any]]:
+        return [
+            {"name": view.facts.view, "frames": view.count, **identify(view)}
+            for view in self._all()
+        ]
+
     def _all(self) -> list[ViewFile]:
         return [view for parts in self._views for view in parts]
 
@@ -224,15 +223,14 @@ class RecordedSource(SeekableSource):
 
     def _set_clock(self) -> None:
         """Find the frames that every view has, whole."""
-        facts = [parts[0].facts for parts in self._views]
-        covered = list(self.coverage().values())
+        coverage = self.coverage()
+        covered = list(coverage.values())
         common = functools.reduce(intersection, covered)
         if not common:
             raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
         self._ranges = _joined(common)
-        self._range_starts = list(
-            itertools.accumulate((stop - start for start, stop in self._ranges), initial=0)
-        )
+        lengths = (stop - start for start, stop in self._ranges)
+        self._range_starts = list(itertools.accumulate(lengths, initial=0))
         self._first = self._ranges[0][0]
         self._count = self._range_starts[-1]
         warnings = [text for view in self._all() for text in view.reader.warnings]
@@ -247,11 +245,9 @@ class RecordedSource(SeekableSource):
                 f"{self._name()}: {left_out} frames are missing in a view and left out in all"
             )
         self.warnings = tuple(warnings)
-        names, one = tuple(f.view for f in facts), facts[0]
         length = None if self._loop else self._count
-        self._spec = SourceSpec(
-            names, one.frame_shape, one.dtype, one.truth, one.fps, one.start_ns, length
-        )
+        one = self._views[0][0].facts.spec
+        self._spec = replace(one, streams=tuple(coverage), length=length)
 
     def _place(self, stream: int, played: int, wanted: int) -> tuple[ViewFile, int, int]:
         """Find the frame that is `played` frames from the start: file, frame, how many follow."""

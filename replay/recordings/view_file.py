@@ -73,20 +73,15 @@ class ViewFile:
             )
         self.facts = facts = ViewFacts.from_metadata(self.path, records[0].values)
         self.reader.expect(self.reader.segments)
-        schema = IMAGE_SCHEMA if len(facts.frame_shape) == 2 else VECTOR_SCHEMA
+        schema = IMAGE_SCHEMA if facts.spec.images else VECTOR_SCHEMA
         self._channels = [self._channel(view_topic(facts.view), schema)]
         if facts.truth:
             self._channels.append(self._channel(TRUTH_TOPIC, TRUTH_SCHEMA))
         self._find_ranges()
 
     def _find_ranges(self) -> None:
-        """Find the frames that have their ground truth."""
         self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))
         self._layouts = self._find_layouts() if self.ranges else []
-
-    def is_at(self, path: Path) -> bool:
-        """Whether a path leads to the very file that was opened."""
-        return self.reader.is_at(path)
 
     def refresh(self, path: Path) -> None:
         """Take in the frames that a recorder wrote since; it may have renamed the file.
@@ -120,8 +115,8 @@ class ViewFile:
         if self._scanner is None:
             self._scanner = ChunkScanner(self.reader, self._layouts)
         outs = [frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8)]
-        count, channels = len(frames), enumerate(self._channels)
-        pieces = [piece for c, rows in channels for piece in rows.pieces(start, count, c)]
+        numbered = enumerate(self._channels)
+        pieces = [p for which, rows in numbered for p in rows.pieces(start, len(frames), which)]
         # In the order of the file, so that each chunk is decoded once.
         pieces.sort(key=operator.attrgetter("segment.offset"))
         for piece in pieces:
@@ -144,7 +139,6 @@ class ViewFile:
         self.reader.close()
 
     def _find_layouts(self) -> list[RowLayout]:
-        """Where the frames and the ground truth stand in their messages."""
         payload = self._find_payload()
         place = payload.tail + payload.size
         marks = np.frombuffer(payload.before, np.uint8)
@@ -176,7 +170,7 @@ class ViewFile:
 
     def _find_payload(self) -> Payload:
         shape = self.facts.frame_shape
-        if len(shape) == 1:
+        if not self.facts.spec.images:
             return vector_payload(shape[0])
         first = self._channels[0].payload(self.ranges[0][0])
         try:
