@@ -17,11 +17,7 @@ BAGS: Final = (".bag", ".db3")
 
 
 class BagImages(ImageStream):
-    """The images on one topic of a ROS bag, in the order of its time stamps.
-
-    Args:
-        path: a .bag, a .db3, or the folder of a rosbag2.
-        topic: the topic; may be left out where there is one topic of images.
+    """The images on one topic of a .bag, a .db3 or a rosbag2's folder, by its time stamps.
 
     Raises:
         CdmisfaError: the package rosbags is missing.
@@ -78,14 +74,11 @@ class BagImages(ImageStream):
         # Several publishers on one topic are several connections of a ROS 1 bag.
         kinds = {str(c.topic): str(c.msgtype) for c in self._reader.connections}
         encoding = "ros1" if ros1 else "cdr"
-        chosen, decode = choose_images(
-            self.path,
-            topic,
-            [
-                (name, kind.replace("/msg/", "/") if ros1 else kind, encoding, name)
-                for name, kind in kinds.items()
-            ],
-        )
+        channels = [
+            (name, kind.replace("/msg/", "/") if ros1 else kind, encoding, name)
+            for name, kind in kinds.items()
+        ]
+        chosen, decode = choose_images(self.path, topic, channels)
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 

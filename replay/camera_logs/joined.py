@@ -13,12 +13,7 @@ from replay.storage.location import Location
 
 
 class JoinedImages(ImageStream):
-    """The images on one topic of several logs, by their times, ties in the order of the logs.
-
-    Args:
-        path: what stands for all of them.
-        parts: each has times, and the same topic.
-    """
+    """The images on one topic of several logs, by their times, ties in the order of the logs."""
 
     def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
         self.path = path

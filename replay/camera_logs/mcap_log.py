@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.messages import Decoder
 from replay.camera_logs.stream import ImageStream, choose_images, sorted_times
 from replay.mcap.reader import LogReader
-from replay.mcap.records import Bytes, Channel, MalformedRecord
+from replay.mcap.records import Bytes, MalformedRecord
 from replay.mcap.segments import Segment
 from replay.storage.location import Location
 
@@ -23,11 +22,6 @@ CACHE_BYTES: Final = 1024 * 1024
 class McapImages(ImageStream):
     """The images on one topic of one log, in the order of log time.
 
-    Args:
-        path: the log.
-        topic: the topic; may be left out where the log has one topic of images.
-        salvage: leave out what is damaged.
-
     Raises:
         UsageError: no such topic, or no images on it.
         LogDamagedError: the log is damaged.
@@ -37,7 +31,12 @@ class McapImages(ImageStream):
         self.path = path
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
         try:
-            self._channel, self._decode = self._find(topic)
+            kinds = {number: schema.name for number, schema in self.reader.schemas.items()}
+            channels = [
+                (c.topic, kinds.get(c.schema_id, "no schema"), c.encoding, c)
+                for c in self.reader.channels.values()
+            ]
+            self._channel, self._decode = choose_images(path, topic, channels)
             self.topic = self._channel.topic
             self._index()
         except BaseException:
@@ -59,15 +58,6 @@ class McapImages(ImageStream):
 
     def close(self) -> None:
         self.reader.close()
-
-    def _find(self, topic: str | None) -> tuple[Channel, Decoder]:
-        kinds = {number: schema.name for number, schema in self.reader.schemas.items()}
-        channels = self.reader.channels.values()
-        return choose_images(
-            self.path,
-            topic,
-            [(c.topic, kinds.get(c.schema_id, "no schema"), c.encoding, c) for c in channels],
-        )
 
     def _index(self) -> None:
         """Find every message of the topic.

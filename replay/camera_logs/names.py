@@ -18,11 +18,12 @@ def stream_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
     topics = [s.topic for s in streams]
     if len(set(topics)) == len(topics):
         return tuple(topics)
-    places = [_place(stream) for stream in streams]
+    paths = [s.path.address if isinstance(s.path, Url) else str(s.path.resolve()) for s in streams]
+    places = list(zip(paths, topics, strict=True))
     for i, place in enumerate(places):
         if place in places[:i]:
             raise UsageError(f"{topics[i]} of {streams[i].path} is named twice: leave one out")
-    for folders in range(max(len(Path(path).parts) for path, _ in places)):
+    for folders in range(max(len(Path(path).parts) for path in paths)):
         names = [_in_folders(stream, folders) for stream in streams]
         if len(set(names)) == len(names):
             return tuple(names)
@@ -42,12 +43,6 @@ def view_names(topics: Sequence[str]) -> tuple[str, ...]:
         taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
         names.append(f"{plain}-{taken + 1}" if taken else plain)
     return tuple(names)
-
-
-def _place(stream: ImageStream) -> tuple[str, str]:
-    """Where the images of a stream lie, and their topic there."""
-    path = stream.path
-    return (path.address if isinstance(path, Url) else str(path.resolve())), stream.topic
 
 
 def _in_folders(stream: ImageStream, folders: int) -> str:

@@ -25,7 +25,7 @@ def open_images(path: Location, topic: str | None, *, salvage: bool = False) -> 
 
     Args:
         path: an MCAP log or its URL, a ROS bag, a video or a folder of pictures.
-        topic: the topic; may be left out where there is one topic of images.
+        topic: may be left out where there is one topic of images.
         salvage: leave out what is damaged.
 
     Raises:
@@ -45,11 +45,7 @@ def open_images(path: Location, topic: str | None, *, salvage: bool = False) -> 
 
 
 def image_logs(paths: Sequence[str | Location]) -> list[Location]:
-    """List the logs that paths mean: a folder of MCAP files is each of them, a rosbag2 one log.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """The logs that paths mean, one at least: a folder of MCAP files is each, a rosbag2 one log."""
     found: list[Location] = []
     for path in map(location, paths):
         if only_foreign(path) or (isinstance(path, Path) and _is_split(path)):
@@ -70,12 +66,7 @@ def only_foreign(path: Location) -> bool:
 def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any]:
     """What tells a log from others: see `identity`; of a folder, names and contents count.
 
-    Args:
-        path: the log.
-        streams: of which one reads it, where it is behind a URL.
-
-    Raises:
-        CdmisfaError: a file cannot be read.
+    One of the streams reads the log, where it is behind a URL.
     """
     if isinstance(path, Url) or not path.is_dir():
         reads = (s.reader for s in streams if isinstance(s, McapImages) and s.path == path)

@@ -17,15 +17,7 @@ PICTURES: Final = (".jpeg", ".jpg", ".png")
 
 
 class FolderImages(ImageStream):
-    """The pictures of a folder, in the order of their names, numbers by value.
-
-    Args:
-        path: the folder.
-        topic: its name, or None.
-
-    Raises:
-        UsageError: it is no topic of the folder.
-    """
+    """The pictures of a folder, in the order of their names, numbers by value."""
 
     def __init__(self, path: Path, topic: str | None) -> None:
         self.path = path
@@ -39,7 +31,6 @@ class FolderImages(ImageStream):
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return len(self._files)
 
     def image(self, row: int) -> Bytes:

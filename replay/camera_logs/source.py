@@ -112,12 +112,10 @@ class ForeignSource(SeekableSource):
 
     @property
     def spec(self) -> SourceSpec:
-        """What the streams deliver; without a length where they loop."""
         return self._spec
 
     @property
     def t(self) -> int:
-        """Number of the next frame."""
         return self._t
 
     def take(self, stream: int, n: int) -> Block:
@@ -175,7 +173,6 @@ class ForeignSource(SeekableSource):
         }
 
     def close(self) -> None:
-        """Let go of the files; harmless when called twice."""
         for stream in self._streams:
             stream.close()
 
@@ -237,7 +234,7 @@ class ForeignSource(SeekableSource):
 
 def _pairs(files: Sequence[Location], topics: Sequence[str]) -> list[tuple[Location, str | None]]:
     if len(files) == 1:
-        return [(files[0], topic) for topic in topics or [None]]
+        return [(files[0], topic) for topic in topics or (None,)]
     if len(topics) < 2:
         return [(file, topics[0] if topics else None) for file in files]
     if len(topics) != len(files):

@@ -32,10 +32,6 @@ _STRETCH: Final[Bytes] = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 25
 class VideoImages(ImageStream):
     """The frames of a video's first stream, at its presentation times.
 
-    Args:
-        path: the file.
-        topic: its name without the ending, or None.
-
     Raises:
         CdmisfaError: the package av is missing.
         UsageError: it is no topic of the file.

@@ -91,11 +91,7 @@ class Chunks:
         ]
 
     def unpack(self, segment: Segment, out: Bytes) -> memoryview:
-        """Decompress the records of a chunk with message indexes, and check their checksum.
-
-        Args:
-            segment: the chunk.
-            out: (segment.size,) written.
+        """Decompress the records of a chunk with message indexes into `out`, (segment.size,).
 
         Returns:
             The records of its message indexes.

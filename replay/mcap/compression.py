@@ -88,11 +88,7 @@ class Decompressor:
 
 
 def check_size(compression: str, size: int) -> None:
-    """Refuse a chunk that cannot or must not be decompressed.
-
-    Raises:
-        MalformedRecord: an unknown compression, or more than `MAX_CHUNK` bytes.
-    """
+    """Refuse an unknown compression, and more than `MAX_CHUNK` bytes decompressed."""
     if compression not in ("", "zstd", "lz4"):
         raise MalformedRecord(f"its compression {compression[:40]!r} is unknown")
     if size > MAX_CHUNK:

@@ -52,12 +52,7 @@ class LogReader:
         salvage: bool = False,
         cache_bytes: int | None = None,
     ) -> None:
-        """Open a log and walk over its structure.
-
-        Args:
-            path: the file, or its URL.
-            salvage: leave out what is damaged.
-            cache_bytes: decoded chunks that are kept.
+        """Open a file or URL and walk over its structure; keep `cache_bytes` of decoded chunks.
 
         Raises:
             UsageError: it cannot be opened.
@@ -221,12 +216,7 @@ class LogReader:
             yield segment, within(table, low, high)
 
     def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
-        """Say which chunks will be read, one after the other, so that they come in time.
-
-        Args:
-            segments: the chunks.
-            indexes: only their message indexes.
-        """
+        """Say which chunks, or only `indexes` of them, will be read one after the other."""
         spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
         self._file.expect(list(spans))
 

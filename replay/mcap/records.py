@@ -85,7 +85,6 @@ class Fields:
         self.at = 0
 
     def take(self, count: int) -> memoryview:
-        """Take the next `count` bytes."""
         if count > len(self.data) - self.at:
             raise MalformedRecord(
                 f"{self.what} is cut short or lies about a length ({count} bytes wanted, "
@@ -107,11 +106,7 @@ class Fields:
             raise MalformedRecord(f"{self.what} holds a text that is not UTF-8") from None
 
     def texts(self) -> dict[str, str]:
-        """Take a map of texts.
-
-        Raises:
-            MalformedRecord: a key stands twice, so that readers would disagree.
-        """
+        """Take a map of texts, where no key may stand twice: readers would disagree."""
         inner = Fields(self.take(self.integer(4)), self.what)
         result: dict[str, str] = {}
         while inner.at < len(inner.data):
@@ -123,7 +118,6 @@ class Fields:
 
 
 def schema(content: bytes | memoryview) -> Schema:
-    """Parse a Schema record."""
     fields = Fields(content, "a schema")
     number = fields.integer(2)
     if number == 0:
@@ -132,7 +126,6 @@ def schema(content: bytes | memoryview) -> Schema:
 
 
 def channel(content: bytes | memoryview) -> Channel:
-    """Parse a Channel record."""
     fields = Fields(content, "a channel")
     return Channel(
         fields.integer(2), fields.integer(2), fields.text(), fields.text(), fields.texts()
@@ -140,7 +133,6 @@ def channel(content: bytes | memoryview) -> Channel:
 
 
 def statistics(content: bytes | memoryview) -> Statistics:
-    """Parse a Statistics record."""
     fields = Fields(content, "the statistics")
     messages = fields.integer(8)
     fields.take(2 + 4)  # schemas and channels
@@ -155,11 +147,7 @@ def statistics(content: bytes | memoryview) -> Statistics:
 
 
 def walk(data: memoryview, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Each record within a chunk as (opcode, place of its first byte, place after its last).
-
-    Raises:
-        MalformedRecord: a record runs over the end, or the opcode 0.
-    """
+    """Each record within a chunk as (opcode, place of its first byte, place after its last)."""
     unpack = RECORD_HEADER.unpack_from
     while at < stop:
         if stop - at < RECORD_HEADER.size:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from mcap.opcode import Opcode
 
@@ -147,24 +148,17 @@ class Definitions:
         self._bytes = 0
 
     def add(self, opcode: int, content: bytes, where: str) -> None:
-        """Take a Schema or Channel record in.
-
-        Raises:
-            MalformedRecord: it is broken.
-            LogDamagedError: its id already means something else.
-        """
+        """Take a Schema or Channel record in, and refuse one whose id means something else."""
         key = (opcode, content)
         if key in self._seen:
             return
         self._bytes += len(content)
         if self._bytes > MAX_DEFINITION:
             raise MalformedRecord(f"schemas and channels take more than {MAX_DEFINITION} bytes")
-        if opcode == Opcode.SCHEMA:
-            new = schema(content)
-            if self.schemas.setdefault(new.id, new) != new:
-                self._refuse(where, f"schema {new.id} is defined twice with different content")
-        else:
-            other = channel(content)
-            if self.channels.setdefault(other.id, other) != other:
-                self._refuse(where, f"channel {other.id} is defined twice with different content")
+        is_schema = opcode == Opcode.SCHEMA
+        new = schema(content) if is_schema else channel(content)
+        known: dict[int, Any] = self.schemas if is_schema else self.channels
+        if known.setdefault(new.id, new) != new:
+            kind = "schema" if is_schema else "channel"
+            self._refuse(where, f"{kind} {new.id} is defined twice with different content")
         self._seen.add(key)

@@ -40,7 +40,6 @@ class Summary:
     Attributes:
         begin: place in the file where the data ends.
         read: it is there, and was read to its end.
-        statistics: what it counts, or None.
         chunks: places that it names for chunks, in order.
         indexes: place and bytes of each of its chunk, attachment and metadata indexes.
     """
@@ -55,12 +54,7 @@ class Summary:
 
 
 def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summary | None:
-    """Read the footer and the summary of a log.
-
-    Args:
-        file: the log.
-        definitions: take in what the summary defines.
-        refuse: told of damage.
+    """Read the footer and the summary of a log, and take in what this defines.
 
     Returns:
         The summary as far as it can be read, or None where the file has no end.
@@ -121,23 +115,14 @@ def header_at(file: Store, at: int) -> tuple[int, int]:
 
 
 def definition(file: Store, content: int, length: int) -> bytes:
-    """Read a record that is kept in memory.
-
-    Raises:
-        MalformedRecord: it is larger than is read at once.
-    """
+    """Read a record that is kept in memory, and must not be too large for that."""
     if length > MAX_DEFINITION:
         raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
     return file.read(content, length)
 
 
 def stated_segments(file: Store, summary: Summary, known: set[int]) -> list[Segment] | None:
-    """The chunks that a summary names, in file order.
-
-    Args:
-        file: the log.
-        summary: its summary.
-        known: the channels that the summary defines.
+    """The chunks that a summary names, in file order, where it defines the `known` channels.
 
     Returns:
         None where the summary does not account for every message.
@@ -171,11 +156,7 @@ def stated_segments(file: Store, summary: Summary, known: set[int]) -> list[Segm
 
 
 def stated_spans(file: Store, summary: Summary, opcode: int) -> list[tuple[int, int]]:
-    """Where a summary says that attachments or metadata are, as spans [start, stop) of the file.
-
-    Raises:
-        MalformedRecord: a broken index.
-    """
+    """Where a summary says that attachments or metadata are, as spans [start, stop) of the file."""
     spans = []
     for content, length in summary.indexes[opcode]:
         fields = _index(file, content, length)

@@ -48,29 +48,22 @@ class MessageTable:
 
     @property
     def channel(self) -> NDArray[np.uint16]:
-        """Channel of each message, (n,)."""
         return self.headers["channel"]
 
     @property
     def log_time(self) -> NDArray[np.uint64]:
-        """Log time of each message in nanoseconds, (n,)."""
         return self.headers["log_time"]
 
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
         return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
 
     def payload(self, row: int) -> bytes:
-        """Copy the payload of one message."""
         at = int(self.at[row])
         return self.data[at : at + int(self.size[row])].tobytes()
 
 
 def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
-    """Build the table of the message records that begin at n places of a chunk.
-
-    Raises:
-        MalformedRecord: what stands there is no message, or runs over the chunk's end.
-    """
+    """Build the table of the message records that begin at n places of a chunk, and check them."""
     if len(offsets) == 0:
         return MessageTable(data, np.empty(0, MESSAGE_HEADER), offsets, offsets)
     width = MESSAGE_HEADER.itemsize
@@ -91,11 +84,7 @@ def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
 
 
 def walked_table(raw: Bytes, *, cut: bool = False) -> tuple[MessageTable, Spans]:
-    """Build the table of a chunk by walking over its records.
-
-    Args:
-        raw: the chunk's records.
-        cut: the chunk ends early; what is broken at its end is left out.
+    """Build the table of a chunk by walking over its records, without the broken end of a cut one.
 
     Raises:
         MalformedRecord: the chunk holds something that is no record, or that has no place there.
@@ -157,7 +146,7 @@ def indexed_table(
 
 
 def within(table: MessageTable, low: int, high: int) -> MessageTable:
-    """Give the messages with log times in [low, high)."""
+    """The messages with log times in [low, high)."""
     times = table.log_time
     if not len(times) or (low <= int(times.min()) and int(times.max()) < high):
         return table

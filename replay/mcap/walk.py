@@ -94,14 +94,7 @@ class Structure:
             self._walk_data()
 
     def resume(self) -> int:
-        """Walk over what was appended to a file that had no end yet.
-
-        Returns:
-            How many of the segments before are as they were.
-
-        Raises:
-            LogDamagedError: what was appended is damaged.
-        """
+        """Walk over what was appended; how many of the segments before are as they were."""
         if self._last_chunk is not None:
             # Its message indexes need not all have been there.
             self._at = self.segments.pop().offset
@@ -179,7 +172,8 @@ class Structure:
         content = self._at + RECORD_HEADER.size
         end = content + length
         if opcode == 0:
-            if self._limit is None and self._only_zeros(self._at):
+            rest = self._file.blocks(self._at, self._file.size)
+            if self._limit is None and not any(map(any, rest)):
                 return self._cut(f"from byte {self._at} on there are only zeros", limit)
             raise MalformedRecord("no record (opcode 0)")
         if end > limit:
@@ -319,9 +313,6 @@ class Structure:
         self.missing = what
         return False
 
-    def _only_zeros(self, at: int) -> bool:
-        return not any(any(block) for block in self._file.blocks(at, self._file.size))
-
     def _resume_after(self, at: int) -> bool:
         """Continue at the next chunk that the summary names."""
         self._close_loose()
@@ -334,7 +325,6 @@ class Structure:
         return True
 
     def _read_end(self) -> None:
-        """Read footer and summary, where the file has them."""
         self.summary = read_summary(self._file, self.definitions, self._refuse)
         self._limit = self.summary.begin if self.summary else None
 
@@ -361,11 +351,7 @@ class Structure:
 
 
 def _fitting(chunk: Segment, end: int) -> Segment:
-    """A chunk whose data does not run over the end of its record.
-
-    Raises:
-        MalformedRecord: it does.
-    """
+    """A chunk whose data must not run over the end of its record."""
     if chunk.data_offset + chunk.stored > end:
         raise MalformedRecord("a chunk's length is not that of its data")
     return chunk

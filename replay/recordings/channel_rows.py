@@ -30,7 +30,6 @@ class Span:
     row: int
 
     def row_of(self, frame: int) -> int:
-        """Number of the message with a frame of the span."""
         return self.row + frame - self.start
 
 
@@ -85,16 +84,11 @@ class ChannelRows:
             self.spans = self._spans_from(0)
 
     def extend(self) -> None:
-        """Take in what its recorder has added to the file.
-
-        Raises:
-            LogDamagedError: what was added is damaged.
-        """
+        """Take in what its recorder has added to the file."""
         self.spans = self._spans_from(self._take_segments())
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
-        """The frames that are there, as ranges [start, stop)."""
         return [(span.start, span.stop) for span in self.spans]
 
     def _take_segments(self) -> int:
@@ -178,17 +172,12 @@ class ChannelRows:
         return own[0] if len(own) == 1 else np.concatenate(own)
 
     def payload(self, frame: int) -> bytes:
-        """Copy the payload of a frame's message."""
         row = self._row(frame)
         number = bisect.bisect_right(self._starts, row) - 1
         return self._table(number).payload(row - self._starts[number])
 
     def tables(self) -> Iterator[tuple[Segment, MessageTable]]:
-        """The messages chunk by chunk, without what is damaged where that is left out.
-
-        Raises:
-            LogDamagedError: a chunk is damaged, or holds more or fewer than its index says.
-        """
+        """The messages chunk by chunk, without what is damaged where that is left out."""
         for segment in self._segments:
             if self._reader.table(segment) is not None:
                 yield segment, own_messages(self._reader, segment, self.channel)
@@ -207,7 +196,6 @@ class ChannelRows:
         return found
 
     def _row(self, frame: int) -> int:
-        """Number of a frame's message."""
         place = bisect.bisect_right(self.spans, frame, key=lambda span: span.start) - 1
         return self.spans[place].row_of(frame)
 

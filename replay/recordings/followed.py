@@ -65,12 +65,10 @@ class FollowedSource(SeekableSource):
 
     @property
     def spec(self) -> SourceSpec:
-        """What the recording delivers; how long it will be is not known."""
         return self._spec
 
     @property
     def t(self) -> int:
-        """Number of the next frame."""
         return self._t
 
     @property
@@ -116,7 +114,6 @@ class FollowedSource(SeekableSource):
         return {"kind": "recording", **self._now.scene(), "followed": True, "views": views}
 
     def close(self) -> None:
-        """Let go of the files; harmless when called twice."""
         if self._source is not None:
             self._source.close()
 
@@ -132,13 +129,7 @@ class FollowedSource(SeekableSource):
         return source is not None and source.first_frame + source.frames >= end
 
     def _wait(self, end: int, what: str) -> None:
-        """Look at the files until an end is reached, they are finished or nothing comes.
-
-        Raises:
-            LogExhaustedError: nothing came in time, or waiting was to stop.
-            UsageError: there is no recording.
-            LogDamagedError: a file is damaged.
-        """
+        """Look at the files until an end is reached, they are finished or nothing comes."""
         if self._reaches(end):
             return
         deadline = time.monotonic() + self._timeout

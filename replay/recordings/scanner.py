@@ -50,11 +50,7 @@ class RowLayout:
     width: int
 
     def checked_ends(self, path: Location, segment: Segment, table: MessageTable) -> Places:
-        """Place after each message of the channel in its chunk, (n,).
-
-        Raises:
-            LogDamagedError: a message is not laid out like that.
-        """
+        """Place after each message of the channel in its chunk, (n,), if all are laid out so."""
         ends = table.at + table.size
         if (table.size < self.least).any():
             wrong = "shorter than"
@@ -79,12 +75,7 @@ class ScannedChunk:
 
 
 class ChunkScanner:
-    """Decodes the chunks of one file for the channels of a view.
-
-    Args:
-        reader: the file.
-        layouts: of the channels wanted.
-    """
+    """Decodes the chunks of one file for the channels of a view, laid out as they are."""
 
     def __init__(self, reader: LogReader, layouts: Sequence[RowLayout]) -> None:
         # Imported with the first block that is read, so that looking at a log compiles nothing.
@@ -163,11 +154,7 @@ class ChunkScanner:
         return ScannedChunk(buffer, ends)
 
     def tabled(self, segment: Segment, buffer: Bytes) -> ScannedChunk:
-        """Decode a chunk by its tables, into a buffer where it is large enough.
-
-        Raises:
-            LogDamagedError: it is damaged, or a message of the view is not laid out like others.
-        """
+        """Decode a chunk by its tables, into a buffer where it is large enough."""
         tables = [own_messages(self._reader, segment, layout.channel) for layout in self._layouts]
         ends = np.zeros((len(tables), max(map(len, tables))), np.int64)
         for which, (layout, table) in enumerate(zip(self._layouts, tables, strict=True)):

@@ -109,12 +109,10 @@ class RecordedSource(SeekableSource):
 
     @property
     def spec(self) -> SourceSpec:
-        """What the recording delivers; without a length where it loops."""
         return self._spec
 
     @property
     def t(self) -> int:
-        """Number of the next frame."""
         return self._t
 
     @property
@@ -129,9 +127,7 @@ class RecordedSource(SeekableSource):
 
     def coverage(self) -> dict[str, list[tuple[int, int]]]:
         """The frames that are there of each view, as ranges [start, stop)."""
-        return {
-            parts[0].facts.view: [r for view in parts for r in view.ranges] for parts in self._views
-        }
+        return {p[0].facts.view: [r for view in p for r in view.ranges] for p in self._views}
 
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a view shows at t .. t+n-1; moves t by n.
@@ -190,13 +186,12 @@ class RecordedSource(SeekableSource):
 
     def describe_files(self) -> list[dict[str, Any]]:
         """The views' files as far as they are known, with the SHA-256 of these bytes."""
-        return self._described(
-            lambda view: {
-                "file": view.path.name,
-                "bytes": view.reader.size,
-                "sha256": view.reader.digest(),
-            }
-        )
+
+        def identify(view: ViewFile) -> dict[str, Any]:
+            size, digest = view.reader.size, view.reader.digest()
+            return {"file": view.path.name, "bytes": size, "sha256": digest}
+
+        return self._described(identify)
 
     def scene(self) -> Mapping[str, str]:
         """What was recorded: the scene, its seed and the checksum of its configuration."""
@@ -204,15 +199,11 @@ class RecordedSource(SeekableSource):
         return {name: getattr(facts, name) for name in _SCENE if name in facts.values}
 
     def close(self) -> None:
-        """Let go of the files; harmless when called twice."""
         for view in self._all():
             view.close()
 
     def _described(self, identify: Callable[[ViewFile], dict[str, Any]]) -> list[dict[str, Any]]:
-        return [
-            {"name": view.facts.view, "frames": view.count, **identify(view)}
-            for view in self._all()
-        ]
+        return [{"name": v.facts.view, "frames": v.count, **identify(v)} for v in self._all()]
 
     def _all(self) -> list[ViewFile]:
         return [view for parts in self._views for view in parts]

@@ -84,11 +84,7 @@ class ViewFile:
         self._layouts = self._find_layouts() if self.ranges else []
 
     def refresh(self, path: Path) -> None:
-        """Take in the frames that a recorder wrote since; it may have renamed the file.
-
-        Raises:
-            LogDamagedError: what was written is damaged.
-        """
+        """Take in the frames that a recorder wrote since; it may have renamed the file."""
         self.path = self.reader.path = path
         if self.reader.refresh():
             self._scanner = None
@@ -135,7 +131,6 @@ class ViewFile:
                 layout.checked_ends(self.path, segment, table)
 
     def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
         self.reader.close()
 
     def _find_layouts(self) -> list[RowLayout]:

@@ -28,7 +28,6 @@ class Url:
 
     @property
     def scheme(self) -> str:
-        """What stands before "://"."""
         return self.address.split("://", 1)[0]
 
     @property
@@ -40,17 +39,14 @@ class Url:
 
     @property
     def stem(self) -> str:
-        """The name without its last ending."""
         return Path(self.name).stem
 
     @property
     def suffix(self) -> str:
-        """The last ending of the name."""
         return Path(self.name).suffix
 
     @property
     def parent(self) -> Url:
-        """The folder it would be in."""
         return Url(str(self).rstrip("/").rsplit("/", 1)[0])
 
     @property

@@ -30,14 +30,7 @@ class RemoteStore(Store):
     """An object on a server, read part by part; `tag` names its version (ETag or date)."""
 
     def __init__(self, url: Url) -> None:
-        """Look for the object and read its beginning.
-
-        Raises:
-            UsageError: there is no such object.
-            UnreachableError: the server does not give it.
-            RemoteError: what it gives is not what it says.
-            CdmisfaError: what reads URLs is not installed.
-        """
+        """Look for the object and read its beginning; errors as those of `open_store`."""
         super().__init__(url)
         self._server = connect(url)
         self._parts: OrderedDict[int, bytes] = OrderedDict()
