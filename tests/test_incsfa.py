@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from cdmisfa.core.blocks import freeze
+from cdmisfa.core.blocks import PIXEL, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.core.frames import PIXEL
 from cdmisfa.features.incsfa import gram, strict
 from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.features.incsfa.state import State, copy_into, new_state, parameters, rank_floor

@@ -16,11 +16,10 @@ from cdmisfa.agents.agent import OUTCOME, begin_abstraction, new_agent, rules
 from cdmisfa.agents.gate import Frozen
 from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.policy import action_values
-from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand, expanded_size
-from cdmisfa.core.frames import PIXEL
 from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals

@@ -12,14 +12,11 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.extending import overload
 
-from cdmisfa.core.splicing import Splicing
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 MARKS = (
     b"@compiled",
     b"@inlined",
-    b"@splicing",
     b"@reordered",
     b"@in_compiled_code",
     b"@_intrinsic",
@@ -35,16 +32,6 @@ def compiled(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile strictly, into every function that calls it: for the small ones of a hot loop."""
     return _compile(function, forceinline=True)
-
-
-def spliced(function: Function) -> Function:
-    """Write a function's body into the compiled ones that call it, and compile it with them."""
-    return _compile(function, inline="always")
-
-
-def splicing(function: Function) -> Function:
-    """Compile strictly a function that calls `spliced` ones in a hot loop."""
-    return _compile(function, pipeline_class=Splicing)
 
 
 def reordered(function: Function) -> Function:

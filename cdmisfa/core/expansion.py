@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.frames import as_frames
+from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
 from cdmisfa.core.registry import Registry
 
 
@@ -28,18 +28,22 @@ class Expansion:
     function: Callable[[NDArray[Any]], NDArray[Any]]
 
 
-@cache
-def _compiled() -> Callable[[NDArray[Any]], NDArray[Any]]:
-    from cdmisfa.core.quadratic import inputs_and_products  # a configuration needs only its name
+def _inputs_and_products(frames: NDArray[Any]) -> NDArray[np.float64]:
+    x = frames * PIXEL if frames.dtype == UINT8 else frames
+    first, second = _pairs(x.shape[1])
+    return np.concatenate([x, x[:, first] * x[:, second]], axis=1)
 
-    return inputs_and_products
+
+@cache
+def _pairs(size: int) -> tuple[NDArray[np.intp], ...]:
+    return np.triu_indices(size)
 
 
 EXPANSIONS: Registry[Expansion] = Registry(
     "expansion",
     {
         "none": Expansion(lambda n: n, lambda frames: frames),
-        "quadratic": Expansion(lambda n: n + n * (n + 1) // 2, lambda frames: _compiled()(frames)),
+        "quadratic": Expansion(lambda n: n + n * (n + 1) // 2, _inputs_and_products),
     },
 )
 """Every expansion, by the name that `learner.expansion` takes; `EXPANSIONS.add` adds one."""

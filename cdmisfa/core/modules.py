@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import PIXEL, UINT8, as_array
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand, expanded_size
-from cdmisfa.core.frames import PIXEL, UINT8, as_array
 
 CHUNK = 1024
 """Frames that are turned into values at once."""

@@ -19,7 +19,7 @@ from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.policy import action_values
-from cdmisfa.core.compiled import spliced, splicing
+from cdmisfa.core.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
@@ -94,10 +94,10 @@ class TrialResult:
     curves: Curves | None
 
 
-_iterate = spliced(iterate)
+_iterate = compiled(iterate)
 
 
-@splicing
+@compiled
 def run_iterations(
     agent: Agent,
     rules: Rules,

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
 from cdmisfa.core.compiled import compiled, reordered
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.frames import PIXEL, UINT8, as_frames
 
 Float = NDArray[np.float64]
 

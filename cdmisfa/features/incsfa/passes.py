@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.compiled import compiled, reordered
-from cdmisfa.core.frames import PIXEL, UINT8
 from cdmisfa.features.incsfa.lanes import LANES, add, load, store
 from cdmisfa.features.incsfa.state import Float, State, mean_rate
 
