@@ -13,11 +13,7 @@ from benchmarks.report import write_page
 def main() -> None:
     """Run benchmarks one after another; each writes results/NAME.json, `page` the page."""
     modules = pkgutil.iter_modules(benchmarks.__path__)
-    names = sorted(
-        m.name
-        for m in modules
-        if not m.name.startswith("_") and m.name not in ("report", "recordings")
-    )
+    names = sorted({m.name for m in modules} - {"__main__", "report"})
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
         "name", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}, or page"

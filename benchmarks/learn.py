@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import gc
-import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.recordings import SAMPLE
-from benchmarks.report import ratio, save
+from benchmarks.report import SAMPLE, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.runs import run
 from replay.recordings.source import RecordedSource
@@ -18,8 +16,8 @@ from replay.recordings.source import RecordedSource
 CONFIG = LearnerConfig(components=32, outputs=5, nu=0.005, tau=40, expansion="none")
 CLOCKS = {"learning thread": time.thread_time_ns, "all threads": time.process_time_ns}
 
-Times = dict[str, list[float]]
-"""By clock: microseconds of CPU, one entry a round."""
+Times = dict[tuple[str, str], list[float]]
+"""By clock and logs: microseconds of CPU, one entry a round."""
 
 
 def learning(out: Path | None, *, rerun: bool) -> Callable[[int], None]:
@@ -50,39 +48,31 @@ def main(*, quick: bool = False, full: bool = False) -> None:
             "run.mcap": learning(Path(folder) / "a", rerun=False),
             "run.mcap and run.rrd": learning(Path(folder) / "b", rerun=True),
         }
-        whole: dict[str, Times] = {what: {name: [] for name in CLOCKS} for what in work}
-        each: dict[str, Times] = {what: {name: [] for name in CLOCKS} for what in work}
+        whole: Times = {(name, what): [] for name in CLOCKS for what in work}
+        each: Times = {(name, what): [] for name in CLOCKS for what in work}
         for turn in range(rounds + 1):
             for what, call in work.items():
                 brief, lengthy = timed(call, short), timed(call, long)
                 for name in CLOCKS if turn else ():  # the first turn warms up
-                    whole[what][name].append(lengthy[name])
-                    each[what][name].append((lengthy[name] - brief[name]) / (long - short))
+                    whole[name, what].append(lengthy[name])
+                    each[name, what].append((lengthy[name] - brief[name]) / (long - short))
     rows = []
-    for name in CLOCKS:
-        for what in work:
-            times, steady = whole[what][name], each[what][name]
-            fixed = [t - long * s for t, s in zip(times, steady, strict=True)]
-            rows.append(
-                [
-                    name,
-                    what,
-                    round(statistics.median(times) / long),
-                    more(times, whole["no log"][name]),
-                    round(statistics.median(steady)),
-                    more(steady, each["no log"][name]),
-                    f"{statistics.median(fixed) / 1000:.0f}",
-                ]
-            )
-    head = [
-        "CPU of",
-        "logs",
-        "us an iteration, whole run",
-        "more than no log",
-        "us a further iteration",
-        "more than no log",
-        "fixed ms",
-    ]
+    for (name, what), times in whole.items():
+        steady = each[name, what]
+        fixed = [t - long * s for t, s in zip(times, steady, strict=True)]
+        rows.append(
+            [
+                name,
+                what,
+                middle([t / long for t in times]),
+                more(times, whole[name, "no log"]),
+                middle(steady),
+                more(steady, each[name, "no log"]),
+                f"{middle(fixed) / 1000:.0f}",
+            ]
+        )
+    head = ["CPU of", "logs", "us an iteration, whole run", "more than no log"]
+    head += ["us a further iteration", "more than no log", "fixed ms"]
     save(
         "learn",
         "Learning with and without logs",

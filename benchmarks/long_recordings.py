@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.report import save
 from cdmisfa.core.blocks import Block, SourceSpec
@@ -23,19 +24,22 @@ TAU = 40
 MEGABYTE = 10**6
 
 
-def write_long(folder: Path, size: int) -> Path:
-    """Record one view of about `size` bytes, uncompressed: a plain image with a line that moves."""
-    folder.mkdir(parents=True, exist_ok=True)
-    spec = SourceSpec(("left",), SHAPE, "uint8", ("x", "y"), 50.0, 10**18)
-    settings = RecordConfig(compression="none")
-    log = ViewLog(folder, "left", Identity("plain", 0, spec, {}), settings)
-    frames = np.full((TAU, *SHAPE), 100, np.uint8)
-    frames[np.arange(TAU), np.arange(TAU)] = 200
-    truth = np.zeros((TAU, 2))
-    while log.file.size < size:
-        log.write(Block(0, log.t, frames, truth))
+def write(folder: Path, frames: NDArray[np.uint8], *, size: int = 0, **keys: str) -> Path:
+    """Record frames as one view, again and again until its file has `size` bytes; the file."""
+    spec = SourceSpec(("left",), frames.shape[1:], "uint8", ("x", "y"), 50.0, 10**18)
+    log = ViewLog(folder, "left", Identity("plain", 0, spec, {}), RecordConfig(**keys))
+    while not log.t or log.file.size < size:
+        log.write(Block(0, log.t, frames, np.zeros((len(frames), 2))))
     log.file.finish()
     return log.file.path
+
+
+def write_long(folder: Path, size: int) -> Path:
+    """Record about `size` bytes, uncompressed: a plain image with a line that moves."""
+    folder.mkdir(parents=True, exist_ok=True)
+    frames = np.full((TAU, *SHAPE), 100, np.uint8)
+    frames[np.arange(TAU), np.arange(TAU)] = 200
+    return write(folder, frames, size=size, compression="none")
 
 
 def play(path: Path) -> None:

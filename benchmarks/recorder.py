@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.report import interleaved, ratio, save
+from benchmarks.report import interleaved, middle, ratio, save
 from recorder.recording import record_scene
 from recorder.world.rendering import take_here
 from recorder.world.scenes import open_scene
@@ -69,13 +68,8 @@ def main(*, quick: bool = False, full: bool = False, scene: str = "icub") -> Non
         jobs = {n: steady_and_start(scene, more, Path(folder), n, rounds) for n in (1, 2)}
     share = ratio(times["rendering"], times["recording"])
     rows: list[list[object]] = [
-        ["rendering alone, CPU", round(statistics.median(times["rendering"])), "", ""],
-        [
-            "recording, CPU",
-            round(statistics.median(times["recording"])),
-            f"{100 * share:.0f} %",
-            "",
-        ],
+        ["rendering alone, CPU", middle(times["rendering"]), "", ""],
+        ["recording, CPU", middle(times["recording"]), f"{100 * share:.0f} %", ""],
     ]
     for n, (frame, start) in jobs.items():
         gain = f"{jobs[1][0] / frame:.2f}x" if n > 1 else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
@@ -17,6 +18,7 @@ import numpy as np
 from cdmisfa.experiments.documents import markdown
 
 RESULTS = Path(__file__).parent / "results"
+SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
 
 
@@ -44,6 +46,11 @@ def interleaved(
     return times
 
 
+def middle(times: Sequence[float], digits: int | None = None) -> float:
+    """The median of times, rounded."""
+    return round(statistics.median(times), digits)
+
+
 def ratio(slow: Sequence[float], fast: Sequence[float]) -> float:
     """Median of the ratios within each round."""
     return statistics.median(s / f for s, f in zip(slow, fast, strict=True))
@@ -52,11 +59,9 @@ def ratio(slow: Sequence[float], fast: Sequence[float]) -> float:
 def platform_facts() -> dict[str, Any]:
     """What the numbers depend on: CPU and versions."""
     cpu = platform.processor()
-    try:
+    with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         cpu = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), cpu)
-    except OSError:
-        pass
     return {
         "cpu": cpu,
         "cores": os.cpu_count(),
@@ -79,7 +84,7 @@ def save(
         name: of the benchmark.
         title: its heading on the page.
         note: what was measured, and how.
-        tables: (header, rows) of each table.
+        tables: (header, rows) of each.
         data: further values for the file.
     """
     RESULTS.mkdir(exist_ok=True)
