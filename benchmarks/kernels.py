@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from benchmarks.report import interleaved, ratio, save
+from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import gram, strict
@@ -295,7 +295,7 @@ def measure_errors(n: int) -> list[list[Any]]:
 
 
 def _result(times: dict[str, list[float]], ours: str, **case: int) -> dict[str, Any]:
-    micros = {name: round(statistics.median(t), 3) for name, t in times.items()}
+    micros = {name: middle(t, 3) for name, t in times.items()}
     ratios = {name: round(ratio(t, times[ours]), 2) for name, t in times.items() if name != ours}
     return {**case, "ours": ours, "us_per_frame": micros, "times_faster_than": ratios}
 

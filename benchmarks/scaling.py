@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import resource
-import statistics
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import interleaved, ratio, save
+from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules
 from cdmisfa.agents.gate import NOVEL
 from cdmisfa.agents.iteration import think
@@ -101,8 +100,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     work = {str(n): agent_steps(n, 20_000 // n + 200) for n in streams}
     steps = interleaved(work, rounds)
     by_streams = [
-        [n, round(statistics.median(steps[str(n)]), 2), f"{ratio(steps[str(n)], steps['10']):.1f}x"]
-        for n in streams
+        [n, middle(steps[str(n)], 2), f"{ratio(steps[str(n)], steps['10']):.1f}x"] for n in streams
     ]
     by_frames = []
     for frames in lengths:
@@ -111,8 +109,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     jobs = {"1": trials(1, 40 * lengths[0]), "2": trials(2, 40 * lengths[0])}
     walls = interleaved(jobs, 2 if quick else 3, time.perf_counter_ns)
     by_jobs = [
-        [n, round(statistics.median(t) / 1000), f"{ratio(walls['1'], t):.2f}x"]
-        for n, t in walls.items()
+        [n, round(middle(t) / 1000), f"{ratio(walls['1'], t):.2f}x"] for n, t in walls.items()
     ]
     save(
         "scaling",

@@ -8,7 +8,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ class PointResult:
     Attributes:
         point: the grid's keys and this point's values.
         trials: how many were asked for.
+        done: how many of them the measures are about.
         failed: how many of them failed.
         missing: how many were not computed yet.
         measures: mean and SD over the finished trials, by name.
@@ -35,15 +36,11 @@ class PointResult:
 
     point: Mapping[str, str]
     trials: int
+    done: int
     failed: int
     missing: int
     measures: Mapping[str, Summary]
     orders: Mapping[str, int]
-
-    @property
-    def done(self) -> int:
-        """How many trials the measures are about."""
-        return self.trials - self.failed - self.missing
 
 
 def results(folder: Path) -> list[PointResult]:
@@ -83,6 +80,7 @@ def _point(point: Mapping[str, str], rows: Sequence[Mapping[str, Any] | None]) -
     return PointResult(
         point=point,
         trials=len(rows),
+        done=len(found),
         failed=sum(row is not None and row["status"] == FAILED for row in rows),
         missing=sum(row is None for row in rows),
         measures=measures,
@@ -92,23 +90,7 @@ def _point(point: Mapping[str, str], rows: Sequence[Mapping[str, Any] | None]) -
 
 def as_json(points: Sequence[PointResult]) -> dict[str, Any]:
     """The results as one JSON document."""
-    return {
-        "schema": SCHEMA,
-        "points": [
-            {
-                "point": dict(p.point),
-                "trials": p.trials,
-                "done": p.done,
-                "failed": p.failed,
-                "missing": p.missing,
-                "measures": {
-                    name: {"mean": s.mean, "sd": s.sd, "n": s.n} for name, s in p.measures.items()
-                },
-                "orders": dict(p.orders),
-            }
-            for p in points
-        ],
-    }
+    return {"schema": SCHEMA, "points": [asdict(point) for point in points]}
 
 
 def measure_names(points: Sequence[PointResult]) -> list[str]:

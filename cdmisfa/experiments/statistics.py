@@ -126,17 +126,10 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
 
 
 def _log_likelihood(x: Float, hits: Float, total: Float, m: Float, k: Float) -> Float:
-    """Log likelihood plus half the log determinant of the information, for every m and k.
+    """Log likelihood plus half the log determinant of the information, (M, K).
 
-    Args:
-        x: (L,) levels.
-        hits: (L,) answers yes at each level.
-        total: (L,) answers at each level.
-        m: (M,) midpoints.
-        k: (K,) slopes.
-
-    Returns:
-        (M, K).
+    Of M midpoints and K slopes, for answers at L levels of x, `total` at each and `hits` of them
+    yes.
     """
     u = x - m[:, None, None]
     z = np.clip(k[:, None] * u, -700.0, 700.0)
@@ -147,17 +140,13 @@ def _log_likelihood(x: Float, hits: Float, total: Float, m: Float, k: Float) -> 
     return np.asarray(likelihood + 0.5 * np.log(np.maximum(determinant, 1e-300)))
 
 
-def direction_cosine(a: Float, b: Float) -> float:
-    """Absolute cosine between two directions: 1 is the same line."""
-    lengths = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return abs(float(a.ravel() @ b.ravel())) / lengths if lengths > 0 else 0.0
-
-
 def correlation(a: Float, b: Float) -> float:
     """Absolute Pearson correlation; 0 where one does not vary."""
     if a.max() == a.min() or b.max() == b.min():
         return 0.0
-    return direction_cosine(a - a.mean(), b - b.mean())
+    a, b = a - a.mean(), b - b.mean()
+    lengths = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return abs(float(a @ b)) / lengths if lengths > 0 else 0.0
 
 
 def stays_above(values: Sequence[float] | Float, threshold: float) -> int:

@@ -142,9 +142,9 @@ def sweep(
         write_json(folder / REQUEST, _request(grid or {}, trials))
         open_trials = [t for t in trials if store.is_open(t.id, t.log, retry=retry_failed)]
         outdated = _outdated(open_trials, store.rows.values())
-        finished = len(trials) - len(open_trials)
+        finished = skipped = len(trials) - len(open_trials)
         again = {trial.id for trial in open_trials}
-        failed = sum(_has_failed(store.rows[t.id]) for t in trials if t.id not in again)
+        failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in again)
         for index, result in run_all(
             run_trial, open_trials, jobs=jobs, engine=engine, scheduler=scheduler
         ):
@@ -152,16 +152,16 @@ def sweep(
             row = _row(trial, result)
             store.add(row)
             finished += 1
-            failed += _has_failed(row)
+            failed += row["status"] == FAILED
             if progress is not None:
                 progress(finished, failed, len(trials))
     rows = store.rows
     return SweepReport(
         folder=folder,
         trials=len(trials),
-        skipped=len(trials) - len(open_trials),
+        skipped=skipped,
         computed=sum(rows[t.id]["status"] == DONE for t in open_trials),
-        failed=tuple(rows[t.id] for t in trials if _has_failed(rows[t.id])),
+        failed=tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED),
         outdated=outdated,
     )
 
@@ -341,10 +341,6 @@ def _outdated(trials: Sequence[Trial], rows: Iterable[Mapping[str, Any]]) -> int
         if row["status"] == DONE and row.get("code") != code()
     }
     return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)
-
-
-def _has_failed(row: Mapping[str, Any]) -> bool:
-    return bool(row["status"] == FAILED)
 
 
 def _request(grid: Mapping[str, Sequence[Any]], trials: Sequence[Trial]) -> dict[str, Any]:

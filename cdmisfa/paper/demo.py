@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SeekableSource
 from cdmisfa.core.errors import NotReproducedError
@@ -20,6 +19,7 @@ from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.runs import RunResult, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source
 from cdmisfa.experiments.statistics import correlation
+from cdmisfa.features.projection import project
 
 SCENE = "icub"
 MODULES = 2
@@ -182,9 +182,11 @@ def _check(
 
 
 def _score(module: Module, source: SeekableSource) -> Learned:
-    """Find the true quantity that a module's first output follows best."""
-    y, truth = _outputs(module, source)
-    r = [correlation(y[:, 0], column) for column in truth.T]
+    """Find the true quantity that a module's first output on its own view follows best."""
+    source.seek(0)
+    block = source.take(module.stream, SCORED_FRAMES)
+    y = project(module.phi, module.phi @ module.mean, block.frames.reshape(len(block), -1))
+    r = [correlation(y[:, 0], column) for column in block.truth.T]
     best = int(np.argmax(r))
     return Learned(
         module.index,
@@ -194,15 +196,3 @@ def _score(module: Module, source: SeekableSource) -> Learned:
         source.spec.truth[best],
         r[best],
     )
-
-
-def _outputs(
-    module: Module, source: SeekableSource
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Outputs (n, J) of a module on its own view, and what was true then (n, D)."""
-    from cdmisfa.features.projection import project
-
-    source.seek(0)
-    block = source.take(module.stream, SCORED_FRAMES)
-    y = project(module.phi, module.phi @ module.mean, block.frames.reshape(len(block), -1))
-    return y, block.truth

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.statistics import correlation, stays_above, summary
+from cdmisfa.experiments.statistics import correlation, stays_above
+from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.features.sfa import batch_sfa, slowness
 from cdmisfa.paper import icub, oscillatory, panels
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Request, Settings, Trial
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, groups
+from replay.recordings.source import RecordedSource
 
 TITLE = "Learning difficulty"
 
@@ -52,20 +54,15 @@ TRAINING = 4000
 def plan(request: Request) -> list[dict[str, Any]]:
     """20 seeds of each stream; the iCub's views where there is a recording."""
     n = request.count(20, 12)
-    trials: list[dict[str, Any]] = [
-        {"scene": "oscillatory", "stream": stream, "recording": None, "identity": None, "seed": s}
+    scenes: list[tuple[str, str | None, Any]] = [("oscillatory", None, None)]
+    if (found := _recording(request)) is not None:
+        scenes.append(("icub", str(found), icub.identity(str(found))))
+    return [
+        {"scene": scene, "stream": stream, "recording": recording, "identity": who, "seed": seed}
+        for scene, recording, who in scenes
         for stream in range(3)
-        for s in range(n)
+        for seed in range(n)
     ]
-    recording = _recording(request)
-    if recording is not None:
-        who = icub.identity(str(recording))
-        trials += [
-            {"scene": "icub", "stream": v, "recording": str(recording), "identity": who, "seed": s}
-            for v in range(3)
-            for s in range(n)
-        ]
-    return trials
 
 
 def _recording(request: Request) -> Path | None:
@@ -76,7 +73,7 @@ def _recording(request: Request) -> Path | None:
     return made if (made / "finished.json").exists() and not request.quick else None
 
 
-def run(settings: Settings) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def run(settings: Settings) -> Ran:
     """Learn one stream alone and compare with batch SFA as it goes."""
     task = _task(settings["scene"], settings["stream"], settings["recording"])
     return compare(task, settings["seed"])
@@ -121,17 +118,13 @@ def _task(scene: str, stream: int, recording: str | None) -> Task:
 
 def _view(recording: str, stream: int, count: int) -> NDArray[Any]:
     """The first frames of a view, flat."""
-    from replay.recordings.source import RecordedSource
-
     with contextlib.closing(RecordedSource(recording)) as source:
         count = min(count, source.frames)
         return source.take(stream, count).frames.reshape(count, -1)
 
 
-def compare(task: Task, seed: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def compare(task: Task, seed: int) -> Ran:
     """Frames until IncSFA's slowest output stays in the direction of batch SFA's."""
-    from cdmisfa.features.incsfa.abstraction import IncSFA
-
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     sfa = IncSFA(task.config, task.frames.shape[1], rng)
     cosines = []
@@ -179,19 +172,16 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     medians: dict[tuple[str, int], float] = {}
     learnable: dict[tuple[str, int], bool] = {}
     names = {"oscillatory": "stream x{}", "icub": "iCub view {}"}
-    for scene, stream in dict.fromkeys((t.settings["scene"], t.settings["stream"]) for t in trials):
-        group = [
-            t for t in trials if (t.settings["scene"], t.settings["stream"]) == (scene, stream)
-        ]
+    for (scene, stream), group in groups(trials, "scene", "stream").items():
         name = names[scene].format(stream + 1)
         learnable[scene, stream] = all(t.row["learnable"] for t in group)
-        eta = summary([t.row["eta_held_out"] for t in group])
-        lines.append(Line(f"{name}: slowness of batch SFA on held-out frames", "-", eta, digits=4))
+        eta = [t.row["eta_held_out"] for t in group]
+        held_out = f"{name}: slowness of batch SFA on held-out frames"
+        lines.append(Line.measured(held_out, eta, digits=4))
         if learnable[scene, stream]:
             needed = [math.inf if (f := t.row["frames"]) is None else f for t in group]
             medians[scene, stream] = float(np.median(needed))
-            reached = summary(needed)
-            lines.append(Line(f"{name}: frames until learned", "-", reached, digits=0))
+            lines.append(Line.measured(f"{name}: frames until learned", needed, digits=0))
     order = [medians.get(("oscillatory", s), math.inf) for s in range(3)]
     claims = [
         Claim(
@@ -202,20 +192,18 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     ]
     if any(scene == "icub" for scene, _ in learnable):
         one, three = medians.get(("icub", 0), math.inf), medians.get(("icub", 2), math.inf)
-        claims.append(
+        claims += [
             Claim(
                 "view 1 is easier than view 3",
                 one < three,
                 f"{one:.0f} and {three:.0f} frames (medians)",
-            )
-        )
-        claims.append(
+            ),
             Claim(
                 "view 2 is not learnable",
                 not learnable["icub", 1],
                 f"slowness below {LEARNABLE * WHITE_NOISE:.3f} on held-out frames would be",
-            )
-        )
+            ),
+        ]
     notes = [
         f"White noise has slowness {WHITE_NOISE:.4f}. Only learnable streams have frames; a trial "
         "that does not stay above a direction cosine of .95 is not in n, and never in the median."
@@ -228,19 +216,11 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     scenes = list(dict.fromkeys(t.settings["scene"] for t in trials))
     drawn, axes = panels.figure(1, len(scenes))
     for panel, scene, letter in zip(axes[0], scenes, "ab", strict=False):
-        for stream in range(3):
-            curves = [
-                t.arrays["cosine"]
-                for t in trials
-                if (t.settings["scene"], t.settings["stream"]) == (scene, stream)
-            ]
-            if not curves:
-                continue
-            mean, sd = panels.mean_sd(panels.stack(curves))
-            at = (np.arange(len(mean)) + 1) * STEP
-            colour = panels.COLOURS[stream]
-            low, high = np.maximum(mean - sd, 0), np.minimum(mean + sd, 1)
-            panel.fill_between(at, low, high, color=colour, alpha=0.2, linewidth=0)
+        alone = [trial for trial in trials if trial.settings["scene"] == scene]
+        for (stream,), group in groups(alone, "stream").items():
+            mean, sd = panels.mean_sd(panels.stack([t.arrays["cosine"] for t in group]))
+            at, colour = (np.arange(len(mean)) + 1) * STEP, panels.COLOURS[stream]
+            panels.band(panel, mean, sd, stream, x=at, within=(0, 1))
             panel.plot(at, mean, color=colour, linewidth=1, label=panels.STREAM_NAMES[stream])
         panel.axhline(THRESHOLD, color="grey", linestyle=":", linewidth=0.8)
         panel.set_xscale("log")
