@@ -101,6 +101,22 @@ def test_every_room_has_forbidden_imports_that_the_rules_catch(tmp_path: Path) -
     assert [lines[0] for lines in caught if not any(line in done.stdout for line in lines)] == []
 
 
+def test_rooms_and_files_stay_small() -> None:
+    crowded = {
+        str(init.parent.relative_to(ROOT)): n
+        for package in PACKAGES
+        for init in inits(package)
+        if (n := sum(f.name != "__init__.py" for f in init.parent.glob("*.py"))) > 12
+    }
+    long = {
+        str(file.relative_to(ROOT)): n
+        for package in PACKAGES
+        for file in (ROOT / package).rglob("*.py")
+        if (n := len(file.read_text("utf-8").splitlines())) > 400
+    }
+    assert (crowded, long) == ({}, {})
+
+
 def test_a_package_hands_on_names_that_exist() -> None:
     code = (
         "import importlib, sys\n"
