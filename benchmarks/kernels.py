@@ -304,12 +304,9 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/kernels.json."""
     rounds = 3 if quick else 7
     with threadpool_limits(1):
-        _measure(rounds, measure_errors(100_000 if full else 4_000 if quick else 10_000))
-
-
-def _measure(rounds: int, errors: list[list[Any]]) -> None:
-    limits = {name: round(x, 1) for name, x in machine_limits(rounds).items()}
-    cases = [*measure_vectors(rounds), *measure_images(rounds)]
+        errors = measure_errors(100_000 if full else 4_000 if quick else 10_000)
+        limits = {name: round(x, 1) for name, x in machine_limits(rounds).items()}
+        cases = [*measure_vectors(rounds), *measure_images(rounds)]
     others = ("plain numba", "strict", "plain numpy", "IncrementalPCA")
     rows = [
         [c["inputs"], c["K"], c["J"], c["tau"], c["ours"], c["us_per_frame"][c["ours"]]]

@@ -27,14 +27,11 @@ def interleaved(
     rounds: int,
     clock: Callable[[], int] = time.thread_time_ns,
 ) -> dict[str, list[float]]:
-    """CPU microseconds per unit of work, one list entry a round.
+    """CPU microseconds per unit of work, one list entry a round, after one round to warm up.
 
-    The candidates take turns, so that a slow spell of the machine hits all of them.
-
-    Args:
-        work: name -> a call that does some units of work and returns how many.
-        rounds: how often each has its turn, after one turn to warm up.
-        clock: nanoseconds, of the calling thread; or of the process or the wall.
+    The candidates take turns, so that a slow spell of the machine hits all of them. Each is a call
+    that does some units of work and returns how many. The clock tells nanoseconds, of the calling
+    thread; or of the process or the wall.
     """
     times: dict[str, list[float]] = {name: [] for name in work}
     for turn in range(rounds + 1):
@@ -78,14 +75,10 @@ def save(
     tables: Sequence[tuple[Sequence[str], Sequence[Sequence[Any]]]],
     **data: Any,
 ) -> None:
-    """Write results/NAME.json, and print its tables.
+    """Write results/NAME.json, with further values in `data`, and print it.
 
-    Args:
-        name: of the benchmark.
-        title: its heading on the page.
-        note: what was measured, and how.
-        tables: (header, rows) of each.
-        data: further values for the file.
+    The title is its heading on the page, the note says what was measured; a table is its header
+    and its rows.
     """
     RESULTS.mkdir(exist_ok=True)
     document = {

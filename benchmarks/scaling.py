@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import contextlib
 import resource
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,20 +63,11 @@ def learn_frames(frames: int) -> tuple[float, float]:
     return cost, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _send_learned(frames: int, pipe: Any) -> None:
-    learn_frames(1000)
-    pipe.send(learn_frames(frames))
-
-
 def apart(frames: int) -> tuple[float, float]:
     """`learn_frames` in a process of its own, so that the peak is this one's."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_send_learned, args=(frames, theirs))
-    process.start()
-    result: tuple[float, float] = ours.recv()
-    process.join()
-    return result
+    with contextlib.closing(Workers(1)) as worker:
+        worker.submit(learn_frames, 1000).result()  # compiles
+        return worker.submit(learn_frames, frames).result()
 
 
 def trials(jobs: int, frames: int) -> Callable[[], int]:

@@ -110,7 +110,9 @@ def run(args: Sequence[str]) -> int:
             remedy = str(error.__cause__ or error)  # click puts an Abort around an interrupt
             return _fail(f"interrupted{': ' if remedy else ''}{remedy}", stop.exit_code)
         except BrokenPipeError:
-            _drop_stdout()
+            # keeps the interpreter from flushing into the closed pipe when it ends
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
         except SystemExit as end:
             return end.code if isinstance(end.code, int) else 1
@@ -148,12 +150,5 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    line = " ".join(message.split())
-    click.echo(f"cdmisfa: {line}", err=True)
+    click.echo(f"cdmisfa: {' '.join(message.split())}", err=True)
     return code
-
-
-def _drop_stdout() -> None:
-    """Keep the interpreter from flushing into the closed pipe when it ends."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

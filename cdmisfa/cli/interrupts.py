@@ -10,9 +10,6 @@ from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-EXIT_BASE = 128
-"""Exit code of a process ended by signal N is this plus N: 130 for Ctrl-C, 143 for SIGTERM."""
-
 
 class Stop:
     """Whether a signal has come; callable, as a loop's `stop`."""
@@ -26,8 +23,8 @@ class Stop:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a command that was stopped."""
-        return EXIT_BASE + (self.number or signal.SIGINT)
+        """Exit code of a command that was stopped: 130 for Ctrl-C, 143 for SIGTERM."""
+        return 128 + (self.number or signal.SIGINT)
 
 
 @contextmanager

@@ -22,12 +22,7 @@ class Bar:
 
 @contextmanager
 def bar(title: str, unit: str) -> Iterator[Bar]:
-    """Show progress while the body runs, if anyone is looking.
-
-    Args:
-        title: what is being done.
-        unit: of what `Bar.update` counts.
-    """
+    """Show progress while the body runs, if anyone is looking; the unit is what is counted."""
     if not sys.stderr.isatty():
         yield Bar()
         return

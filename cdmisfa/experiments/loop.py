@@ -71,13 +71,7 @@ def learn(
 
 
 def ending(learner: Learner, max_modules: int, max_iterations: int | None) -> str:
-    """The key of `ENDINGS` for which a learner is to stop now, or "" where it is to learn on.
-
-    Args:
-        learner: between two iterations.
-        max_modules: end after so many modules.
-        max_iterations: end after so many iterations; None never.
-    """
+    """The key of `ENDINGS` for which a learner is to stop now, or "" where it is to learn on."""
     if len(learner.modules) >= max_modules:
         return "max_modules"
     if max_iterations is not None and learner.iteration >= max_iterations:

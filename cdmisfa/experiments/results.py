@@ -19,6 +19,9 @@ from cdmisfa.experiments.sweep import REQUEST
 
 SCHEMA = 1
 
+NOTHING = summary([])
+"""A measure that a point does not have."""
+
 
 @dataclass(frozen=True, slots=True)
 class PointResult:
@@ -26,11 +29,8 @@ class PointResult:
 
     Attributes:
         point: the grid's keys and this point's values.
-        trials: how many were asked for.
-        done: how many of them the measures are about.
-        failed: how many of them failed.
-        missing: how many were not computed yet.
-        measures: mean and SD over the finished trials, by name.
+        trials: how many were asked for, of which some are done, failed, or missing yet.
+        measures: mean and SD over those that are done, by name.
         orders: how often which streams were learned in which order, the most frequent first.
     """
 
@@ -50,7 +50,6 @@ def results(folder: Path) -> list[PointResult]:
         UsageError: the folder holds no sweep.
         LogDamagedError: its files are damaged.
     """
-    folder = Path(folder)
     path = folder / REQUEST
     try:
         request = json.loads(path.read_text("utf-8"))
@@ -109,9 +108,8 @@ def as_csv(points: Sequence[PointResult]) -> str:
     for p in points:
         cells: list[Any] = [*p.point.values(), p.trials, p.done, p.failed]
         for name in names:
-            found = p.measures.get(name)
-            for value in (found.mean, found.sd) if found else (math.nan, math.nan):
-                cells.append("" if math.isnan(value) else repr(value))
+            found = p.measures.get(name, NOTHING)
+            cells += ["" if math.isnan(v) else repr(v) for v in (found.mean, found.sd)]
         order, count = next(iter(p.orders.items()), ("", 0))
         writer.writerow([*cells, order, count])
     return text.getvalue()
@@ -126,7 +124,7 @@ def as_table(points: Sequence[PointResult]) -> tuple[list[str], list[list[str]]]
     for p in points:
         order, count = next(iter(p.orders.items()), ("", 0))
         shown = f"{order} ({count}/{p.done})" if order else ""
-        cells = [_cell(p.measures.get(name)) for name in names]
+        cells = [_cell(p.measures.get(name, NOTHING)) for name in names]
         rows.append([*p.point.values(), f"{p.done}/{p.trials}", str(p.failed), *cells, shown])
     return head, rows
 
@@ -146,8 +144,8 @@ def as_latex(points: Sequence[PointResult]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cell(found: Summary | None) -> str:
-    if found is None or not found.n:
+def _cell(found: Summary) -> str:
+    if not found.n:
         return ""
     return f"{found.mean:.4g}" if math.isnan(found.sd) else f"{found.mean:.4g} ± {found.sd:.2g}"
 

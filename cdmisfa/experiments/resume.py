@@ -65,10 +65,7 @@ _INTEGERS = ("index", "stream", "iteration")
 def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
     """The command that begins a run, as JSON values; paths are kept relative to its folder.
 
-    Args:
-        source: as on the command line.
-        options: of the command; of them those in `OPTIONS` are kept.
-        run: the folder.
+    Of the options of the command those in `OPTIONS` are kept.
     """
     kept = {name: options[name] for name in OPTIONS if name in options}
     preset = kept.get("preset")
@@ -102,13 +99,9 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """Where a run stood after some iteration.
+    """Where a run stood after some iterations: the source's next frame, the learner's state.
 
-    Attributes:
-        iteration: iterations done.
-        t: the source's next frame.
-        state: of the learner.
-        versions: of the packages that computed it.
+    The versions are those of the packages that computed it.
     """
 
     iteration: int
@@ -189,11 +182,9 @@ def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
 
 
 def newest_covered(run: Path, iterations: int) -> Checkpoint | None:
-    """The newest readable checkpoint whose past the log holds; None starts from the beginning.
+    """The newest readable checkpoint whose past a log of so many iterations holds.
 
-    Args:
-        run: the run's folder.
-        iterations: how many iterations its log holds.
+    None starts from the beginning.
     """
     for path in checkpoints(run):
         with contextlib.suppress(LogDamagedError):
@@ -209,9 +200,7 @@ class Checkpoints(Sink):
     It comes after the run's log, which must hold every iteration before a checkpoint.
 
     Args:
-        run: the folder.
-        source: of the run.
-        learner: of the run.
+        run, source, learner: the run's folder, and what it learns from and with.
         every: iterations between two; 0 saves one at the end only.
         flush: lets the disk have all of the log.
     """
@@ -241,11 +230,7 @@ class Checkpoints(Sink):
 
 
 def restore(learner: Learner, checkpoint: Checkpoint) -> None:
-    """Put a learner where the checkpoint stands.
-
-    Raises:
-        LogDamagedError: the checkpoint is not one of this configuration.
-    """
+    """Put a learner where a checkpoint of this configuration stands."""
     try:
         learner.restore(checkpoint.state)
     except (KeyError, TypeError, ValueError) as error:
@@ -255,11 +240,7 @@ def restore(learner: Learner, checkpoint: Checkpoint) -> None:
 
 
 def log_to_resume(run: Path) -> Path:
-    """The log of a run that was stopped, wherever it is.
-
-    Raises:
-        UsageError: there is no run.
-    """
+    """The log of a run that was stopped, wherever it is."""
     from replay.runs.folders import RUN_FILE
 
     finished = run / RUN_FILE
@@ -297,11 +278,7 @@ def _has_header(log: Path) -> bool:
 
 
 def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
-    """Refuse to resume with another configuration, seed or source, naming the first difference.
-
-    Raises:
-        UsageError: something differs.
-    """
+    """Refuse to resume with another configuration, seed or source, naming the first difference."""
     from replay.runs.log import read_header
 
     header = read_header(log)

@@ -48,11 +48,6 @@ class RunResult:
     Attributes:
         run: its folder, if it has one.
         source: what it learned from, described.
-        streams: their names.
-        seed: of the learner.
-        iterations: in all.
-        frames: in all.
-        signals_sha256: hash of all signals.
         modules: what was learned, in order.
         summary: what else the learner says of itself.
         ended: why, a key of `ENDINGS`.
@@ -141,7 +136,7 @@ def run(
         checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
         live: also show the run in Rerun while it learns, to viewers on this machine.
         announce: called with the address of the live view.
-        command: how the run is begun, kept with it; see `manifest.command_of`.
+        command: how the run is begun, kept with it; see `resume.command_of`.
 
     Raises:
         UsageError: `folder` exists and `force` is not set; or `resume` is, and `folder` holds no

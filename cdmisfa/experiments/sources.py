@@ -78,8 +78,7 @@ def configure(
         seed: becomes `scene.seed` where that is not set.
 
     Raises:
-        UsageError: an unknown scene, preset, learner, section or key, or a value that does not
-            fit.
+        UsageError: an unknown scene, preset, learner, section or key, or a value that misfits.
     """
     words = parse_settings(settings)
     algorithm = words.get("learner", {}).get("algorithm")
@@ -89,19 +88,17 @@ def configure(
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
 
-    def layers(section: str) -> tuple[Mapping[str, Any], ...]:
-        return tables.get(section, {}), words.get(section, {})
-
-    for_kind = tables.get("scene", {}).get("kind", kind)
-    if for_kind != kind:
+    layers = {name: (tables.get(name, {}), words.get(name, {})) for name in SECTIONS}
+    of_preset, of_words = layers["scene"]
+    if of_preset.get("kind", kind) != kind:
         raise UsageError(
-            f"the preset {preset} is for the scene {for_kind}, this is {kind}: choose another "
-            "preset, or leave it out"
+            f"the preset {preset} is for the scene {of_preset['kind']}, this is {kind}: choose "
+            "another preset, or leave it out"
         )
-    if words.get("scene", {}).get("kind", kind) != kind:
+    if of_words.get("kind", kind) != kind:
         raise UsageError(f"scene.kind cannot be set: the source says that it is {kind}")
-    known = {name: {f.name: f for f in fields(entry.config)} for name, entry in SCENES.items()}
-    for key in (*tables.get("scene", {}), *words.get("scene", {})):
+    known = {name: [f.name for f in fields(entry.config)] for name, entry in SCENES.items()}
+    for key in (*of_preset, *of_words):
         name = key.partition(".")[0]
         if name not in known[kind] and any(name in others for others in known.values()):
             raise UsageError(
@@ -110,11 +107,11 @@ def configure(
             )
     if algorithm is None:
         algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
-    scene = build(SCENES[kind].config, "scene", *layers("scene"), {"kind": kind})
+    scene = build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind})
     return Configuration(
-        learner=build(LEARNERS[algorithm].configuration, "learner", *layers("learner")),
+        learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"]),
         scene=scene if scene.seed is not None else replace(scene, seed=seed),
-        record=build(RecordConfig, "record", *layers("record")),
+        record=build(RecordConfig, "record", *layers["record"]),
     )
 
 
@@ -195,7 +192,7 @@ def open_source(
             raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
         source = FollowedSource(paths[0], timeout=follow)
     else:
-        source = open_log(paths, loop=loop, salvage=salvage, cameras=cameras)
+        source = _open_log(paths, cameras, loop=loop, salvage=salvage)
     try:
         kind = preset_for(source.spec, source.describe(), preset)
         return source, configure(kind, preset, settings, seed)
@@ -204,38 +201,22 @@ def open_source(
         raise
 
 
-def open_log(
-    paths: Sequence[Location],
-    *,
-    loop: bool = False,
-    salvage: bool = False,
-    cameras: CameraOptions | None = None,
+def _open_log(
+    paths: Sequence[Location], cameras: CameraOptions, *, loop: bool, salvage: bool
 ) -> SeekableSource:
-    """Open a recording of ours, or what else holds images.
-
-    Args:
-        paths: of one recording, or of the logs of others.
-        loop: start again at the end.
-        salvage: pass over damaged parts.
-        cameras: how images of others become frames; given, the paths are taken as such logs.
-
-    Raises:
-        UsageError: no such log, or streams that need to be aligned.
-        LogDamagedError: it is damaged.
-    """
+    """Open a recording of ours, or what else holds images."""
     from replay.camera_logs.opening import only_foreign
     from replay.recordings.source import RecordedSource
     from replay.recordings.view_file import NoRecordingError
 
-    cameras = cameras or CameraOptions()
     if cameras == CameraOptions():
         for path in paths:
             _refuse_what_is_no_log(path)
-    if cameras == CameraOptions() and not any(map(only_foreign, paths)):
-        with contextlib.suppress(NoRecordingError):
-            return RecordedSource(paths, loop=loop, salvage=salvage)
-        for path in paths:
-            _refuse_remote_run(path)
+        if not any(map(only_foreign, paths)):
+            with contextlib.suppress(NoRecordingError):
+                return RecordedSource(paths, loop=loop, salvage=salvage)
+            for path in paths:
+                _refuse_remote_run(path)
     return open_cameras(paths, cameras, loop=loop, salvage=salvage)
 
 
@@ -287,12 +268,7 @@ def open_cameras(
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> ForeignSource:
-    """Open the camera logs of others as streams on one clock; see `ForeignSource`.
-
-    Raises:
-        UsageError: no such log, or streams that need to be aligned.
-        LogDamagedError: it is damaged.
-    """
+    """Open the camera logs of others as streams on one clock; see `ForeignSource`."""
     from replay.camera_logs.source import ForeignSource
 
     return ForeignSource(

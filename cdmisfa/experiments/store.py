@@ -65,12 +65,9 @@ class TrialStore:
             self._opened = opened.pop_all()
 
     def is_open(self, trial: str, kept: Path | None = None, *, retry: bool = False) -> bool:
-        """Whether a trial is to be computed.
+        """Whether a trial is to be computed; with `retry` also one that has failed.
 
-        Args:
-            trial: its identity.
-            kept: what there is of it beside its row, which may have been removed.
-            retry: it is where it has failed.
+        It is, too, where what is `kept` of it beside its row has been removed.
         """
         row = self.rows.get(trial)
         if row is None or (retry and row["status"] == FAILED):

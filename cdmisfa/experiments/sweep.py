@@ -37,14 +37,11 @@ class Trial:
     """One run of a sweep, and everything a worker needs to compute it.
 
     Attributes:
-        id: hash of configuration, seed, source and code.
+        id: hash of all it depends on.
         source: a scene's name, or the paths of a recording.
         configuration: preset, settings, the grid's point and the seed, all together.
         point: the grid's keys with this trial's values.
         seed: of the learner, and of a live scene.
-        loop: start a recording again at its end.
-        max_iterations: end after so many.
-        max_modules: end after so many.
         log: folder in which to keep its log, or None.
         code: version of the code that the hash is about; workers must have the same.
     """
@@ -66,7 +63,6 @@ class SweepReport:
     """What a sweep came to.
 
     Attributes:
-        folder: of the sweep.
         trials: how many were asked for.
         skipped: how many of them were finished before.
         computed: how many finished now.
@@ -102,23 +98,12 @@ def sweep(
 ) -> SweepReport:
     """Run every trial of a grid that is not finished yet.
 
-    Args:
-        source: a scene's name or a recording's paths, as for `learn`.
-        folder: where the rows are; made where it does not exist.
-        grid: values to try, by configuration key; every combination is a point.
-        seeds: every point is tried with each of them.
-        preset: instead of the source's own.
-        settings: `section.key=value` words for all trials.
-        loop: start a recording again at its end.
-        max_iterations: end each trial after so many.
-        max_modules: end each trial after so many.
-        jobs: local processes.
-        engine: where to compute, see `engines.ENGINES`.
-        scheduler: address of a dask scheduler.
-        keep_logs: keep each trial's run folder in folder/trials; with workers on other
-            machines it must be a shared one.
-        retry_failed: compute trials again that failed before.
-        progress: called with the trials finished, failed, and asked for.
+    Source, preset, settings and loop are those of `open_source`; jobs, engine and scheduler those
+    of `run_all`; each trial ends after max_iterations or max_modules. The grid has values to try
+    by configuration key: every combination is a point, tried with each of the seeds. With
+    `keep_logs` each trial's run is kept in folder/trials, which workers on other machines must
+    share; with `retry_failed` trials that failed before are computed again. `progress` is called
+    with the trials finished, failed, and asked for.
 
     Raises:
         UsageError: a wrong key, value, source or engine, found before any trial starts.
@@ -199,8 +184,10 @@ def plan(
         seeded = _seeded(kind, preset, chosen)
         for seed in each:
             configuration = seeded(seed)
-            learned = _configuration(configuration, recorded)
-            name = identity(learned, seed, recorded, limits, code())
+            depends = [as_table(configuration.learner)]
+            if recorded is None:  # the world's part counts only where it is live
+                depends.append(configuration.tables())
+            name = identity(depends, seed, recorded, limits, code())
             trial = Trial(
                 id=name,
                 source=paths,
@@ -243,20 +230,10 @@ def _is_live(words: Sequence[str | Path]) -> bool:
     return len(words) == 1 and words[0] in SCENES
 
 
-def _configuration(configuration: Configuration, recorded: Any) -> Any:
-    """What of a configuration a trial depends on: the world's part only where it is live."""
-    learner = as_table(configuration.learner)
-    return [learner] if recorded is not None else [learner, configuration.tables()]
-
-
 def run_trial(trial: Trial) -> dict[str, Any]:
-    """Compute one trial.
+    """Compute one trial: its result, or under "error" why there is none.
 
-    Oscillatory trials without a log run in compiled code as a whole; all others run as
-    `learn` does.
-
-    Returns:
-        The result, or under "error" why there is none.
+    Oscillatory trials without a log run in compiled code as a whole; all others as `learn` does.
     """
     if trial.code != code():
         return {"error": f"the worker has cdmisfa {code()}, not {trial.code}: install the same"}
@@ -302,7 +279,6 @@ def _logged_trial(trial: Trial) -> dict[str, Any]:
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:
-            trial.log.parent.mkdir(parents=True, exist_ok=True)
             log = opened.enter_context(whole(trial.log))
         result = run(
             source,

@@ -34,26 +34,6 @@ CHUNK = 512
 """Iterations between two returns to Python."""
 
 
-class Curves(Mapping[str, NDArray[Any]]):
-    """What a trial's iterations came to, an array a signal with iterations first.
-
-    The fields of `OUTCOME` (N,), eta_dot (N, J), R (N, S) of the stay entries, Q (N, S, 2) and
-    policy (N, S), named as in `BlockSignals` and equal to it.
-    """
-
-    def __init__(self, parts: Sequence[Mapping[str, NDArray[Any]]]) -> None:
-        self._arrays = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._arrays[name]
-
-    def __iter__(self) -> Any:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)
-
-
 @dataclass(frozen=True, slots=True)
 class Swap:
     """An abrupt change of the world: another signal on a stream from the next block on.
@@ -81,7 +61,9 @@ class TrialResult:
         epsilon: its probability of a random action.
         ended: "max_modules", "max_iterations" or "nothing_left".
         swapped: iteration from which on the swapped signal was shown; -1 never.
-        curves: every iteration, where asked for.
+        curves: where asked for, what every iteration came to, an array a signal, named as in
+            `BlockSignals` and equal to it: the fields of `OUTCOME` (N,), eta_dot (N, J), R (N, S)
+            of the stay entries, Q (N, S, 2) and policy (N, S).
     """
 
     modules: tuple[Module, ...]
@@ -91,7 +73,7 @@ class TrialResult:
     epsilon: float
     ended: str
     swapped: int
-    curves: Curves | None
+    curves: Mapping[str, NDArray[Any]] | None
 
 
 _iterate = compiled(iterate)
@@ -255,7 +237,7 @@ def run_trial(
         epsilon=learner.epsilon,
         ended=ended,
         swapped=swapped,
-        curves=Curves(parts) if curves else None,
+        curves={n: np.concatenate([p[n] for p in parts]) for n in parts[0]} if curves else None,
     )
 
 

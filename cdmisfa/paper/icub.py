@@ -103,9 +103,8 @@ def run(settings: Settings) -> Ran:
 class Curves(Sink):
     """Keeps what the figures show: some signals, and each module's last outputs.
 
-    Attributes:
-        arrays: by name; of module i its outputs yi, and of its object the truthi.
-        encoded: of each module the correlation with its object.
+    The arrays have of module i its outputs yi, and of its object the truthi; `encoded` is the
+    correlation of the two.
     """
 
     def __init__(self, tau: int, truth: Sequence[str]) -> None:

@@ -39,20 +39,16 @@ NOISE = 0.02
 OLD, NEW = "101", "011"
 
 COLUMNS: Mapping[str, Mapping[float, float]] = {"sigma": SIGMAS, "nu": NUS, "tau": TAUS}
+QUICK_COLUMNS = {"sigma": {sigma: SIGMAS[sigma] for sigma in (0.008, 0.0009, 0.0)}}
 
 
 def plan(request: Request) -> list[dict[str, Any]]:
     """Table 1, then table 2: 14 values of epsilon^c, 10 trials each, for every value of a key."""
     n = request.count(10, 3)
-    tables: list[tuple[str, Sequence[float]]] = [("sigma", tuple(SIGMAS))]
-    if request.quick:
-        tables = [("sigma", (0.008, 0.0009, 0.0))]
-    else:
-        tables += [("nu", tuple(NUS)), ("tau", tuple(TAUS))]
     changes = QUICK_CHANGES if request.quick else CHANGES
     return [
         {"key": key, "value": value, "epsilon_c": epsilon, "seed": seed}
-        for key, values in tables
+        for key, values in (QUICK_COLUMNS if request.quick else COLUMNS).items()
         for value in values
         for epsilon in changes
         for seed in range(n)
@@ -188,12 +184,12 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
         epsilons = [epsilon for (epsilon,) in sorted(by_change)]
         policies = [[[*map(int, t.row["policy"])] for t in by_change[e,]] for e in epsilons]
         mean = np.array([np.mean(policy, axis=0) for policy in policies])
-        for s in range(mean.shape[1]):
+        for s, (marker, size) in enumerate(panels.MARKERS):
             panel.plot(
                 epsilons,
                 mean[:, s],
-                marker=panels.MARKERS[s][0],
-                markersize=panels.MARKERS[s][1],
+                marker=marker,
+                markersize=size,
                 linewidth=1,
                 linestyle=panels.DASHES[s],
                 color=panels.COLOURS[s],

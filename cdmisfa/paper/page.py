@@ -12,14 +12,9 @@ from cdmisfa.paper.reproduce import NAMES, markdown_table
 
 
 def write_page(root: Path, page: Path) -> None:
-    """Write a Markdown page of every experiment below a folder, with its figures beside it.
+    """Write a Markdown page of every experiment below a folder.
 
-    Args:
-        root: folder of the results, one folder an experiment.
-        page: file to write; the figures go into a folder of the page's name next to it.
-
-    Raises:
-        UsageError: there are no results.
+    Its figures go into a folder of the page's name next to it.
     """
     documents = [
         read_results(root / name) for name in NAMES if (root / name / "results.json").exists()
@@ -57,11 +52,7 @@ def write_page(root: Path, page: Path) -> None:
 
 
 def read_results(folder: Path) -> dict[str, Any]:
-    """The results.json of an experiment.
-
-    Raises:
-        UsageError: there is none, or it is not one.
-    """
+    """The results.json of an experiment."""
     path = folder / "results.json"
     try:
         document = json.loads(path.read_text(encoding="utf-8"))

@@ -47,11 +47,9 @@ class Request:
     """What is asked of an experiment.
 
     Attributes:
-        trials: trials per condition; None is the paper's number.
-        quick: few trials, enough to test the claim.
+        trials: trials per condition; None is the paper's number, or where `quick` a few.
         recording: folder of a recording, for the experiments that see.
         folder: where the experiment's files go.
-        jobs: parallel processes.
         force: results of more or other trials may be replaced.
     """
 
@@ -69,13 +67,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A finished trial.
-
-    Attributes:
-        settings: what it was told.
-        row: what it came to, in plain values.
-        arrays: curves and the like, for the figures.
-    """
+    """A finished trial: what it was told, what it came to in plain values, and its curves."""
 
     settings: Settings
     row: Mapping[str, Any]
@@ -84,12 +76,9 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of an experiment's table.
+    """One line of an experiment's table: the paper's value, or "-", and ours over trials.
 
     Attributes:
-        quantity: what was measured.
-        paper: the paper's value, as text; "-" where it has none.
-        ours: mean over trials, standard deviation and number of trials.
         interval: 95 % confidence interval, where one was computed.
         digits: decimals to print.
     """
@@ -191,15 +180,8 @@ class Experiment(Protocol):
         """Figures, as PNG and SVG each."""
 
 
-Progress = Callable[[int, int], None]
-
-
 def experiment(name: str) -> Experiment:
-    """The module of an experiment.
-
-    Raises:
-        UsageError: there is none of this name.
-    """
+    """The module of an experiment."""
     if name not in NAMES:
         raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*NAMES, 'all'))}")
     return cast(Experiment, importlib.import_module(f"cdmisfa.paper.{name}"))
@@ -211,19 +193,11 @@ def reproduce(
     *,
     engine: str = "local",
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Run an experiment's missing trials, and write what all of them came to.
+    """Run an experiment's missing trials, and write what all of them came to: results.json.
 
-    Args:
-        name: one of `NAMES`.
-        request: what is asked; its folder is made.
-        engine: where trials run, one of `engines.ENGINES`.
-        scheduler: its address.
-        progress: told finished and all trials.
-
-    Returns:
-        The document of results.json.
+    Engine and scheduler are those of `run_all`; `progress` is told finished and all trials.
 
     Raises:
         UsageError: no such experiment or engine, or the folder holds results of trials that
@@ -236,7 +210,6 @@ def reproduce(
         _keep_results(request.folder, planned)
     version = code()
     names = [identity(name, settings, version) for settings in planned]
-    (request.folder / "trials").mkdir(parents=True, exist_ok=True)
     curves = [request.folder / "trials" / f"{n}.npz" for n in names]
     with contextlib.closing(TrialStore(request.folder)) as store:
         missing = [i for i, n in enumerate(names) if store.is_open(n, curves[i])]
@@ -294,11 +267,7 @@ def run_one(task: tuple[str, Settings]) -> Ran:
 
 
 def check(document: Mapping[str, Any]) -> None:
-    """Complain when a claim of the paper did not come out.
-
-    Raises:
-        NotReproducedError: naming the claims.
-    """
+    """Complain, naming them, when claims of the paper did not come out."""
     failed = [c for c in document["claims"] if not c["holds"]]
     if failed:
         words = "; ".join(f"{c['claim']} ({c['detail']})" for c in failed)
@@ -306,11 +275,7 @@ def check(document: Mapping[str, Any]) -> None:
 
 
 def read_arrays(path: Path) -> Arrays:
-    """What was kept of a trial for the figures.
-
-    Raises:
-        UsageError: the file is damaged.
-    """
+    """What was kept of a trial for the figures."""
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             return dict(stored)
@@ -319,11 +284,7 @@ def read_arrays(path: Path) -> Arrays:
 
 
 def _keep_results(folder: Path, planned: Sequence[Settings]) -> None:
-    """Refuse to replace results that hold trials which are not planned now.
-
-    Raises:
-        UsageError: they do, or cannot be read.
-    """
+    """Refuse to replace results that hold trials which are not planned now."""
     path = folder / "rows.parquet"
     if not path.is_file():
         return

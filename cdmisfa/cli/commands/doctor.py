@@ -7,7 +7,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from typing import Any
 
@@ -49,10 +49,7 @@ def doctor_command(ctx: click.Context, as_json: bool) -> None:
     checks = [check for look in LOOKS for check in look()]
     ok = all(check.ok or check.needed_for for check in checks)
     if as_json:
-        rows = [
-            {"what": c.what, "ok": c.ok, "detail": c.detail, "needed_for": c.needed_for}
-            for c in checks
-        ]
+        rows = [asdict(check) for check in checks]
         options.print_json({"schema": options.SCHEMA, "ok": ok, "checks": rows})
     else:
         words = [(("missing", "ok")[c.ok], c.what, c.detail, c.needed_for) for c in checks]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.runs import RunResult
-    from replay.camera_logs.source import Align
 
 TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
@@ -63,6 +62,7 @@ TICK = 0.1
 @click.pass_context
 def learn_command(
     ctx: click.Context,
+    /,
     source: tuple[str, ...],
     out: Path | None,
     seed: int,
@@ -78,12 +78,9 @@ def learn_command(
     no_rerun: bool,
     follow: bool,
     follow_timeout: float,
-    topics: tuple[str, ...],
-    size: tuple[int, int] | None,
-    align: Align | None,
-    rate: float | None,
     force: bool,
     as_json: bool,
+    **cameras: Any,
 ) -> None:
     """Learn slow feature modules from a scene or a recording.
 
@@ -113,7 +110,7 @@ def learn_command(
         seed=seed,
         loop=loop,
         salvage=salvage,
-        cameras=CameraOptions(topics, size, align, rate),
+        cameras=CameraOptions(**cameras),
         follow=follow_timeout if follow else None,
     )
     say_about(frames)
@@ -180,8 +177,7 @@ def announce(address: str) -> None:
 class Reporter(Sink):
     """Shows a run's progress: every module once, the rest a few times a second.
 
-    Attributes:
-        told: whether anything was learned.
+    It was `told` something where anything was learned.
     """
 
     def __init__(self, shown: Bar, max_iterations: int | None) -> None:
