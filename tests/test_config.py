@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -78,14 +79,39 @@ def test_a_key_like_no_other_lists_them_all() -> None:
         ("tau", True, "a whole number"),
         pytest.param("tau", 10**30, "a whole number", id="tau-huge"),
         ("tau", None, "a whole number"),
-        ("algorithm", "3.0", "choose one of 2.0, 1.0"),
-        ("expansion", "cubic", "choose one of none, quadratic"),
+        ("algorithm", 3, "a text"),
+        ("expansion", "cubic", "there are none, quadratic"),
+        ("expansion", "quadratik", "did you mean quadratic"),
         ("beta", "much", "a number"),
     ],
 )
 def test_values_of_the_wrong_type(key: str, value: Any, words: str) -> None:
     with pytest.raises(UsageError, match=rf"learner\.{key} is .*{words}"):
         learner(**{key: value})
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("tau", "a", "'a': it must be a whole number"),
+        ("tau", 40.5, "a whole number"),
+        ("tau", np.float32(40.5), "a whole number"),
+        ("tau", None, "a whole number"),
+        ("nu", "fast", "a number"),
+        ("nu", [0.1], "a number"),
+        ("algorithm", 2.0, "a text"),
+        ("expansion", "cubic", "there are none, quadratic"),
+    ],
+)
+def test_values_of_the_wrong_type_from_python_too(key: str, value: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=rf"learner\.{key} is .*{words}"):
+        LearnerConfig(**{key: value})
+
+
+def test_a_value_from_python_gets_the_fields_type() -> None:
+    config = LearnerConfig(tau=np.int64(40), nu=1, beta="auto")  # type: ignore[arg-type]
+    assert (config.tau, config.nu, config.beta) == (40, 1.0, None)
+    assert (type(config.tau), type(config.nu)) == (int, float)
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,11 @@ def inlined(function: Function) -> Function:
     return _compile(function, forceinline=True)
 
 
+def spliced(function: Function) -> Function:
+    """Write a function's body into the compiled ones that call it, and compile it with them."""
+    return _compile(function, inline="always")
+
+
 def reordered(function: Function) -> Function:
     """Compile with sums in whichever order is fastest on this processor, and keep the result.
 

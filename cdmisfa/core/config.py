@@ -14,7 +14,9 @@ import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
+from operator import index
 from typing import Any, Literal, TypeVar
 
 from cdmisfa.core.errors import UsageError
@@ -41,7 +43,7 @@ class LearnerConfig:
     value again with its source.
     """
 
-    algorithm: Literal["2.0", "1.0"] = "2.0"
+    algorithm: str = "2.0"
     nu: float = 0.05
     tau: int = 100
     sigma: float = 0.0009
@@ -49,7 +51,7 @@ class LearnerConfig:
     beta: float | None = None
     components: int = 5
     outputs: int = 1
-    expansion: Literal["none", "quadratic"] = "quadratic"
+    expansion: str = "quadratic"
     epsilon_start: float = 1.2
     epsilon_decay: float = 0.999
     epsilon_knee: float = 0.8
@@ -70,6 +72,12 @@ class LearnerConfig:
     roc_error: float = 0.1
 
     def __post_init__(self) -> None:
+        from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy
+
+        convert_fields(self, "learner")
+        if self.expansion not in EXPANSIONS:
+            hint = did_you_mean(self.expansion, EXPANSIONS)
+            raise UsageError(f"learner.expansion is {self.expansion}: {hint}")
         positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
         positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
         positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
@@ -96,6 +104,20 @@ class LearnerConfig:
         if self.beta is not None:
             return self.beta
         return self.nu * math.log(2.0) / (2.0 * max(n_streams - 1, 1))
+
+
+def convert_fields(section: Any, prefix: str) -> None:
+    """Give every field of a new dataclass its type, as `build` does; for `__post_init__`.
+
+    Raises:
+        UsageError: a value does not fit; it names the key.
+    """
+    for name, hint in _hints(type(section)).items():
+        value = convert(getattr(section, name), hint, f"{prefix}.{name}")
+        object.__setattr__(section, name, value)
+
+
+_hints: Any = cache(typing.get_type_hints)
 
 
 def positive(section: Any, prefix: str, *names: str) -> None:
@@ -181,7 +203,7 @@ def build(
         UsageError: an unknown key (with the nearest valid one) or a value of the wrong type.
     """
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     values: dict[str, Any] = {}
     nested: dict[str, list[Mapping[str, Any]]] = {}
     for layer in layers:
@@ -244,9 +266,9 @@ def convert(value: Any, hint: Any, key: str) -> Any:
                 raise ValueError
             return value
         if hint is int:
-            if isinstance(value, bool | float):
+            if isinstance(value, bool):
                 raise ValueError
-            whole = int(value)
+            whole = int(value) if isinstance(value, str) else index(value)
             if abs(whole) > LARGEST:
                 raise ValueError
             return whole

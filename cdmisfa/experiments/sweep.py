@@ -14,13 +14,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
-from cdmisfa.core.config import LearnerConfig, as_table
+from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
 from cdmisfa.experiments.store import DONE, FAILED, TrialStore, code, identity
+from cdmisfa.experiments.trial import has_trials
+from cdmisfa.experiments.trial import run_trial as run_oscillatory
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES, open_scene
@@ -233,13 +235,14 @@ def _is_live(words: Sequence[str | Path]) -> bool:
 def run_trial(trial: Trial) -> dict[str, Any]:
     """Compute one trial: its result, or under "error" why there is none.
 
-    Oscillatory trials without a log run in compiled code as a whole; all others as `learn` does.
+    Oscillatory trials without a log run as a whole in compiled code where the learner has it;
+    all others as `learn` does.
     """
     if trial.code != code():
         return {"error": f"the worker has cdmisfa {code()}, not {trial.code}: install the same"}
     try:
-        known = isinstance(trial.configuration.learner, LearnerConfig)
-        if trial.source == ("oscillatory",) and trial.log is None and known:
+        live = trial.source == ("oscillatory",) and trial.log is None
+        if live and has_trials(trial.configuration.learner):
             return _compiled_trial(trial)
         return _logged_trial(trial)
     except CdmisfaError as error:
@@ -250,8 +253,6 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 
 
 def _compiled_trial(trial: Trial) -> dict[str, Any]:
-    from cdmisfa.experiments.trial import run_trial as run_oscillatory
-
     streams = cast(OscillatoryConfig, trial.configuration.scene).streams
     result = run_oscillatory(
         trial.configuration.learner,

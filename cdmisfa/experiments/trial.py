@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,11 @@ from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.policy import action_values
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.compiled import compiled, spliced
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
+from cdmisfa.core.learning import Learner
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
@@ -76,7 +77,7 @@ class TrialResult:
     curves: Mapping[str, NDArray[Any]] | None
 
 
-_iterate = compiled(iterate)
+_iterate = spliced(iterate)
 
 
 @compiled
@@ -163,6 +164,15 @@ def run_iterations(
     return len(uniforms)
 
 
+def has_trials(config: Any) -> bool:
+    """Whether the learner of a configuration, and what it learns with, has compiled code."""
+    return _compiles(open_learner(config, OscillatorySource().spec, 0))
+
+
+def _compiles(learner: Learner) -> TypeGuard[CuriousLearner]:
+    return isinstance(learner, CuriousLearner) and learner.kernel is not None
+
+
 def run_trial(
     config: LearnerConfig,
     streams: Sequence[str] = ("x1", "x2", "x3"),
@@ -188,7 +198,7 @@ def run_trial(
         UsageError: the learner, or the feature it learns with, has no compiled code.
     """
     learner = open_learner(config, OscillatorySource(streams).spec, seed)
-    if not isinstance(learner, CuriousLearner) or learner.kernel is None:
+    if not _compiles(learner):
         raise UsageError(
             f"learner.algorithm {config.algorithm} has no compiled trials: use learn for it"
         )

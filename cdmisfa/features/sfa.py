@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.blocks import as_frames
+
 Float = NDArray[np.float64]
 
 
@@ -20,7 +22,7 @@ def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -
     they hold rounding noise.
 
     Args:
-        frames: (n, I) consecutive frames.
+        frames: (n, I) consecutive frames, uint8 or float64, of which each counts as it is.
         outputs: J, how many features.
         tolerance: least share of the largest variance.
 
@@ -28,10 +30,11 @@ def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -
         (J, I) weights of the centred frame.
 
     Raises:
-        ValueError: the frames vary in fewer than J directions.
+        UsageError: these are no frames.
+        ValueError: they vary in fewer than J directions.
     """
-    x = np.asarray(frames, dtype=np.float64)
-    x = x - x.mean(axis=0)
+    x = as_frames(frames).astype(np.float64)
+    x -= x.mean(axis=0)
     _, deviation, directions = np.linalg.svd(x / np.sqrt(len(x)), full_matrices=False)
     kept = deviation**2 > tolerance * deviation[0] ** 2
     if kept.sum() < outputs:

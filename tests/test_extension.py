@@ -1,0 +1,153 @@
+"""An expansion, a feature and a learner of somebody else, added without editing a file."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from numpy.typing import NDArray
+from test_trial import QUICK, assert_equal, step_by_step
+
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.agents.learners import LEARNERS, LearnerEntry
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import EXPANSIONS, Expansion
+from cdmisfa.experiments.trial import has_trials, run_trial
+from cdmisfa.features.feature import Feature
+from cdmisfa.features.incsfa.abstraction import MANY_INPUTS
+from recorder.world.oscillatory import OscillatorySource
+from replay.runs.modules import load_modules
+
+STREAMS = ("x1", "x2", "x3")
+
+
+def cubic(frames: NDArray[Any]) -> NDArray[np.float64]:
+    """All inputs, their products of two, and each one's cube."""
+    x = frames * (1 / 255 if frames.dtype == np.uint8 else 1.0)
+    i, j = np.triu_indices(x.shape[1])
+    return np.hstack([x, x[:, i] * x[:, j], x**3])
+
+
+def many(frames: NDArray[Any]) -> NDArray[np.float64]:
+    """So many inputs that IncSFA takes its other kernel."""
+    return np.hstack([np.cos(k * frames) / (1 + k) for k in range(MANY_INPUTS // 2 + 1)])
+
+
+class Settled(NamedTuple):
+    mean: NDArray[np.float64]
+    phi: NDArray[np.float64]
+
+
+class PlainFeature:
+    """Learns nothing but the mean, and says so: a feature without compiled code."""
+
+    def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
+        self.state = Settled(np.zeros(n_inputs), rng.standard_normal((config.outputs, n_inputs)))
+
+    @property
+    def phi(self) -> NDArray[np.float64]:
+        return self.state.phi
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        return self.state.mean
+
+    def update(self, frames: NDArray[Any], gap: bool = False) -> NDArray[np.float64]:
+        self.state.mean[...] += 0.1 * (frames.mean(axis=0) - self.state.mean)
+        return np.full(len(frames), 0.01)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlainConfig(LearnerConfig):
+    """Keys `learner.*` of the plain learner: those of 2.0, and one of its own."""
+
+    algorithm: str = "plain"
+    first_mean: float = 0.0
+
+
+def open_plain(config: PlainConfig, spec: Any, seed: int) -> CuriousLearner:
+    learner = CuriousLearner(config, spec, seed, feature=PlainFeature)
+    learner.abstraction.mean[...] = config.first_mean
+    return learner
+
+
+@pytest.fixture(autouse=True)
+def _added() -> Iterator[None]:
+    EXPANSIONS.add("cubic", Expansion(lambda n: 2 * n + n * (n + 1) // 2, cubic))
+    EXPANSIONS.add("many", Expansion(lambda n: n * (MANY_INPUTS // 2 + 1), many))
+    LEARNERS.add("plain", LearnerEntry(PlainConfig, open_plain, preset="oscillatory"))
+    yield
+    EXPANSIONS.remove("cubic")
+    EXPANSIONS.remove("many")
+    LEARNERS.remove("plain")
+
+
+@pytest.mark.parametrize(("expansion", "least"), [("cubic", 1), ("many", 0)])
+def test_a_compiled_trial_is_the_learner_with_an_expansion_of_ones_own(
+    expansion: str, least: int
+) -> None:
+    config = dataclasses.replace(QUICK, expansion=expansion, delta=0.005)
+    trial = run_trial(config, seed=5, curves=True, max_iterations=600)
+    assert len(trial.modules) >= least
+    assert all(m.expansion == expansion for m in trial.modules)
+    assert_equal(trial, *step_by_step(config, STREAMS, 5, trial.iterations))
+
+
+def test_without_an_expansion_the_trial_is_the_learner_too() -> None:
+    config = dataclasses.replace(QUICK, expansion="none", components=2)
+    trial = run_trial(config, seed=5, curves=True, max_iterations=300)
+    assert_equal(trial, *step_by_step(config, STREAMS, 5, trial.iterations))
+
+
+def test_its_modules_transform_frames(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    done = cdmisfa(
+        *("learn", "oscillatory", "--set", "learner.expansion=cubic", "--no-rerun"),
+        *("--set", "learner.delta=1", "--set", "learner.eta_dot_window=5"),
+        *("--max-modules", "1", "-o", str(tmp_path / "run")),
+    )
+    assert done.code == 0, done.err
+    (module,) = load_modules(tmp_path / "run")
+    x = np.random.default_rng(0).random((7, 2))
+    expected = (cubic(x) - module.mean) @ module.phi.T
+    np.testing.assert_allclose(module.transform(x), expected, rtol=1e-12)
+
+
+def test_a_feature_of_ones_own_is_learned_with_and_restored() -> None:
+    source = OscillatorySource()
+    config = dataclasses.replace(QUICK, expansion="none", components=2)
+    learner, copy = (CuriousLearner(config, source.spec, 3, feature=PlainFeature) for _ in range(2))
+    assert isinstance(learner.abstraction, Feature)
+    for _ in range(20):
+        learner.step(source.take(learner.stream, learner.tau))
+    copy.restore(learner.state)
+    block = source.take(learner.stream, learner.tau)
+    one, two = learner.step(block), copy.step(block)
+    assert one.novel
+    np.testing.assert_array_equal(one.y, two.y)
+    expected = (block.frames - learner.abstraction.mean) @ learner.phi.T
+    np.testing.assert_allclose(one.y, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_learner_without_compiled_code_has_no_trials() -> None:
+    assert has_trials(QUICK)
+    assert not has_trials(PlainConfig())
+    with pytest.raises(UsageError, match=r"learner\.algorithm plain has no compiled trials"):
+        run_trial(PlainConfig(), seed=0)
+
+
+def test_a_learner_of_ones_own_is_learned_with_by_its_name(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    args = ("--algorithm", "plain", "--set", "learner.first_mean=0.5", "--json")
+    learn = ("learn", "oscillatory", *args, "--max-iterations", "5", "--no-rerun")
+    done = cdmisfa(*learn, "-o", str(tmp_path / "run"))
+    assert (done.code, done.json["iterations"]) == (0, 5), done.err
+    assert done.json["epsilon"] == pytest.approx(1.2 * 0.999**5)
+    other = cdmisfa("learn", "oscillatory", "--set", "learner.first_mean=0.5")
+    assert "unknown key learner.first_mean" in other.err

@@ -1,0 +1,142 @@
+"""Frames are checked where they come in: compiled code never reads beyond what it was given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.core.blocks import Block, SourceSpec, as_frames
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import EXPANSIONS, Expansion, expand, quadratic
+from cdmisfa.features.incsfa.abstraction import MANY_INPUTS, IncSFA
+from cdmisfa.features.projection import project
+from cdmisfa.features.sfa import batch_sfa
+
+SMALL, LARGE = 5, MANY_INPUTS + 50
+CONFIG = LearnerConfig(components=3)
+TYPES = ("float64", "uint8", "float32", "int8", "bool", "int64", "complex128", ">f8", "U3", "O")
+
+
+def abstraction(size: int) -> IncSFA:
+    return IncSFA(CONFIG, size, np.random.default_rng(0))
+
+
+@st.composite
+def anything(draw: st.DrawFn) -> np.ndarray:
+    """Arrays of most shapes, types and orders, many of them frames of SMALL or LARGE values."""
+    inner = draw(st.sampled_from([(SMALL,), (LARGE,), (SMALL, 1), (1,), (2,), (3,), (0,), ()]))
+    shape = (draw(st.integers(0, 4)), *inner)
+    array = np.random.default_rng(0).integers(0, 2, shape).astype(draw(st.sampled_from(TYPES)))
+    match draw(st.integers(0, 4)):
+        case 0:
+            return np.asfortranarray(array)
+        case 1 if array.ndim > 1:
+            return np.repeat(array, 2, axis=1)[:, ::2]
+        case 2:
+            return array[::-1]
+        case 3:
+            array.flags.writeable = False
+    return array
+
+
+@given(anything(), st.sampled_from([SMALL, LARGE]), st.booleans())
+@settings(deadline=None, max_examples=400)
+def test_frames_are_learned_from_or_refused(frames: np.ndarray, size: int, gap: bool) -> None:
+    fits = frames.ndim == 2 and frames.shape[1] == size and frames.dtype in (np.uint8, np.float64)
+    fits = fits and frames.dtype.isnative
+    sfa = abstraction(size)
+    calls = [lambda: sfa.update(frames, gap), lambda: project(sfa.phi, np.zeros(1), frames)]
+    for call in calls:
+        if fits:
+            assert len(call()) == len(frames)
+        else:
+            with pytest.raises(UsageError, match=r"^frames of .* given: give "):
+                call()
+
+
+@given(anything())
+@settings(deadline=None, max_examples=200)
+def test_frames_are_expanded_or_refused(frames: np.ndarray) -> None:
+    if frames.ndim == 2 and frames.dtype in (np.uint8, np.float64) and frames.dtype.isnative:
+        before = frames.copy()
+        unit = 1 / 255 if frames.dtype == np.uint8 else 1.0
+        i, j = np.triu_indices(frames.shape[1])
+        x = frames * unit
+        np.testing.assert_array_equal(quadratic(frames), np.hstack([x, x[:, i] * x[:, j]]))
+        np.testing.assert_array_equal(frames, before)
+    else:
+        for kind in ("none", "quadratic"):
+            with pytest.raises(UsageError, match=r"^frames of .* given: give "):
+                expand(kind, frames)
+
+
+def test_the_order_of_frames_in_memory_does_not_matter() -> None:
+    frames = np.random.default_rng(1).random((60, SMALL))
+    wide = np.zeros((60, 2 * SMALL))
+    wide[:, ::2] = frames
+    raw = np.zeros(frames.nbytes + 1, np.uint8)
+    unaligned = raw[1:].view(np.float64).reshape(frames.shape)
+    unaligned[...] = frames
+    expected = abstraction(SMALL).update(frames).tobytes()
+    for same in (np.asfortranarray(frames), wide[:, ::2], unaligned, frames.tolist()):
+        assert abstraction(SMALL).update(same).tobytes() == expected  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["int8", "bool"])
+def test_only_uint8_are_pixels(kind: str) -> None:
+    frames = np.ones((4, SMALL), kind)
+    for call in (as_frames, quadratic, abstraction(SMALL).update):
+        with pytest.raises(UsageError, match=f"frames of {kind} given: give uint8 pixels or"):
+            call(frames)  # type: ignore[operator]
+
+
+def test_rows_of_unequal_length_are_refused() -> None:
+    with pytest.raises(UsageError, match="unequal length"):
+        abstraction(2).update([[1.0, 2.0], [1.0]])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("phi", "offset"),
+    [(np.ones(SMALL), np.zeros(1)), (np.ones((2, SMALL)), np.zeros(1)), (np.ones((1, 4)), [0.0])],
+)
+def test_weights_that_do_not_fit_are_refused(phi: Any, offset: Any) -> None:
+    with pytest.raises(UsageError, match="given: give"):
+        project(phi, offset, np.zeros((3, SMALL)))
+
+
+@pytest.mark.parametrize("frames", [np.zeros(5), np.zeros((2, 3, 4)), np.zeros((4, 5), bool), "x"])
+def test_batch_sfa_takes_frames_only(frames: Any) -> None:
+    with pytest.raises(UsageError, match="given: give"):
+        batch_sfa(frames, 1)
+
+
+def test_an_expansion_that_gives_another_size_than_it_says_is_refused() -> None:
+    EXPANSIONS.add("short", Expansion(lambda n: n + 1, lambda frames: frames))
+    try:
+        with pytest.raises(UsageError, match=r"give \(n, 6\)"):
+            expand("short", np.zeros((3, SMALL)))
+    finally:
+        EXPANSIONS.remove("short")
+
+
+@pytest.mark.parametrize("block", [np.zeros((100, 2)), [1.0], None])
+def test_a_learner_takes_blocks_only(block: Any) -> None:
+    learner = CuriousLearner(LearnerConfig(), SourceSpec(("a",), (2,), "float64"), 0)
+    with pytest.raises(UsageError, match=r"given: a learner takes the blocks of a source"):
+        learner.step(block)
+
+
+def test_a_block_of_another_order_in_memory_gives_the_same_bits() -> None:
+    spec = SourceSpec(("a",), (2,), "float64")
+    frames = np.random.default_rng(2).random((100, 2))
+    ys = []
+    for same in (frames, np.asfortranarray(frames)):
+        learner = CuriousLearner(LearnerConfig(), spec, 0)
+        ys.append(learner.step(Block(0, 0, same, np.empty((100, 0)))).y.tobytes())
+    assert ys[0] == ys[1]

@@ -1,0 +1,122 @@
+"""Modules know what their input was: they transform frames as the learner did."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cdmisfa.agents.learner import CuriousLearner
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.modules import Module
+from cdmisfa.experiments.resume import Checkpoint, load_checkpoint, save_checkpoint
+from replay.runs.modules import load_modules, save_modules
+from replay.runs.transformer import SlowFeatures
+
+EASY = {"delta": 1.0, "eta_dot_window": 3, "min_variance": 0.0, "warm_up": 0, "tau": 20}
+"""Saves what it has after a few blocks."""
+
+
+def learned(dtype: str, expansion: str, shape: tuple[int, ...] = (2, 3)) -> tuple[Any, Any]:
+    """A learner's first module, and its output on the block after it, with the block's frames."""
+    rng = np.random.default_rng(0)
+    config = LearnerConfig(expansion=expansion, components=2, **EASY)
+    learner = CuriousLearner(config, SourceSpec(("a",), shape, dtype), 1)
+    k = 0
+    while True:
+        walk = np.cumsum(rng.standard_normal((20, *shape)), axis=0)
+        frames = walk if dtype == "float64" else (walk * 9 + 120).clip(0, 255).astype(np.uint8)
+        signals = learner.step(Block(0, 20 * k, frames, np.empty((20, 0))))
+        if len(signals.y_frozen):
+            return learner, (signals.y_frozen[0], frames)
+        k += 1
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "float64"])
+@pytest.mark.parametrize("expansion", ["none", "quadratic"])
+def test_a_module_transforms_as_the_learner_did(dtype: str, expansion: str, tmp_path: Path) -> None:
+    learner, (y, frames) = learned(dtype, expansion)
+    module = learner.modules[0]
+    assert module.expansion == expansion
+    assert module.scale == (1 / 255 if dtype == "uint8" else 1.0)
+    save_modules(tmp_path / "modules.npz", learner.modules)
+    (loaded, *_) = load_modules(tmp_path)
+    for same in (module, loaded):
+        np.testing.assert_allclose(same.transform(frames), y, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(same.transform(frames.reshape(20, -1)), y, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(SlowFeatures(loaded).transform(frames), loaded.transform(frames))
+    assert (loaded.expansion, loaded.scale) == (module.expansion, module.scale)
+    assert type(loaded.expansion) is str
+
+
+def test_the_width_does_not_decide_where_the_expansion_is_known() -> None:
+    """Two values expand to five weights; five values that nobody expanded have five, too."""
+    module = with_width(5, expansion="none")
+    assert module.transform(np.zeros((3, 5))).shape == (3, 1)
+    with pytest.raises(UsageError, match="frames of 2 values given"):
+        module.transform(np.zeros((3, 2)))
+
+
+def with_width(width: int, **values: Any) -> Module:
+    phi, mean, zero, policy = np.ones((1, width)), np.zeros(width), np.zeros(1), np.zeros(1, int)
+    return Module(1, 0, 9, phi, mean, zero, zero, zero, policy, **values)
+
+
+def test_values_are_values_even_as_uint8() -> None:
+    frames = np.array([[3, 4]], np.uint8)
+    assert with_width(2, expansion="none", scale=1.0).transform(frames).tolist() == [[7.0]]
+    assert with_width(2).transform(frames)[0, 0] == pytest.approx(7 / 255)
+
+
+@pytest.mark.parametrize("kind", ["int8", "bool", "int64", "U1"])
+def test_what_is_neither_pixel_nor_value_is_refused(kind: str) -> None:
+    with pytest.raises(UsageError, match=r"frames of \S+ given: give uint8 pixels or float"):
+        with_width(2).transform(np.ones((3, 2)).astype(kind))
+
+
+def test_a_single_frame_is_not_read_as_many() -> None:
+    module = with_width(48 * 128, expansion="none")
+    for given in (module, SlowFeatures(module)):
+        with pytest.raises(UsageError, match=r"a single frame of shape \(48, 128\) given: .*None"):
+            given.transform(np.zeros((48, 128), np.uint8))
+        assert given.transform(np.zeros((1, 48, 128), np.uint8)).shape == (1, 1)
+
+
+def test_files_from_before_are_read_and_the_width_decides(tmp_path: Path) -> None:
+    learner, (y, frames) = learned("uint8", "quadratic")
+    save_modules(tmp_path / "modules.npz", learner.modules)
+    with np.load(tmp_path / "modules.npz") as stored:
+        old = {k: v for k, v in stored.items() if not k.endswith(("_expansion", "_scale"))}
+    np.savez(tmp_path / "old.npz", **old)
+    (module, *_) = load_modules(tmp_path / "old.npz")
+    assert module.expansion == ""
+    np.testing.assert_allclose(module.transform(frames), y, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("change", [{"module1_expansion": 3.0}, {"module1_scale": "x"}])
+def test_a_file_with_other_things_in_their_place_is_damaged(
+    change: dict[str, Any], tmp_path: Path
+) -> None:
+    save_modules(tmp_path / "modules.npz", [with_width(2)])
+    with np.load(tmp_path / "modules.npz") as stored:
+        np.savez(tmp_path / "bad.npz", **{**stored, **{k: np.array(v) for k, v in change.items()}})
+    with pytest.raises(LogDamagedError):
+        load_modules(tmp_path / "bad.npz")
+
+
+def test_checkpoints_keep_both_and_are_read_without(tmp_path: Path) -> None:
+    learner, _ = learned("uint8", "none")
+    state = learner.state
+    path = save_checkpoint(tmp_path, Checkpoint(learner.iteration, 0, state, {}))
+    kept = load_checkpoint(path).state
+    assert [(m.expansion, m.scale) for m in kept.modules] == [("none", 1 / 255)] * len(kept.modules)
+    before = dataclasses.replace(
+        kept, modules=tuple(dataclasses.replace(m, expansion="") for m in kept.modules)
+    )
+    learner.restore(before)
+    assert {m.expansion for m in learner.modules} == {"none"}
