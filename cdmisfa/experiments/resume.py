@@ -110,7 +110,7 @@ class Checkpoint:
     versions: Mapping[str, str]
 
 
-def save_checkpoint(run: Path, checkpoint: Checkpoint) -> Path:
+def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
     """Write a checkpoint into a run's folder and drop all but the newest ones.
 
     The run's log must already hold every iteration before it.
@@ -133,7 +133,6 @@ def save_checkpoint(run: Path, checkpoint: Checkpoint) -> Path:
         np.savez(file, allow_pickle=False, **arrays)
     for old in checkpoints(run)[KEPT:]:
         old.unlink()
-    return path
 
 
 def checkpoints(run: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -149,11 +149,8 @@ def _learn(
         )
 
 
-@contextlib.contextmanager
-def _opened(words: list[str | Path], seed: int) -> Iterator[SeekableSource]:
-    source, _ = open_source(words, seed=seed, loop=True)
-    with contextlib.closing(source):
-        yield source
+def _opened(words: list[str | Path], seed: int) -> AbstractContextManager[SeekableSource]:
+    return contextlib.closing(open_source(words, seed=seed, loop=True)[0])
 
 
 def _check(

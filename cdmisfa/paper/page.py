@@ -45,9 +45,8 @@ def write_page(root: Path, page: Path) -> None:
             if figure.endswith(".png"):
                 shutil.copyfile(root / name / figure, figures / figure)
                 parts += [f"![{document['title']}]({figures.name}/{figure})", ""]
-    versions = documents[0]["versions"]
-    shown = ", ".join(f"{key} {versions[key]}" for key in sorted(versions))
-    parts += ["", f"Versions: {shown}.", ""]
+    versions = sorted(documents[0]["versions"].items())
+    parts += ["", f"Versions: {', '.join(map(' '.join, versions))}.", ""]
     page.write_text("\n".join(parts), encoding="utf-8")
 
 
