@@ -8,7 +8,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import gram, strict
 from cdmisfa.features.incsfa.abstraction import IncSFA
-from cdmisfa.features.incsfa.state import State, copy_into, new_state, parameters, rank_floor
+from cdmisfa.features.incsfa.state import State, new_state, parameters, rank_floor
 from cdmisfa.features.projection import project
 from cdmisfa.features.sfa import batch_sfa, direction_cosine, slowness
 from recorder.world.oscillatory import OscillatorySource, one_period
@@ -241,7 +241,8 @@ def test_a_saved_state_goes_on_with_the_same_bits(kernel):
     a, xi = learn_in(kernel, config, frames, [40] * 60)
     half, _ = learn_in(kernel, config, frames[:1200], [40] * 30)
     copy = new_state(np.random.default_rng(9), 210, config)
-    copy_into(half, copy)
+    for source, target in zip(half, copy, strict=True):
+        target[...] = source
     rest = np.empty(1200)
     for k in range(0, 1200, 40):
         block = frames[1200 + k : 1240 + k]

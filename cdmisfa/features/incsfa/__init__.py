@@ -6,6 +6,6 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "cdmisfa.features.incsfa.abstraction": "IncSFA",
-        "cdmisfa.features.incsfa.state": "Params State copy_into new_state parameters",
+        "cdmisfa.features.incsfa.state": "Params State new_state parameters",
     },
 )

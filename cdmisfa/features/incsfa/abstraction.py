@@ -27,13 +27,8 @@ class Strict(NamedTuple):
     params: Params
 
 
-class Gram(NamedTuple):
-    """An abstraction as compiled code takes it, to be learned by `gram.update`."""
-
-    phi: Float
-    mean: Float
-    state: State
-    params: Params
+class Gram(Strict):
+    """The same, to be learned by `gram.update`."""
 
 
 UPDATES: Any = {Strict: strict.update, Gram: gram.update}

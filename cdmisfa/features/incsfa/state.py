@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled, inlined
+from cdmisfa.core.compiled import inlined
 from cdmisfa.core.config import LearnerConfig
 
 Float = NDArray[np.float64]
@@ -95,19 +95,6 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
         phi=np.zeros((J, n_inputs)),
         counts=np.zeros(3, dtype=np.int64),
     )
-
-
-@compiled
-def copy_into(source: State, target: State) -> None:
-    """Overwrite one state with another of the same sizes."""
-    target.mean[:] = source.mean
-    target.v[:] = source.v
-    target.d[:] = source.d
-    target.gram[:] = source.gram
-    target.w[:] = source.w
-    target.z_prev[:] = source.z_prev
-    target.phi[:] = source.phi
-    target.counts[:] = source.counts
 
 
 @inlined
