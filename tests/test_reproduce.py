@@ -245,3 +245,11 @@ def test_leading_directions_are_those_of_an_exact_decomposition() -> None:
     exact = np.linalg.svd(x, full_matrices=False)[2][:4].T
     found = difficulty.leading_directions(x, 4)
     np.testing.assert_allclose(np.abs(np.sum(exact * found, axis=0)), 1.0, atol=1e-6)
+
+
+def test_difficulty_says_how_many_frames_of_a_view_it_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["reproduce", "difficulty", "--quick", "--recording", str(SAMPLE)]
+    assert cdmisfa([*words, "-o", str(tmp_path)]) == 2
+    assert "takes more than 4000: record them" in capsys.readouterr().err

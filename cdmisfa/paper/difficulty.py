@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.statistics import correlation, stays_above
 from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.features.sfa import batch_sfa, slowness
@@ -105,6 +106,11 @@ def _task(scene: str, stream: int, recording: str | None) -> Task:
     else:
         config = icub.learner_config()
         frames = _view(recording, stream, FRAMES[scene])
+        if len(frames) <= TRAINING:
+            raise UsageError(
+                f"{recording} holds {len(frames)} frames of a view: how hard its views are to "
+                f"learn takes more than {TRAINING}: record them, or leave --recording out"
+            )
         training, held_out = frames[:TRAINING], frames[TRAINING : 2 * TRAINING]
     oracle = slowest(training, config.components)
     answer = held_out / _unit(held_out) @ oracle
