@@ -1,7 +1,6 @@
 """What every scene and every recording can be told (keys `scene.*` and `record.*`).
 
-Beneath both rooms, because the world takes the clock of `record.*` and the log the rest. What
-only one scene has stands with that scene.
+Imported by `world` and `log`. What only one scene has stands with that scene.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Colours that people with any colour vision can tell apart, the same in viewer and figures.
+"""Colours that people with any colour vision can tell apart, for the viewer and figures.
+
+The figures that redraw the paper's panels have their own colours.
 
 Source: Okabe and Ito, Color Universal Design (2008).
 """

@@ -19,7 +19,10 @@ from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.whole import partial_path
 
 FLUSH_NS = 1_000_000_000
-"""Log time after which the chunk in progress is handed to the operating system."""
+"""Log time after which the chunk in progress is handed to the operating system, by default.
+
+A run's log flushes by wall time (`replay/runs/writer.py`).
+"""
 
 Compression = Literal["zstd", "lz4", "none"]
 
@@ -128,7 +131,9 @@ class LogFile:
         sequence: int = 0,
         publish_time: int | None = None,
     ) -> None:
-        """Write a message; what is older than a second of log time is flushed first.
+        """Write a message.
+
+        Once `flush_ns` of log time have passed since the chunk began, it is flushed first.
 
         Args:
             channel: id from `add_channel`.

@@ -1,4 +1,4 @@
-"""The frames of a recording's views, from its first to its last, a piece at a time."""
+"""A recording's frames piece by piece, and as PNG files."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def write_film(
             video = container.add_stream("libx264", rate=rate, options=options)
             video.height, video.width = spec.frame_shape
             video.pix_fmt = pixel_format(spec.frame_shape)
-            video.max_b_frames = 0  # each frame's place in the file is its place in time
+            video.max_b_frames = 0  # no B-frames: file order is display order
             video.codec_context.color_range = FULL_RANGE
             for picture in _pictures(av, source, stream):
                 picture.time_base = 1 / rate

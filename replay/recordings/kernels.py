@@ -2,7 +2,7 @@
 
 A chunk passes only where every byte of it is accounted for, its message index agrees with
 it, and its messages are laid out as the recorder does it. What does not pass is left to
-`replay.mcap.tables` and `replay.recordings.view_file`, which say what is wrong with it.
+`replay.mcap.tables` and `replay.recordings.scanner`, which say what is wrong with it.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def gather(data: Bytes, ends: Places, distances: Places, width: int, out: Bytes)
         width: bytes of a value.
         out: (n, R * width) written.
     """
-    # Unsigned numbers need no look at negative indices, and so become vector moves.
+    # Unsigned, so that numba leaves out the test for negative indices.
     for i in range(np.uint64(len(ends))):
         for r in range(np.uint64(len(distances))):
             low, column = np.uint64(ends[i] - distances[r]), r * np.uint64(width)

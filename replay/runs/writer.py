@@ -70,8 +70,9 @@ class RunWriter(Sink):
         self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
         self._phi_every = max(phi_every, 1)
-        # The learner is quicker than the log's clock: what waits is flushed by the wall's. Of
-        # images zstd leaves a tenth less than lz4, and takes twice as long.
+        # Learning runs faster than log time: flushing every second of log time would be too
+        # often, so the wall clock decides. Of images zstd leaves a tenth less than lz4, and
+        # takes twice as long.
         self._log = LogFile(
             path, force=force, compression="lz4", chunk_size=CHUNK_BYTES, flush_ns=NEVER_NS
         )

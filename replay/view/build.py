@@ -72,7 +72,7 @@ def build_view(
 
 @contextlib.contextmanager
 def view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
-    """The view of a run, built for as long as it is looked at."""
+    """The view of a run, a recording or an .rrd file, there for as long as it is looked at."""
     if path.suffix == ".rrd":
         if not path.is_file():
             raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")

@@ -153,7 +153,7 @@ def _follow(
     try:
         add_views(runs, dataset, place, progress, ended)
     except REFUSALS as error:
-        if not ended.wait(1.0):  # the server goes first
+        if not ended.wait(1.0):  # when interrupted the server may die before us; that is no error
             print(f"views are not served: {error}", file=sys.stderr, flush=True)
 
 
