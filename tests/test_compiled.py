@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numba
 import pytest
 
-from cdmisfa.core.compiled import compiled, needs_compiling
+from cdmisfa.core.compiled import MARKS, compiled, needs_compiling
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -54,3 +54,17 @@ def test_what_was_kept_before_a_class_moved_is_made_again(tmp_path: Path) -> Non
         assert (done.stdout, done.stderr) == ("3.0\n", "")
         (tmp_path / f"{home}.py").unlink()
     assert list((tmp_path / "kept").rglob("*.nbi"))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        b"@compiled\n",
+        b"@inlined\n",
+        b"@reordered\n",
+        b"@in_compiled_code(f)\n",
+        b"_f = spliced(f)\n",
+    ],
+)
+def test_a_file_counts_by_each_way_to_compile_alone(source: bytes) -> None:
+    assert any(mark in source for mark in MARKS)

@@ -18,7 +18,7 @@ CONSTANT_VARIANCE = 1e-12
 """A block in which no input varies more than this carries nothing to learn."""
 
 ENOUGH = 4.0
-"""Twice what suffices, so that rounding cannot matter."""
+"""2 suffices (see below); doubled against rounding."""
 
 BAND = 2.0
 """Half width of a module's band of known slowness, in standard deviations (paper)."""

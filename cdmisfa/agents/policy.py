@@ -47,7 +47,8 @@ def value_sum(stay: Float, switch: Float, policy: Int, gamma: float) -> float:
     if whole > 0:
         lanes = np.zeros(LANES)
         for first in range(0, whole, LANES):
-            for lane in range(np.uint64(LANES)):  # unsigned: needs no look at negative indices
+            # Unsigned, so that numba leaves out the test for negative indices.
+            for lane in range(np.uint64(LANES)):
                 at = np.uint64(first) + lane
                 kept = stay[at] * horizon
                 left = switch[at]

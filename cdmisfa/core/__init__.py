@@ -1,4 +1,4 @@
-"""The words everybody shares: blocks, signals, modules, configuration, errors."""
+"""For all: blocks, signals, modules, configuration, errors, registries, compiling, processes."""
 
 from cdmisfa.core.faces import face
 

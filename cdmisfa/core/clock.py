@@ -24,7 +24,8 @@ Times = NDArray[np.int64]
 
 def time_of(t: int, fps: float, start_ns: int) -> int:
     """Log time of frame t, in nanoseconds: start + t / fps, rounded half to even."""
-    return start_ns + round(t * NANOSECONDS / float(fps))  # whole rates divide differently
+    # An int fps would be divided exactly, unlike the float in `times_of`.
+    return start_ns + round(t * NANOSECONDS / float(fps))
 
 
 def times_of(frames: NDArray[Any], fps: float, start_ns: int) -> Times:

@@ -17,6 +17,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 MARKS = (
     b"@compiled",
     b"@inlined",
+    b"spliced(",
     b"@reordered",
     b"@in_compiled_code",
     b"@_intrinsic",

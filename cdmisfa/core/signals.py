@@ -1,8 +1,10 @@
 """`BlockSignals`: the one record of everything the learner thought in one iteration.
 
 Every consumer walks over its fields: the schema of run.mcap, Rerun's entities and
-layout, the columns of an export, the table of signals in the docs. Adding a signal
-is raising `SCHEMA_VERSION` and adding one field here that is there `since` then.
+layout, the columns of an export, the table of signals in the docs. Adding a signal is
+raising `SCHEMA_VERSION` and adding a field whose `since` is the new version. Its value is
+set in `agents/learner.py` or, if it is a scalar of the iteration, is a field of `OUTCOME`
+(`agents/agent.py`) set in `agents/iteration.py`.
 """
 
 from __future__ import annotations

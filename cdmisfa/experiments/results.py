@@ -29,7 +29,10 @@ class PointResult:
 
     Attributes:
         point: the grid's keys and this point's values.
-        trials: how many were asked for, of which some are done, failed, or missing yet.
+        trials: how many were asked for.
+        done: how many of them the measures are about.
+        failed: how many of them failed.
+        missing: how many were not computed yet.
         measures: mean and SD over those that are done, by name.
         orders: how often which streams were learned in which order, the most frequent first.
     """

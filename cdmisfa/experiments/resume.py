@@ -99,9 +99,13 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """Where a run stood after some iterations: the source's next frame, the learner's state.
+    """Where a run stood after some iteration.
 
-    The versions are those of the packages that computed it.
+    Attributes:
+        iteration: iterations done.
+        t: the source's next frame.
+        state: of the learner.
+        versions: of the packages that computed it.
     """
 
     iteration: int
@@ -199,7 +203,9 @@ class Checkpoints(Sink):
     It comes after the run's log, which must hold every iteration before a checkpoint.
 
     Args:
-        run, source, learner: the run's folder, and what it learns from and with.
+        run: the run's folder.
+        source: what it learns from.
+        learner: what learns.
         every: iterations between two; 0 saves one at the end only.
         flush: lets the disk have all of the log.
     """

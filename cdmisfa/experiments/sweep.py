@@ -100,12 +100,23 @@ def sweep(
 ) -> SweepReport:
     """Run every trial of a grid that is not finished yet.
 
-    Source, preset, settings and loop are those of `open_source`; jobs, engine and scheduler those
-    of `run_all`; each trial ends after max_iterations or max_modules. The grid has values to try
-    by configuration key: every combination is a point, tried with each of the seeds. With
-    `keep_logs` each trial's run is kept in folder/trials, which workers on other machines must
-    share; with `retry_failed` trials that failed before are computed again. `progress` is called
-    with the trials finished, failed, and asked for.
+    Args:
+        source: a scene's name or a recording's paths, as for `learn`.
+        folder: where the rows are; made where it does not exist.
+        grid: values to try, by configuration key; every combination is a point.
+        seeds: every point is tried with each of them.
+        preset: instead of the source's own.
+        settings: `section.key=value` words for all trials.
+        loop: start a recording again at its end.
+        max_iterations: end each trial after so many.
+        max_modules: end each trial after so many.
+        jobs: local processes.
+        engine: where to compute, see `engines.ENGINES`.
+        scheduler: address of a dask scheduler.
+        keep_logs: keep each trial's run folder in folder/trials; with workers on other
+            machines it must be a shared one.
+        retry_failed: compute trials again that failed before.
+        progress: called with the trials finished, failed, and asked for.
 
     Raises:
         UsageError: a wrong key, value, source or engine, found before any trial starts.

@@ -48,9 +48,15 @@ Stage = Callable[[str, str], AbstractContextManager[Bar]]
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A module, and the true quantity that its first output follows best.
+    """A module, and what in the world its output follows.
 
-    The policy says "stay" or "switch" for each view; the correlation has no sign.
+    Attributes:
+        module: index, from 1.
+        view: name of the view it was learned on.
+        policy: "stay" or "switch" for each view.
+        iteration: at which it was saved.
+        follows: name of the true quantity that its first output follows best.
+        correlation: of the two, without sign.
     """
 
     module: int
@@ -80,8 +86,12 @@ class Report:
 def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Report:
     """Record the scene, learn from the recording, compare with live, draw figures.
 
-    `recordings/demo-icub` and `runs/demo-icub` in the folder `out` are replaced. The recording has
-    so many frames, rendered by some jobs; the learner starts it again at its end.
+    Args:
+        out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
+        seed: of world and learner.
+        frames: of the recording; the learner starts it again at its end.
+        jobs: processes that render.
+        stage: opens each stage's report of progress.
 
     Raises:
         CdmisfaError: there is no simulator, or files cannot be written.

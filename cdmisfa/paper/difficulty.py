@@ -82,10 +82,14 @@ def run(settings: Settings) -> Ran:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A stream to learn: frames (n, I) that IncSFA gets, and with which constants.
+    """A stream to learn, with the answer.
 
-    The answer (n,) is batch SFA's slowest output on held-out frames, the test (n, I), and eta its
-    slowness.
+    Attributes:
+        frames: (n, I) what IncSFA gets.
+        config: its constants.
+        test: (n, I) held-out frames.
+        answer: (n,) batch SFA's slowest output on them.
+        eta: its slowness.
     """
 
     frames: NDArray[Any]

@@ -103,8 +103,9 @@ def run(settings: Settings) -> Ran:
 class Curves(Sink):
     """Keeps what the figures show: some signals, and each module's last outputs.
 
-    The arrays have of module i its outputs yi, and of its object the truthi; `encoded` is the
-    correlation of the two.
+    Attributes:
+        arrays: by name; of module i its outputs are yi, the truth of its object truthi.
+        encoded: of each module the correlation with its object.
     """
 
     def __init__(self, tau: int, truth: Sequence[str]) -> None:

@@ -47,7 +47,7 @@ class Request:
     """What is asked of an experiment.
 
     Attributes:
-        trials: trials per condition; None is the paper's number, or where `quick` a few.
+        trials: trials per condition; None is the paper's number, or a few where `quick` is set.
         recording: folder of a recording, for the experiments that see.
         folder: where the experiment's files go.
         force: results of more or other trials may be replaced.
@@ -67,7 +67,13 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A finished trial: what it was told, what it came to in plain values, and its curves."""
+    """A finished trial.
+
+    Attributes:
+        settings: what it was computed for.
+        row: what it came to, in plain values.
+        arrays: curves and the like, for the figures.
+    """
 
     settings: Settings
     row: Mapping[str, Any]
@@ -76,9 +82,12 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of an experiment's table: the paper's value, or "-", and ours over trials.
+    """One line of an experiment's table.
 
     Attributes:
+        quantity: what was measured.
+        paper: the paper's value, as text; "-" where it has none.
+        ours: mean over trials, standard deviation and number of trials.
         interval: 95 % confidence interval, where one was computed.
         digits: decimals to print.
     """

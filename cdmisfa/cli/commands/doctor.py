@@ -96,7 +96,7 @@ def _kernel_cache() -> Iterator[Check]:
         from cdmisfa.agents.iteration import think
         from cdmisfa.features.incsfa import strict
         from replay.recordings import kernels
-    except ImportError:  # said of the package that is missing
+    except ImportError:  # `_packages` says which package is missing
         return
     compiled: tuple[Any, ...] = (think, strict.update, kernels.scan)
     folders = [function.stats.cache_path for function in compiled]

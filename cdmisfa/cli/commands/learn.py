@@ -177,7 +177,8 @@ def announce(address: str) -> None:
 class Reporter(Sink):
     """Shows a run's progress: every module once, the rest a few times a second.
 
-    It was `told` something where anything was learned.
+    Attributes:
+        told: whether any block was learned.
     """
 
     def __init__(self, shown: Bar, max_iterations: int | None) -> None:

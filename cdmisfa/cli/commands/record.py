@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from recorder.recording import ViewRecording
     from replay.camera_logs.source import Align
 
+CONVERTED = ("foreign",)
+"""The source in the manifest of a recording that was converted from camera logs."""
+
 
 @click.command("record")
 @click.argument("scene", required=False)
@@ -77,7 +80,7 @@ def record_command(
     from recorder.world.scenes import SCENES
 
     begun = read_recording(out) if resume and out is not None else Manifest()
-    if begun.source == ("foreign",):  # the kind of camera logs
+    if begun.source == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
     scene = scene or "".join(begun.source)
