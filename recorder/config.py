@@ -53,7 +53,7 @@ class RecordConfig:
         within(self, "record", 1024, 2**28, "chunk_size")
 
 
-def view_names(names: tuple[str, ...], key: str) -> None:
+def check_view_names(names: tuple[str, ...], key: str) -> None:
     """Refuse names of views that could not be told apart, or not be names of files.
 
     Raises:

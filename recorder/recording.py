@@ -16,9 +16,9 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.folder import cleared, refuse_existing, view_logs
-from recorder.log.manifest import Manifest, keep_recording, read_recording
-from recorder.log.resume import FramesHeld, frames_held, make_way, resume_view
+from recorder.log.begun import Begun, keep_recording, read_recording
+from recorder.log.folder import prepared_folder, refuse_existing, view_logs
+from recorder.log.resume import FramesHeld, frames_held, resume_view, set_log_aside
 from recorder.log.split import Split
 from recorder.log.viewfacts import FASTEST, SLOWEST, Identity
 from recorder.log.viewlog import ViewParts
@@ -135,7 +135,7 @@ def record(
             raise UsageError(f"no view {view!r}: the {what} has {', '.join(streams)}")
     chosen = [name for name in streams if not views or name in views]
     with ExitStack() as open_logs:
-        open_logs.enter_context(cleared(folder, chosen if force else ()))
+        open_logs.enter_context(prepared_folder(folder, chosen if force else ()))
         earlier: Earlier = {view: {} for view in chosen}
         if resume:
             earlier, split, frames = _as_begun(folder, identity, chosen, split, frames)
@@ -149,12 +149,12 @@ def record(
             lengths = dict.fromkeys(unfinished, frames)
             limits = {} if split is None else dict.fromkeys(unfinished, str(split))
             options = {"seed": identity.seed, "frames": lengths, "split": limits}
-            keep_recording(folder, unfinished, Manifest((identity.kind,), options))
+            keep_recording(folder, unfinished, Begun((identity.kind,), options))
         poses = dict(zip(streams, getattr(source, "head_poses", ()), strict=False))
         parts = {view: list(place.parts) for view, place in places.items()}
         logs: dict[int, ViewParts] = {}
         for view, place in places.items():
-            log_to_resume = make_way(place)
+            log_to_resume = set_log_aside(place)
             if place.complete:
                 continue
             log = ViewParts(

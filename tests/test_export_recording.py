@@ -294,7 +294,7 @@ def test_wrong_requests_are_named(tmp_path):
 def test_a_view_s_name_leads_nowhere_else():
     names = ("../../x", "a/b", "a_b", ".hidden", "", "left")
     spec = SourceSpec(names, (2, 2), "uint8", (), 50.0, 0, None)
-    found = frames.view_names(spec)
+    found = frames.file_names(spec)
     assert len(set(found)) == len(names)
     assert not any("/" in name or name.startswith(".") for name in found)
     assert found[-1] == "left"

@@ -14,16 +14,16 @@ from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
 from recorder.recording import save_picture
-from recorder.world.eyes import LUMA, eye_matrix, grey, look, perspective
-from recorder.world.icub_config import EyesConfig, IcubConfig, SphereConfig
-from recorder.world.motions import Motions
+from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig
+from recorder.world.icub.eyes import LUMA, eye_matrix, grey, look, perspective
+from recorder.world.icub.motions import Motions
 from recorder.world.scenes import SCENES, open_scene
 
 pytest.importorskip("pybullet")
 
-from recorder.world.live import TRUTH, LiveSource
-from recorder.world.picture import SIZE
-from recorder.world.world import World
+from recorder.world.icub.picture import SIZE
+from recorder.world.icub.source import TRUTH, IcubSource
+from recorder.world.icub.world import World
 
 SCENE = IcubConfig(seed=1)
 FRAMES = 80
@@ -31,7 +31,7 @@ FRAMES = 80
 
 def look_at(scene: IcubConfig, n: int = FRAMES) -> np.ndarray:
     """All views of a scene's first frames, (views, n, height, width)."""
-    source = LiveSource(scene, RecordConfig())
+    source = IcubSource(scene, RecordConfig())
     views = []
     for stream in range(3):
         source.seek(0)
@@ -47,7 +47,7 @@ def seen() -> np.ndarray:
 
 class TestLive(SourceContract):
     def open(self) -> FrameSource:
-        return LiveSource(SCENE, RecordConfig())
+        return IcubSource(SCENE, RecordConfig())
 
 
 def test_the_preset_is_the_default_scene():
@@ -86,7 +86,7 @@ def test_each_object_is_seen_in_its_own_view_and_nowhere_else(seen, number, view
 
 
 def test_the_truth_is_where_the_objects_are(seen):
-    source = LiveSource(SCENE, RecordConfig())
+    source = IcubSource(SCENE, RecordConfig())
     block = source.take(0, FRAMES)
     source.close()
     assert source.spec.truth == TRUTH
@@ -162,7 +162,7 @@ def test_another_seed_is_another_recording(seen):
 
 def test_a_scene_of_another_size(seen):
     eyes = EyesConfig(views=("one",), yaw=(10.0,), width=20, height=10)
-    source = LiveSource(IcubConfig(eyes=eyes, object3=SphereConfig(radius=0.03)), RecordConfig())
+    source = IcubSource(IcubConfig(eyes=eyes, object3=SphereConfig(radius=0.03)), RecordConfig())
     assert source.take(0, 3).frames.shape == (3, 10, 40)
     source.close()
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cdmisfa.core.errors import UsageError
-from recorder.world.icub_config import BoxConfig, IcubConfig, SphereConfig
-from recorder.world.motions import CHUNK, Motions, reflect
+from recorder.world.icub.config import BoxConfig, IcubConfig, SphereConfig
+from recorder.world.icub.motions import CHUNK, Motions, reflect
 
 SCENE = IcubConfig()
 WHOLE = Motions(SCENE, 3).take(2 * CHUNK + 100)

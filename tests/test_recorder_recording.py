@@ -18,14 +18,14 @@ from mcap.reader import make_reader
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import RecordConfig
 from recorder.log import resume
+from recorder.log.begun import RECORDING
 from recorder.log.folder import held
-from recorder.log.manifest import RECORDING
-from recorder.log.messages import METADATA
+from recorder.log.messages import RECORDING_METADATA
 from recorder.log.resume import frames_held
 from recorder.log.split import Split
 from recorder.log.whole import partial_path
 from recorder.recording import RecordingStoppedError, record, record_scene
-from recorder.world.icub_config import IcubConfig
+from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
 from recorder.world.rendering import BLOCK, requests
 from recorder.world.scenes import SCENES, open_scene
@@ -91,7 +91,7 @@ def test_every_view_of_every_frame_is_there_and_equals_live(icub):
 def test_a_file_says_what_it_is(icub):
     with (icub / "center.mcap").open("rb") as file:
         reader = make_reader(file)
-        values = next(m.metadata for m in reader.iter_metadata() if m.name == METADATA)
+        values = next(m.metadata for m in reader.iter_metadata() if m.name == RECORDING_METADATA)
         config = json.loads(next(a.data for a in reader.iter_attachments()))
     expected = {
         "scene": "icub",

@@ -34,7 +34,7 @@ from cdmisfa.experiments.resume import (
 from cdmisfa.experiments.runs import RunResult, run
 from recorder.config import RecordConfig
 from recorder.recording import record_scene
-from recorder.world.icub_config import IcubConfig
+from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference

@@ -46,7 +46,8 @@ FORBIDDEN = {
     "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),
     "recorder.log": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner"),
     "recorder.world": ("recorder.log.logfile", "replay.palette", "cdmisfa.features.sfa", "mcap"),
-    "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.world"),
+    "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
+    "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.images", "replay.viewer.program", "rerun"),
@@ -55,7 +56,7 @@ FORBIDDEN = {
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.mcap.records", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.images", "pybullet"),
-    "replay.viewer": ("cdmisfa.experiments.runs", "recorder.world.world"),
+    "replay.viewer": ("cdmisfa.experiments.runs", "recorder.world.icub.world"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""
 

@@ -26,7 +26,7 @@ from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import versions
-from recorder.log.manifest import Manifest, found_path, kept_path
+from recorder.log.begun import Begun, found_path, relative_path
 from recorder.log.whole import partial_path, whole
 from recorder.world.scenes import SCENES
 
@@ -70,8 +70,8 @@ def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> 
     kept = {name: options[name] for name in OPTIONS if name in options}
     preset = kept.get("preset")
     if preset is not None and preset.endswith(".toml"):
-        kept["preset"] = kept_path(preset, run)
-    return Manifest(tuple(source), kept).as_json(run, SCENES)
+        kept["preset"] = relative_path(preset, run)
+    return Begun(tuple(source), kept).as_json(run, SCENES)
 
 
 def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -83,7 +83,7 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """
     from replay.runs.log import read_header
 
-    begun = Manifest.from_json(read_header(log_to_resume(run)).manifest.get(COMMAND), run)
+    begun = Begun.from_json(read_header(log_to_resume(run)).manifest.get(COMMAND), run)
     if begun is None:
         raise UsageError(f"{run} does not say what it learns from: name its source")
     options = {

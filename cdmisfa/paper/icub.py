@@ -87,7 +87,7 @@ def identity(path: str) -> dict[str, Any]:
 def open_world(settings: Settings) -> FrameSource:
     """The recording, or a live scene of the trial's own seed."""
     if settings["recording"] == LIVE:
-        from recorder.world.icub_config import IcubConfig
+        from recorder.world.icub.config import IcubConfig
         from recorder.world.scenes import open_scene
 
         return open_scene("icub", IcubConfig(seed=settings["seed"]))

@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "recorder.log.logfile": "LogFile",
-        "recorder.log.manifest": "Manifest",
+        "recorder.log.begun": "Begun",
         "recorder.log.split": "Split",
         "recorder.log.viewfacts": "Identity ViewFacts",
         "recorder.log.viewlog": "ViewLog ViewParts",

@@ -67,7 +67,7 @@ def refuse_existing(folder: Path, *, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def cleared(folder: Path, views: Sequence[str]) -> Iterator[None]:
+def prepared_folder(folder: Path, views: Sequence[str]) -> Iterator[None]:
     """Make and hold a recording's folder, and remove what it has of some views.
 
     Raises:

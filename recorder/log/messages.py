@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 
-METADATA = "cdmisfa.recording"
+RECORDING_METADATA = "cdmisfa.recording"
 """Name of the metadata record that says what a recording is."""
 
 SCHEMA_VERSION = 1

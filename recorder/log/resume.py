@@ -22,7 +22,7 @@ from mcap.records import Channel, Message
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.folder import part_name, part_number
-from recorder.log.messages import METADATA, view_topic
+from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity, ViewFacts
 from recorder.log.whole import partial_path
@@ -117,7 +117,7 @@ def resume_view(
     first = 0
     while True:
         path = folder / part_name(view, None if split is None else len(parts))
-        attempts = (path, partial_path(path), kept_path(path))
+        attempts = (path, partial_path(path), aside_path(path))
         found = {p: there[p].whole(first) for p in attempts if p in there}
         later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
         best = max(found, key=lambda p: found[p], default=path)
@@ -137,7 +137,7 @@ def resume_view(
                 "use the same, or overwrite with --force"
             )
         if best == path and stop == frames and not follows:
-            aside = tuple(p for p in found if p == kept_path(path))
+            aside = tuple(p for p in found if p == aside_path(path))
             parts.append((path, stop - first))
             return Resume(path, tuple(parts), stop, stale=aside, complete=True)
         if not follows:
@@ -159,7 +159,7 @@ def resume_view(
     return place
 
 
-def make_way(place: Resume) -> Path | None:
+def set_log_aside(place: Resume) -> Path | None:
     """Remove what is stale, and move the log to be resumed aside.
 
     Returns:
@@ -168,7 +168,7 @@ def make_way(place: Resume) -> Path | None:
     Raises:
         LogWriteError: the disk does not allow it.
     """
-    path, kept = place.path, kept_path(place.path)
+    path, kept = place.path, aside_path(place.path)
     try:
         for old in place.stale:
             old.unlink()
@@ -183,7 +183,7 @@ def make_way(place: Resume) -> Path | None:
     return kept
 
 
-def kept_path(path: Path) -> Path:
+def aside_path(path: Path) -> Path:
     """Where a partial is kept while its frames are copied into the new one."""
     return path.with_name(path.name + ".partial.kept")
 
@@ -204,7 +204,7 @@ def _undamaged(path: Path, read: Callable[[NonSeekingReader], Iterator[Any]]) ->
 def _refuse_other(path: Path, facts: ViewFacts) -> None:
     """Refuse to resume a log that states other facts."""
     records = _undamaged(path, NonSeekingReader.iter_metadata)
-    record = next((m for m in records if m.name == METADATA), None)
+    record = next((m for m in records if m.name == RECORDING_METADATA), None)
     if record is None:
         raise UsageError(f"{path} does not say what it is a recording of: overwrite with --force")
     for key, value in facts.as_metadata().items():

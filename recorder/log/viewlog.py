@@ -12,8 +12,8 @@ from recorder.log.folder import part_name
 from recorder.log.logfile import LogFile
 from recorder.log.messages import (
     ENCODING,
-    METADATA,
     POSE_TOPIC,
+    RECORDING_METADATA,
     TRUTH_TOPIC,
     ImageEncoder,
     PoseEncoder,
@@ -21,7 +21,7 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
-from recorder.log.resume import kept_path, messages
+from recorder.log.resume import aside_path, messages
 from recorder.log.split import Split
 from recorder.log.viewfacts import MAX_FRAMES, Identity, version
 
@@ -80,7 +80,7 @@ class ViewLog:
             compression=settings.compression,
             chunk_size=settings.chunk_size,
         )
-        log.add_metadata(METADATA, identity.facts(view, first_frame).as_metadata())
+        log.add_metadata(RECORDING_METADATA, identity.facts(view, first_frame).as_metadata())
         log.add_attachment(
             CONFIG_NAME, "application/json", identity.config_json(), log_time=spec.start_ns
         )
@@ -184,7 +184,7 @@ class ViewParts:
         """Give the last part its index and its name, and forget what it was copied from."""
         file = self._log.file
         file.finish()
-        kept_path(file.path).unlink(missing_ok=True)
+        aside_path(file.path).unlink(missing_ok=True)
         self._parts.append((file.path, self.t - self._first))
 
     def abandon(self) -> None:
@@ -218,4 +218,4 @@ class ViewParts:
             self._log = self._next()
         finally:
             full.finish()
-        kept_path(full.path).unlink(missing_ok=True)
+        aside_path(full.path).unlink(missing_ok=True)

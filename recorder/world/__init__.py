@@ -5,10 +5,10 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "recorder.world.icub_config": "IcubConfig",
+        "recorder.world.icub.config": "IcubConfig",
+        "recorder.world.icub.motions": "Motions",
+        "recorder.world.icub.source": "IcubSource",
         "recorder.world.oscillatory": "OscillatoryConfig OscillatorySource",
-        "recorder.world.live": "LiveSource",
-        "recorder.world.motions": "Motions",
         "recorder.world.scenes": "SCENES Scene open_scene",
     },
 )

@@ -19,7 +19,7 @@ from cdmisfa.core.blocks import (
 )
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from recorder.config import SceneConfig, view_names
+from recorder.config import SceneConfig, check_view_names
 
 PERIOD = 500
 """Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500."""
@@ -89,7 +89,7 @@ class OscillatoryConfig(SceneConfig):
 
     def __post_init__(self) -> None:
         SceneConfig.__post_init__(self)
-        view_names(self.streams, "scene.streams")
+        check_view_names(self.streams, "scene.streams")
 
 
 class OscillatorySource(SeekableSource):

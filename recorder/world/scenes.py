@@ -13,10 +13,10 @@ from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
-from recorder.world.icub_config import IcubConfig
-from recorder.world.live import LiveSource
+from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.picture import scene_picture
+from recorder.world.icub.source import IcubSource
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
-from recorder.world.picture import scene_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -55,7 +55,7 @@ def _open_oscillatory(config: OscillatoryConfig, record: RecordConfig) -> Seekab
 SCENES: Registry[Scene] = Registry(
     "scene",
     {
-        "icub": Scene(IcubConfig, LiveSource, "icub", scene_picture, ("pybullet", "icub-models")),
+        "icub": Scene(IcubConfig, IcubSource, "icub", scene_picture, ("pybullet", "icub-models")),
         "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
     },
 )

@@ -96,7 +96,7 @@ def read_history(path: Path) -> History:
     stream = np.empty(n, dtype=np.int64)
     policy = np.empty((n, len(shown)), dtype=np.int64)
     stay = np.full((n, len(shown)), np.nan)
-    heard = [_Heard(save.module, save.stream) for save in outline.saved[:SHOWN]]
+    heard = [_OutputCollector(save.module, save.stream) for save in outline.saved[:SHOWN]]
     at = 0
     for columns in read_columns(path, header):
         rows = slice(at, at := at + len(columns))
@@ -121,7 +121,7 @@ def read_history(path: Path) -> History:
     )
 
 
-class _Heard:
+class _OutputCollector:
     """What a module says whenever its own stream is watched; at its save, what it last said."""
 
     def __init__(self, module: int, stream: int) -> None:

@@ -35,7 +35,7 @@ def pieces(source: RecordedSource, stream: int) -> Iterator[Block]:
         yield source.take(stream, min(size, end - t))
 
 
-def view_names(spec: SourceSpec) -> tuple[str, ...]:
+def file_names(spec: SourceSpec) -> tuple[str, ...]:
     """A name for each view that can be one of a file, no two of them the same.
 
     A log may come from anywhere, and call its view `../x`.
@@ -49,7 +49,7 @@ def view_names(spec: SourceSpec) -> tuple[str, ...]:
 
 def write_images(source: RecordedSource, folder: Path) -> int:
     """Write every frame of every view as VIEW/FRAME.png, and return how many there are."""
-    for stream, name in enumerate(view_names(source.spec)):
+    for stream, name in enumerate(file_names(source.spec)):
         (folder / name).mkdir()
         for block in pieces(source, stream):
             for i, frame in enumerate(block.frames):

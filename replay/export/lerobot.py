@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.export.images import pieces, view_names
+from replay.export.images import file_names, pieces
 from replay.export.videos import pixel_format, write_film
 from replay.recordings.source import RecordedSource
 
@@ -72,7 +72,7 @@ def write_lerobot(source: RecordedSource, folder: Path, *, name: str, lossless: 
     stats = {key: _number_stats(column) for key, column in columns.items()}
     videos = []
     if source.spec.images:
-        for stream, view in enumerate(view_names(source.spec)):
+        for stream, view in enumerate(file_names(source.spec)):
             videos.append(key := f"observation.images.{view}")
             file = _place(folder / "videos" / key, "mp4")
             write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY)
@@ -108,7 +108,7 @@ def _columns(
         truth = np.concatenate([block.truth for block in pieces(source, 0)])
         add(STATE, truth.astype(np.float32), list(spec.truth))
     if not spec.images:
-        for stream, view in enumerate(view_names(spec)):
+        for stream, view in enumerate(file_names(spec)):
             frames = np.concatenate([block.frames for block in pieces(source, stream)])
             names = [f"x{i + 1}" for i in range(frames.shape[1])]
             add(f"observation.{view}", frames.astype(np.float32), names)

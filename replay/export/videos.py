@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from replay.export.images import pieces, view_names
+from replay.export.images import file_names, pieces
 from replay.recordings.source import RecordedSource
 
 LOSSY = {"crf": "18", "preset": "medium"}
@@ -34,7 +34,7 @@ FULL_RANGE = 2
 
 def write_films(source: RecordedSource, folder: Path, *, lossless: bool) -> int:
     """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
-    for stream, name in enumerate(view_names(source.spec)):
+    for stream, name in enumerate(file_names(source.spec)):
         write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
     return source.frames * len(source.spec.streams)
 

@@ -13,7 +13,7 @@ from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel
 from replay.mcap.segments import Problem
-from replay.runs.folders import METADATA, RUN_FILE, read_manifest
+from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
 from replay.runs.messages import missing
 from replay.storage.listing import log_files
@@ -127,7 +127,7 @@ def _describe_file(path: Location) -> LogInfo:
                 )
             )
         metadata = {m.name: m.values for m in reader.metadata}
-        version = record_version(metadata.get(METADATA, {}))
+        version = record_version(metadata.get(RUN_METADATA, {}))
         return LogInfo(
             path=str(path),
             kind=surveyed.kind,
@@ -154,5 +154,5 @@ def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
 def _ended(path: Path) -> str | None:
     if path.name != RUN_FILE and not (path / RUN_FILE).is_file():
         return None
-    result = read_manifest(path if path.is_dir() else path.parent).get("result")
+    result = read_run_json(path if path.is_dir() else path.parent).get("result")
     return str(result["ended"]) if isinstance(result, Mapping) and "ended" in result else None

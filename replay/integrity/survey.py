@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.log.messages import METADATA as RECORDING
+from recorder.log.messages import RECORDING_METADATA
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
 from replay.mcap.segments import Problem, Segment
-from replay.runs.folders import METADATA as RUN
+from replay.runs.folders import RUN_METADATA
 from replay.storage.location import Location
 
 SCHEMA: Final = 1
@@ -56,9 +56,9 @@ class Survey:
 def kind_of(reader: LogReader) -> Kind:
     """Tell a recording and a run from other logs by their metadata."""
     names = {m.name for m in reader.metadata}
-    if RECORDING in names:
+    if RECORDING_METADATA in names:
         return "recording"
-    return "run" if RUN in names else "foreign"
+    return "run" if RUN_METADATA in names else "foreign"
 
 
 def _crc(reader: LogReader, decoded: bool) -> Crc:

@@ -19,7 +19,7 @@ from replay.mcap.chunks import Chunks
 from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
 from replay.mcap.segments import Attachment, Message, Problem, Segment
 from replay.mcap.tables import MessageTable, in_order, within
-from replay.mcap.walk import Structure
+from replay.mcap.walk import LogStructure
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import open_store
 
@@ -67,7 +67,7 @@ class LogReader:
         self._file = open_store(self.path)
         try:
             by_index = isinstance(self.path, Url)
-            self._structure = Structure(self._file, self._refuse, by_index=by_index)
+            self._structure = LogStructure(self._file, self._refuse, by_index=by_index)
             definitions = self._structure.definitions
             self._chunks = Chunks(self._file, definitions, self._note, cache_bytes)
             self._settle()

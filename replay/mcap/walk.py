@@ -44,7 +44,7 @@ _OPEN_LENGTH: Final = 2**64 - 1
 _BEFORE_DATA: Final = 1024 * 1024
 
 
-class Structure:
+class LogStructure:
     """What the walk found, or what the summary names.
 
     Args:

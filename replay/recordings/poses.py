@@ -10,7 +10,7 @@ from google.protobuf import message
 
 from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import LogDamagedError
-from recorder.log.messages import METADATA, POSE_TOPIC
+from recorder.log.messages import POSE_TOPIC, RECORDING_METADATA
 from replay.mcap.reader import LogReader
 from replay.storage.listing import log_files
 
@@ -28,7 +28,7 @@ def head_poses(path: Path) -> dict[str, HeadPose]:
     found: dict[str, HeadPose] = {}
     for file in log_files(path):
         with LogReader(file) as reader:
-            facts = next((r.values for r in reader.metadata if r.name == METADATA), {})
+            facts = next((r.values for r in reader.metadata if r.name == RECORDING_METADATA), {})
             entry = next(reader.messages({POSE_TOPIC}), None)
         if entry is None or "view" not in facts:
             continue

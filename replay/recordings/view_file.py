@@ -16,7 +16,7 @@ from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import (
     IMAGE_ENCODING,
     IMAGE_SCHEMA,
-    METADATA,
+    RECORDING_METADATA,
     TRUTH_SCHEMA,
     TRUTH_TOPIC,
     VECTOR_SCHEMA,
@@ -65,10 +65,11 @@ class ViewFile:
             raise
 
     def _open(self) -> None:
-        records = [m for m in self.reader.metadata if m.name == METADATA]
+        records = [m for m in self.reader.metadata if m.name == RECORDING_METADATA]
         if len(records) != 1:
             raise NoRecordingError(
-                f"{self.path}: no recording of cdmisfa ({len(records)} {METADATA} records); "
+                f"{self.path}: no recording of cdmisfa "
+                f"({len(records)} {RECORDING_METADATA} records); "
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
         self.facts = facts = ViewFacts.from_metadata(self.path, records[0].values)

@@ -14,7 +14,7 @@ from replay.mcap.reader import LogReader
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
 
-METADATA = "cdmisfa.run"
+RUN_METADATA = "cdmisfa.run"
 """Name of the metadata record that makes a log that of a run."""
 
 REQUEST = "sweep.json"
@@ -48,10 +48,10 @@ def is_run(path: Path) -> bool:
     if path.is_dir():
         return any(p.is_file() for p in (path / RUN_FILE, partial_path(path / RUN_FILE)))
     with LogReader(run_log(path)) as reader:
-        return any(record.name == METADATA for record in reader.metadata)
+        return any(record.name == RUN_METADATA for record in reader.metadata)
 
 
-def read_manifest(folder: Path) -> Mapping[str, Any]:
+def read_run_json(folder: Path) -> Mapping[str, Any]:
     """How a run was begun and what came of it; empty where nothing readable says so."""
     try:
         document = json.loads((folder / "run.json").read_text("utf-8"))

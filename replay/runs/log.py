@@ -14,7 +14,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION
 from replay.mcap.reader import LogReader
-from replay.runs.folders import METADATA, RUN_FILE, run_log
+from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
 from replay.runs.messages import missing
 
 SIGNALS_TOPIC = "/signals"
@@ -75,13 +75,15 @@ def read_header(path: Path) -> RunHeader:
     """
     log = run_log(path)
     with LogReader(log) as reader:
-        found = next((r.values for r in reader.metadata if r.name == METADATA), None)
+        found = next((r.values for r in reader.metadata if r.name == RUN_METADATA), None)
     if found is None:
         raise UsageError(f"{log} is no run's log: name a run's folder or its {RUN_FILE}")
     schema = record_version(found)
     if schema < 1:  # asked first: all else may look different in a later one
         text = found.get("schema", "")
-        raise LogDamagedError(f"{log}: its metadata {METADATA} is broken (schema {text[:20]!r})")
+        raise LogDamagedError(
+            f"{log}: its metadata {RUN_METADATA} is broken (schema {text[:20]!r})"
+        )
     if schema > SCHEMA_VERSION:
         raise UsageError(
             f"{log} was written with version {schema} of the signals, this is version "
@@ -93,7 +95,7 @@ def read_header(path: Path) -> RunHeader:
             spec[name] = tuple(spec[name])
         return RunHeader(schema, SourceSpec(**spec), json.loads(found["manifest"]))
     except (KeyError, TypeError, ValueError, UsageError) as error:
-        raise LogDamagedError(f"{log}: its metadata {METADATA} is broken ({error})") from error
+        raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
 
 def count_iterations(path: Path) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import joined
-from replay.runs.folders import read_manifest, run_log
+from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import RunHeader, read_header
 from replay.runs.modules import load_modules
 from replay.runs.stretches import read_columns
@@ -42,7 +42,7 @@ class Run:
     @cached_property
     def result(self) -> Mapping[str, Any] | None:
         """What `learn --json` said at its end, None where the run was broken off."""
-        return read_manifest(self.log.parent).get("result")
+        return read_run_json(self.log.parent).get("result")
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:

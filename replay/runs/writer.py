@@ -18,7 +18,7 @@ from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
 from replay.mcap.reader import LogReader
 from replay.runs.columns import columns_of_messages
-from replay.runs.folders import METADATA
+from replay.runs.folders import RUN_METADATA
 from replay.runs.log import EVENT_TOPIC, PHI_TOPIC, SIGNALS_TOPIC, TRUTH_TOPIC, WATCHED_TOPIC
 from replay.runs.messages import (
     MATRIX_SCHEMA,
@@ -78,7 +78,7 @@ class RunWriter(Sink):
         )
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
-            METADATA,
+            RUN_METADATA,
             {
                 "schema": str(SCHEMA_VERSION),
                 "spec": json.dumps(asdict(spec)),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from cdmisfa.core.errors import CdmisfaError
-from replay.runs.folders import read_manifest, run_log
+from replay.runs.folders import read_run_json, run_log
 from replay.view.bindings import Chunk, ChunkStore, ComponentDescriptor
 from replay.view.labels import label
 
@@ -58,15 +58,15 @@ def properties_of(outline: Outline, folder: Path) -> Sections:
 
     Args:
         outline: the run in short.
-        folder: of the run, whose manifest says why it ended.
+        folder: of the run, whose run.json says why it ended.
     """
     began, learned = outline.header.manifest, [outline.names()[s.stream] for s in outline.saved]
     counts = began.get("seed", 0), outline.iterations, outline.frames
-    return {**_configuration(began), "result": _result(counts, learned, read_manifest(folder))}
+    return {**_configuration(began), "result": _result(counts, learned, read_run_json(folder))}
 
 
 def read_properties(run: Path) -> Sections:
-    """The same as `properties_of`, from the manifest of a finished run alone.
+    """The same as `properties_of`, from the run.json of a finished run alone.
 
     The log of a run that has none, or no result in it, is read through.
 
@@ -74,16 +74,16 @@ def read_properties(run: Path) -> Sections:
         UsageError: there is no such run.
         LogDamagedError: it cannot be read.
     """
-    manifest = read_manifest(run)
+    document = read_run_json(run)
     try:
-        found = manifest["result"]
+        found = document["result"]
         learned = [str(module["stream"]) for module in found["modules"]]
-        counts = int(manifest["seed"]), int(found["iterations"]), int(found["frames"])
+        counts = int(document["seed"]), int(found["iterations"]), int(found["frames"])
     except (KeyError, TypeError, ValueError):
         from replay.runs.outline import read_outline  # only where there is no result
 
         return properties_of(read_outline(run), run)
-    return {**_configuration(manifest), "result": _result(counts, learned, manifest)}
+    return {**_configuration(document), "result": _result(counts, learned, document)}
 
 
 def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
@@ -165,13 +165,13 @@ def _configuration(manifest: Mapping[str, Any]) -> Sections:
 
 
 def _result(
-    counts: tuple[Any, int, int], learned: Sequence[str], manifest: Mapping[str, Any]
+    counts: tuple[Any, int, int], learned: Sequence[str], document: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What a run came to, and why it ended, where its manifest says it."""
+    """What a run came to, and why it ended, where its run.json says it."""
     found = dict(zip(("seed", "iterations", "frames"), counts, strict=True))
     found |= {"modules": len(learned), "learned": label(", ".join(learned))}
     with contextlib.suppress(KeyError, TypeError):
-        ending = manifest["result"]
+        ending = document["result"]
         found |= {name: str(ending[name]) for name in ("ended", "signals_sha256")}
     return found
 

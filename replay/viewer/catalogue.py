@@ -1,8 +1,8 @@
 """Many runs in one table: Rerun's own catalogue server over a folder of runs.
 
 A row is a run, its columns are the run's configuration and result; from there each run
-is opened in its own view. The rows come first, from the manifests; the views, which are
-larger and may have to be built, follow as a second layer of the same recordings. Only
+is opened in its own view. The rows come first, from the files run.json; the views, which
+are larger and may have to be built, follow as a second layer of the same recordings. Only
 programs on this machine can connect.
 """
 
@@ -84,7 +84,7 @@ def serve_catalogue(
 
     Raises:
         UsageError: there is no run in it.
-        LogDamagedError: a run without a manifest cannot be read.
+        LogDamagedError: a run without a run.json cannot be read.
         CdmisfaError: the server ended with an error.
     """
     runs = runs_in(folder)

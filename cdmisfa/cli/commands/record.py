@@ -76,10 +76,10 @@ def record_command(
     same seed gives the same bytes.
     """
     from cdmisfa.experiments.sources import configure
-    from recorder.log.manifest import Manifest, read_recording
+    from recorder.log.begun import Begun, read_recording
     from recorder.world.scenes import SCENES
 
-    begun = read_recording(out) if resume and out is not None else Manifest()
+    begun = read_recording(out) if resume and out is not None else Begun()
     if begun.source == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from cdmisfa.core.config import positive, within
 from cdmisfa.core.errors import UsageError
-from recorder.config import SceneConfig, view_names
+from recorder.config import SceneConfig, check_view_names
 
 Range = tuple[float, float]
 
@@ -60,7 +60,7 @@ class EyesConfig:
                 f"scene.eyes.yaw has {len(self.yaw)} angles for the {len(self.views)} views of "
                 "scene.eyes.views: give one for each"
             )
-        view_names(self.views, "scene.eyes.views")
+        check_view_names(self.views, "scene.eyes.views")
         if self.near >= self.far:
             raise UsageError(f"scene.eyes.near is {self.near}: it must be below scene.eyes.far")
         if not any(self.light):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.world.icub_config import IcubConfig
+from recorder.world.icub.config import IcubConfig
 
 NECK_YAW = b"neck_yaw"
 """The joint that turns the head to the left; the last of the neck."""

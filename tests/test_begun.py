@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from cdmisfa.core.errors import LogWriteError
-from recorder.log.manifest import (
+from recorder.log.begun import (
     RECORDING,
-    Manifest,
+    Begun,
     keep_recording,
     read_recording,
 )
@@ -19,23 +19,23 @@ from recorder.log.manifest import (
 
 def test_paths_move_with_the_folder_and_other_words_stay(tmp_path: Path) -> None:
     words = (str(tmp_path / "logs" / "a.mcap"), "icub", "s3://bucket/b.mcap")
-    values = Manifest(words, {"seed": 7}).as_json(tmp_path / "run", names=("icub",))
+    values = Begun(words, {"seed": 7}).as_json(tmp_path / "run", names=("icub",))
     assert values == {"source": ["./../logs/a.mcap", "icub", "s3://bucket/b.mcap"], "seed": 7}
-    moved = Manifest.from_json(json.loads(json.dumps(values)), tmp_path / "new" / "run")
+    moved = Begun.from_json(json.loads(json.dumps(values)), tmp_path / "new" / "run")
     assert moved is not None
     assert moved.source == (str(tmp_path / "new" / "logs" / "a.mcap"), *words[1:])
     assert moved.options == {"seed": 7}
 
 
 @pytest.mark.parametrize("values", [None, [], "x", {}, {"source": "icub"}, {"source": None}])
-def test_what_is_no_manifest_is_none(values: object) -> None:
-    assert Manifest.from_json(values, Path()) is None
+def test_what_does_not_say_how_it_began_is_none(values: object) -> None:
+    assert Begun.from_json(values, Path()) is None
 
 
 def test_a_recording_keeps_what_its_unfinished_views_shall_be(tmp_path: Path) -> None:
     first = {"seed": 1, "frames": {"a": 5, "b": 5}, "split": {"a": "5s", "b": "5s"}}
-    keep_recording(tmp_path, ["a", "b"], Manifest(("icub",), first))
-    longer = Manifest(("icub",), {"seed": 1, "frames": {"a": 9}, "split": {}})
+    keep_recording(tmp_path, ["a", "b"], Begun(("icub",), first))
+    longer = Begun(("icub",), {"seed": 1, "frames": {"a": 9}, "split": {}})
     keep_recording(tmp_path, ["a"], longer)
     begun = read_recording(tmp_path)
     assert begun.source == ("icub",)
@@ -67,4 +67,4 @@ def test_a_disk_that_does_not_take_it_is_named(tmp_path: Path) -> None:
     values: dict[str, Any] = {"frames": {"a": 1}, "split": {}}
     (tmp_path / "nowhere").write_text("a file")
     with pytest.raises(LogWriteError, match=r"nowhere/recording\.json cannot be written"):
-        keep_recording(tmp_path / "nowhere", ["a"], Manifest((), values))
+        keep_recording(tmp_path / "nowhere", ["a"], Begun((), values))

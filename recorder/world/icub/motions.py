@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import check_frame
-from recorder.world.icub_config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
+from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 
 CHUNK = 4096
 """Frames drawn at a time."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from recorder.world.eyes import look, perspective
-from recorder.world.icub_config import IcubConfig, TableConfig
-from recorder.world.motions import Motions
-from recorder.world.world import World
+from recorder.world.icub.config import IcubConfig, TableConfig
+from recorder.world.icub.eyes import look, perspective
+from recorder.world.icub.motions import Motions
+from recorder.world.icub.world import World
 
 if TYPE_CHECKING:
     from PIL import Image

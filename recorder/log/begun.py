@@ -1,15 +1,15 @@
 """How something was begun, kept with it, so that it can be resumed without being told again.
 
-`Manifest` is the one form of it: the words that named the source, and the options of the command
-that make the result what it is. A run keeps its manifest in its log, a recording that is not
-finished keeps its own in RECORDING. Paths are kept relative to the folder, so that the folder can
-be moved together with what it was made from.
+`Begun` is the one form of it: the words that named the source, and the options of the command
+that make the result what it is. A run keeps it within the manifest in its log, a recording that
+is not finished in RECORDING. Paths are kept relative to the folder, so that the folder can be
+moved together with what it was made from.
 
 Example:
-    >>> begun = Manifest(("logs/a.mcap",), {"seed": 7})
+    >>> begun = Begun(("logs/a.mcap",), {"seed": 7})
     >>> begun.as_json(Path("runs/a"))
     {'source': ['./../../logs/a.mcap'], 'seed': 7}
-    >>> Manifest.from_json(begun.as_json(Path("runs/a")), Path("runs/a")) == begun
+    >>> Begun.from_json(begun.as_json(Path("runs/a")), Path("runs/a")) == begun
     True
 """
 
@@ -25,14 +25,14 @@ from typing import Any
 from recorder.log.whole import whole
 
 RECORDING = "recording.json"
-"""Manifest of a recording; gone when every view is finished.
+"""File that says how a recording was begun; gone when every view is finished.
 
 Beside the logs, because these hold the same bytes whatever length was wanted first.
 """
 
 
 @dataclass(frozen=True, slots=True)
-class Manifest:
+class Begun:
     """How something was begun.
 
     Attributes:
@@ -44,24 +44,27 @@ class Manifest:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def as_json(self, folder: Path, names: Collection[str] = ()) -> dict[str, Any]:
-        """The manifest as JSON values, to be kept in a folder.
+        """The same as JSON values, to be kept in a folder.
 
         Args:
             folder: to which paths become relative.
             names: words that are no paths, as those of scenes; URLs are not, either.
         """
-        return {"source": [kept_path(word, folder, names) for word in self.source], **self.options}
+        return {
+            "source": [relative_path(word, folder, names) for word in self.source],
+            **self.options,
+        }
 
     @classmethod
-    def from_json(cls, values: object, folder: Path) -> Manifest | None:
-        """The manifest that a folder keeps; None where the values are not one."""
+    def from_json(cls, values: object, folder: Path) -> Begun | None:
+        """How something was begun, as a folder keeps it; None where the values do not say it."""
         if not isinstance(values, Mapping) or not isinstance(values.get("source"), list):
             return None
         options = {str(name): value for name, value in values.items() if name != "source"}
         return cls(tuple(found_path(str(word), folder) for word in values["source"]), options)
 
 
-def kept_path(word: str, folder: Path, names: Collection[str] = ()) -> str:
+def relative_path(word: str, folder: Path, names: Collection[str] = ()) -> str:
     """A path relative to the folder that keeps it; other words as they are."""
     if word in names or "://" in word:
         return word
@@ -69,12 +72,12 @@ def kept_path(word: str, folder: Path, names: Collection[str] = ()) -> str:
 
 
 def found_path(word: str, folder: Path) -> str:
-    """A word of `kept_path` as it was, or where it lies now."""
+    """A word of `relative_path` as it was, or where it lies now."""
     return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
 
 
-def read_recording(folder: Path) -> Manifest:
-    """The manifest of an unfinished recording, as far as it has a readable one.
+def read_recording(folder: Path) -> Begun:
+    """How an unfinished recording was begun, as far as its folder readably says so.
 
     Returns:
         The scene as its source, and the options `seed`, `frames` and `split`; the latter two are
@@ -86,26 +89,26 @@ def read_recording(folder: Path) -> Manifest:
         split = {v: limit for v, limit in values.get("split", {}).items() if isinstance(limit, str)}
         scene, seed = values.get("scene", ""), values.get("seed")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return Manifest((), {"frames": {}, "split": {}})
+        return Begun((), {"frames": {}, "split": {}})
     known = {"seed": seed} if _is_count(seed) and 0 <= seed < 2**63 else {}
     source = (scene,) if scene and isinstance(scene, str) else ()
-    return Manifest(source, {"frames": frames, "split": split, **known})
+    return Begun(source, {"frames": frames, "split": split, **known})
 
 
-def keep_recording(folder: Path, views: Sequence[str], manifest: Manifest | None = None) -> None:
+def keep_recording(folder: Path, views: Sequence[str], begun: Begun | None = None) -> None:
     """Keep how some views are begun, or that they are finished, beside what the others are.
 
     Raises:
         LogWriteError: the disk does not take it.
     """
     known = read_recording(folder)
-    manifest = manifest or replace(known, options={**known.options, "frames": {}, "split": {}})
+    begun = begun or replace(known, options={**known.options, "frames": {}, "split": {}})
     frames, split = (
         {v: value for v, value in known.options[name].items() if v not in views}
-        | manifest.options[name]
+        | begun.options[name]
         for name in ("frames", "split")
     )
-    scene, seed = "".join(manifest.source), manifest.options.get("seed")
+    scene, seed = "".join(begun.source), begun.options.get("seed")
     path = folder / RECORDING
     if not frames:
         path.unlink(missing_ok=True)

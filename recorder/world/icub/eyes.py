@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import HeadPose
-from recorder.world.icub_config import EyesConfig
-from recorder.world.world import World
+from recorder.world.icub.config import EyesConfig
+from recorder.world.icub.world import World
 
 LUMA = (299, 587, 114)
 """Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly."""

@@ -10,16 +10,16 @@ import numpy as np
 from cdmisfa.core.blocks import Block, HeadPose, SeekableSource, SourceSpec, check_request, freeze
 from cdmisfa.core.config import as_table
 from recorder.config import RecordConfig
-from recorder.world.eyes import Eyes
-from recorder.world.icub_config import IcubConfig
-from recorder.world.motions import Motions
-from recorder.world.world import World
+from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.eyes import Eyes
+from recorder.world.icub.motions import Motions
+from recorder.world.icub.world import World
 
 TRUTH = tuple(f"object{i}_{axis}" for i in (1, 2, 3) for axis in "xy")
 """Columns of ground truth: the objects' positions in the paper's coordinates, metres."""
 
 
-class LiveSource(SeekableSource):
+class IcubSource(SeekableSource):
     """What the robot's eyes see in a scene, rendered when it is asked for, on a clock.
 
     Raises:
