@@ -8,9 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from cdmisfa.core.clock import START_NS
+from cdmisfa.core.clock import RECORDED_FPS, START_NS
 from cdmisfa.core.config import within
 from cdmisfa.core.errors import UsageError
+
+Compression = Literal["zstd", "lz4", "none"]
+"""What the chunks of a log can be compressed with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +47,11 @@ class RecordConfig:
 
     fps: float = 50.0
     start_ns: int = START_NS
-    compression: Literal["zstd", "lz4", "none"] = "zstd"
+    compression: Compression = "zstd"
     chunk_size: int = 1024 * 1024
 
     def __post_init__(self) -> None:
-        within(self, "record", 1e-3, 1e6, "fps")
+        within(self, "record", *RECORDED_FPS, "fps")
         within(self, "record", 0, 2**62, "start_ns")
         within(self, "record", 1024, 2**28, "chunk_size")
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
@@ -20,7 +21,7 @@ from recorder.log.begun import Begun, keep_recording, read_recording
 from recorder.log.folder import prepared_folder, refuse_existing, view_logs
 from recorder.log.resume import FramesHeld, frames_held, resume_view, set_log_aside
 from recorder.log.split import Split
-from recorder.log.viewfacts import FASTEST, SLOWEST, Identity
+from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewParts
 from recorder.log.whole import whole
 from recorder.world.rendering import render_in_processes, take_here
@@ -228,10 +229,11 @@ def _identity(
             f"a recording holds gray images, (height, width) uint8, or vectors, (n,) float64, not "
             f"{spec.frame_shape} {spec.dtype}"
         )
-    if not SLOWEST <= spec.fps <= FASTEST:
+    slowest, fastest = RECORDED_FPS
+    if not slowest <= spec.fps <= fastest:
         raise UsageError(
             f"a recording of {spec.fps} frames a second cannot be read: give it an fps in "
-            f"[{SLOWEST:g}, {FASTEST:g}]"
+            f"[{slowest:g}, {fastest:g}]"
         )
     if scene is None:
         stated = dict(source.describe())

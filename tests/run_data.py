@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.signals import BlockSignals
-from replay.runs.stretches import read_stretches
+from replay.runs.stretches import read_columns, read_stretches
 from replay.runs.writer import RunWriter
 
 START_NS = 1_451_606_400_000_000_000
@@ -22,6 +22,12 @@ IMAGE = SourceSpec(
     ("left", "center", "right"), (12, 16), "uint8", ("box_y", "ball_y"), 50.0, START_NS
 )
 VECTOR = SourceSpec(("x1", "x2", "x3"), (2,), "float64", ("theta",), 50.0, START_NS)
+
+
+def read_signals(path: Path) -> Iterator[BlockSignals]:
+    """Every record of a run, in order, one by one."""
+    for columns in read_columns(path):
+        yield from columns.records()
 
 
 def block_of(spec: SourceSpec, stream: int, t: int, tau: int, rng: np.random.Generator) -> Block:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from run_data import read_signals
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -16,7 +17,6 @@ from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.recordings.poses import head_poses, yaw_of
 from replay.recordings.source import RecordedSource
-from replay.runs.stretches import read_signals
 from replay.view.build import build_view
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from PIL import Image
-from run_data import IMAGE, VECTOR, having, run_of
+from run_data import IMAGE, VECTOR, having, read_signals, run_of
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
@@ -18,7 +18,6 @@ from cdmisfa.experiments import runs
 from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings import kernels as scan
-from replay.runs.stretches import read_signals
 from replay.viewer import display, headless, live
 from replay.viewer.live import LiveView
 

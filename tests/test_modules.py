@@ -11,7 +11,7 @@ import pytest
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.resume import Checkpoint, checkpoints, load_checkpoint, save_checkpoint
 from replay.runs.modules import load_modules, save_modules
@@ -120,3 +120,20 @@ def test_checkpoints_keep_both_and_are_read_without(tmp_path: Path) -> None:
     np.savez(path, **old)
     learner.restore(load_checkpoint(path).state)
     assert {(m.expansion, m.scale) for m in learner.modules} == {("none", 1 / 255)}
+
+
+def test_a_write_that_fails_leaves_the_earlier_modules_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "modules.npz"
+    save_modules(path, [with_width(2)])
+    before = path.read_bytes()
+
+    def full(file: Any, **arrays: Any) -> None:
+        file.write(b"PK")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(LogWriteError, match=r"modules\.npz cannot be written: No space left"):
+        save_modules(path, [with_width(3)])
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [(path.name, before)]

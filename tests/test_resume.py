@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from run_data import parts_of
+from run_data import parts_of, read_signals
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
@@ -38,7 +38,6 @@ from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
-from replay.runs.stretches import read_signals
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from run_data import parts_of
+from run_data import parts_of, read_signals
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
@@ -22,7 +22,6 @@ from cdmisfa.experiments.runs import RunResult
 from cdmisfa.experiments.runs import run as run_it
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
-from replay.runs.stretches import read_signals
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
 

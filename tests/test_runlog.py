@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from run_data import IMAGE, VECTOR, parts_of, rows_of, run_of, signals_of, write_run
+from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, signals_of, write_run
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -26,7 +26,6 @@ from replay.runs.folders import is_run
 from replay.runs.log import read_header
 from replay.runs.messages import decode_matrix, decode_signals, encode_signals
 from replay.runs.modules import load_modules, save_modules
-from replay.runs.stretches import read_signals
 from replay.runs.writer import RunWriter
 
 

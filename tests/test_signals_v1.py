@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from run_data import VECTOR, having, parts_of, rows_of, write_run
+from run_data import VECTOR, having, parts_of, read_signals, rows_of, write_run
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -23,7 +23,6 @@ from replay.runs.compare import first_difference
 from replay.runs.log import read_header
 from replay.runs.messages import decode_signals, encode_signals
 from replay.runs.outline import read_outline
-from replay.runs.stretches import read_signals
 from replay.runs.writer import RunWriter
 from replay.view import layout
 

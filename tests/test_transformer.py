@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from run_data import rows_of
+from run_data import read_signals, rows_of
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -15,7 +15,6 @@ from cdmisfa.core.modules import Module
 from cdmisfa.experiments import runs
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import save_modules
-from replay.runs.stretches import read_signals
 from replay.runs.transformer import SlowFeatures
 
 

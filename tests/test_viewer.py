@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 from PIL import Image
-from run_data import IMAGE, VECTOR, run_of, write_run
+from run_data import IMAGE, VECTOR, read_signals, run_of, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from replay.runs.stretches import read_signals
 from replay.view import layout
 from replay.view.bindings import viewer_program
 from replay.view.build import build_view

@@ -19,6 +19,9 @@ START_NS = 1_451_606_400_000_000_000
 SLOWEST = 1e-6
 """Frames a second of the slowest clock; the fastest has one a nanosecond, the unit of time."""
 
+RECORDED_FPS = (1e-3, 1e6)
+"""Fewest and most frames a second that a recording can have, or logs of cameras be sampled at."""
+
 Times = NDArray[np.int64]
 
 

@@ -16,6 +16,7 @@ from typing import Literal, Self
 from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.config import Compression
 from recorder.log.whole import partial_path
 
 FLUSH_NS = 1_000_000_000
@@ -23,8 +24,6 @@ FLUSH_NS = 1_000_000_000
 
 A run's log flushes by wall time (`replay/runs/writer.py`).
 """
-
-Compression = Literal["zstd", "lz4", "none"]
 
 
 class LogFile:

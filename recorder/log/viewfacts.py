@@ -15,16 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.clock import frames_of, times_of
+from cdmisfa.core.clock import RECORDED_FPS, frames_of, times_of
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import SCHEMA_VERSION
 
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
-SLOWEST: Final = 1e-3
-FASTEST: Final = 1e6
-"""Frames a second that a recording can have."""
 
 PACKAGES: Final = ("cdmisfa", "numpy", "zstandard")
 """Packages whose versions every file states."""
@@ -130,8 +127,9 @@ class ViewFacts:
             fps = float(values.get("fps", ""))
         except ValueError:
             fps = math.nan
-        if not SLOWEST <= fps <= FASTEST:
-            raise refuse("fps", "it must be in [0.001, 1000000]")
+        slowest, fastest = RECORDED_FPS
+        if not slowest <= fps <= fastest:
+            raise refuse("fps", f"it must be in [{slowest:g}, {fastest:.0f}]")
         truth = _names(values.get("truth", ""))
         if len(set(truth)) != len(truth) or not all(n.isidentifier() for n in truth):
             raise refuse("truth", "they must be different names")

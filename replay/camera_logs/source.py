@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
+from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from replay.camera_logs.alignment import (
     Rows,
@@ -74,8 +75,9 @@ class ForeignSource(SeekableSource):
                 need `align`.
             LogDamagedError: a log is damaged.
         """
-        if rate is not None and not 1e-3 <= rate <= 1e6:
-            raise UsageError(f"--rate is {rate}: it must be in [0.001, 1000000]")
+        slowest, fastest = RECORDED_FPS
+        if rate is not None and not slowest <= rate <= fastest:
+            raise UsageError(f"--rate is {rate}: it must be in [{slowest:g}, {fastest:.0f}]")
         if min(size) < 1:
             raise UsageError(f"--size is {size[1]}x{size[0]}: it must be above 0")
         named = [paths] if isinstance(paths, str | Path | Url) else paths

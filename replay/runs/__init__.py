@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = face(
         "replay.runs.run": "Run",
         "replay.runs.writer": "RunWriter",
         "replay.runs.columns": "SignalColumns",
-        "replay.runs.stretches": "read_columns read_signals read_stretches",
+        "replay.runs.stretches": "read_columns read_stretches",
         "replay.runs.outline": "Outline read_outline",
         "replay.runs.compare": "Difference first_difference side_by_side",
         "replay.runs.modules": "load_modules save_modules",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -12,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.modules import Module
-from recorder.log.whole import partial_path
+from recorder.log.whole import whole
 
 MODULES_FILE = "modules.npz"
 """Name of the file in a run's folder."""
@@ -33,21 +32,14 @@ def save_modules(path: Path, modules: Iterable[Module]) -> None:
     """Write modules as arrays `module<index>_<field>`, whole or not at all.
 
     Raises:
-        CdmisfaError: the file cannot be written.
+        LogWriteError: the file cannot be written.
     """
     arrays: dict[str, Any] = {}
     for module in modules:
         for field in dataclasses.fields(Module):
             arrays[_key(module.index, field.name)] = getattr(module, field.name)
-    partial = partial_path(Path(path))
-    try:
-        with open(partial, "wb") as file:
-            np.savez(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        raise CdmisfaError(f"{path} cannot be written: {error.strerror or error}") from error
+    with whole(Path(path)) as partial, open(partial, "wb") as file:
+        np.savez(file, **arrays)
 
 
 def load_modules(path: Path) -> tuple[Module, ...]:

@@ -14,7 +14,6 @@ from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.signals import BlockSignals
 from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
 from replay.runs.columns import SignalColumns, columns_of_messages
@@ -110,12 +109,6 @@ def read_columns(path: Path, header: RunHeader | None = None) -> Iterator[Signal
     """Every record of a run, in order, as arrays; see `read_stretches`."""
     for stretch in read_stretches(path, header, topics=(SIGNALS_TOPIC,)):
         yield from stretch.signals
-
-
-def read_signals(path: Path, header: RunHeader | None = None) -> Iterator[BlockSignals]:
-    """Every record of a run, in order, one by one; see `read_stretches`."""
-    for columns in read_columns(path, header):
-        yield from columns.records()
 
 
 class _Waiting:
