@@ -18,7 +18,7 @@ from cdmisfa.agents.learners import LEARNERS, LearnerEntry
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
-from cdmisfa.experiments.trial import has_trials, run_trial
+from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from cdmisfa.features.feature import Feature
 from cdmisfa.features.incsfa.abstraction import MANY_INPUTS
 from recorder.world.oscillatory import OscillatorySource
@@ -135,8 +135,8 @@ def test_a_feature_of_ones_own_is_learned_with_and_restored() -> None:
 
 
 def test_a_learner_without_compiled_code_has_no_trials() -> None:
-    assert has_trials(QUICK)
-    assert not has_trials(PlainConfig())
+    assert has_compiled_trials(QUICK)
+    assert not has_compiled_trials(PlainConfig())
     with pytest.raises(UsageError, match=r"learner\.algorithm plain has no compiled trials"):
         run_trial(PlainConfig(), seed=0)
 

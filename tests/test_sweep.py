@@ -91,8 +91,8 @@ def test_the_world_has_the_seed_of_the_trial_unless_it_was_given_one() -> None:
 
 def test_a_worker_with_other_code_refuses() -> None:
     (trial,) = plan("oscillatory", grid={}, seeds=[0], max_iterations=5)
-    assert "error" not in sweeping.run_trial(trial)
-    refused = sweeping.run_trial(dataclasses.replace(trial, code="0.0.0+another"))
+    assert "error" not in sweeping.compute(trial)
+    refused = sweeping.compute(dataclasses.replace(trial, code="0.0.0+another"))
     assert "not 0.0.0+another" in refused["error"]
 
 
@@ -176,18 +176,18 @@ def test_failed_trials_are_listed_and_retried_when_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     computed: list[int] = []
-    healthy = sweeping.run_trial
+    healthy = sweeping.compute
 
-    def flaky(trial: sweeping.Trial) -> dict[str, Any]:
+    def flaky(trial: sweeping.SweepTrial) -> dict[str, Any]:
         computed.append(trial.seed)
         return {"error": "no luck"} if trial.seed == 1 else healthy(trial)
 
-    monkeypatch.setattr(sweeping, "run_trial", flaky)
+    monkeypatch.setattr(sweeping, "compute", flaky)
     first = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     assert [(row["seed"], row["error"]) for row in first.failed] == [(1, "no luck")]
     second = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     assert (second.skipped, len(second.failed)) == (3, 1)
-    monkeypatch.setattr(sweeping, "run_trial", healthy)
+    monkeypatch.setattr(sweeping, "compute", healthy)
     third = sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30, retry_failed=True)
     assert (third.skipped, third.computed, third.failed) == (2, 1, ())
     assert computed == [0, 1, 2]

@@ -27,7 +27,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "info": ("logs", "Say what is in a recording, a run or any MCAP file."),
     "verify": ("logs", "Check that a log is whole: structure, checksums, no gaps."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
-    "convert": ("record", "Write camera logs of others as a recording."),
+    "convert": ("convert", "Write camera logs of others as a recording."),
     "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),
     "plot": ("runs", "Draw the figures of a run."),
     "export": (
@@ -44,7 +44,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "reproduce",
         "Reproduce an experiment of the paper: numbers, tables and figures.",
     ),
-    "demo": ("reproduce", "Record, learn, check and show: the whole story in minutes."),
+    "demo": ("demo", "Record, learn, check and show: the whole story in minutes."),
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }
 """Each command with its module in this package and its line of help."""

@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = face(
         "cdmisfa.experiments.runs": "RunExhaustedError RunResult run",
         "cdmisfa.experiments.sources": "CameraOptions Configuration configure open_source",
         "cdmisfa.experiments.store": "TrialStore",
-        "cdmisfa.experiments.sweep": "SweepReport Trial",
+        "cdmisfa.experiments.sweep": "SweepReport SweepTrial",
         "cdmisfa.experiments.trial": "run_trial",
     },
 )

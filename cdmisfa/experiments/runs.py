@@ -217,6 +217,7 @@ def _run_log(
 
     On failure a log that is not finished is left as a readable prefix.
     """
+    from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
     from replay.runs.writer import RunWriter
 
     if not resume:
@@ -227,17 +228,17 @@ def _run_log(
         except OSError as error:
             raise _no_folder(out, error) from error
     with held(out):
-        stale = [out / name for name in ("run.json", "modules.npz", "run.rrd")]
+        stale = [out / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE)]
         if resume:
             set_aside(out, spec, manifest)
         else:
-            stale += [out / "run.mcap", out / SET_ASIDE, *checkpoints(out)]
+            stale += [out / RUN_FILE, out / SET_ASIDE, *checkpoints(out)]
         try:
             for path in stale:
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise _no_folder(out, error) from error
-        log = RunWriter(out / "run.mcap", spec, manifest, force=force or resume)
+        log = RunWriter(out / RUN_FILE, spec, manifest, force=force or resume)
         try:
             yield log
         except BaseException:
@@ -296,9 +297,10 @@ def _write_run(
     *,
     rerun: bool,
 ) -> None:
+    from replay.runs.folders import MODULES_FILE, RUN_JSON, VIEW_FILE
     from replay.runs.modules import save_modules
 
-    save_modules(out / "modules.npz", result.modules)
+    save_modules(out / MODULES_FILE, result.modules)
     document = {
         "schema": 1,
         "signals_schema": SCHEMA_VERSION,
@@ -311,8 +313,8 @@ def _write_run(
         "result": result.as_json(),
         **begun,
     }
-    write_json(out / "run.json", document)
+    write_json(out / RUN_JSON, document)
     if rerun:
         from replay.view.build import build_view
 
-        build_view(out, out / "run.rrd")
+        build_view(out, out / VIEW_FILE)

@@ -115,7 +115,9 @@ def configure(
     )
 
 
-def preset_for(spec: SourceSpec, described: Mapping[str, Any], preset: str | None = None) -> str:
+def scene_kind_for(
+    spec: SourceSpec, described: Mapping[str, Any], preset: str | None = None
+) -> str:
     """The kind of scene, and so the preset, for a recording: that of its scene.
 
     What shows another scene takes the kind of the `preset` chosen, else by what a frame is.
@@ -194,7 +196,7 @@ def open_source(
     else:
         source = _open_log(paths, cameras, loop=loop, salvage=salvage)
     try:
-        kind = preset_for(source.spec, source.describe(), preset)
+        kind = scene_kind_for(source.spec, source.describe(), preset)
         return source, configure(kind, preset, settings, seed)
     except BaseException:
         source.close()

@@ -64,10 +64,10 @@ class TrialStore:
             self.rows = {row["id"]: row for row in read_rows(folder)}
             self._opened = opened.pop_all()
 
-    def is_open(self, trial: str, kept: Path | None = None, *, retry: bool = False) -> bool:
-        """Whether a trial is to be computed; with `retry` also one that has failed.
+    def needs_computing(self, trial: str, kept: Path | None = None, *, retry: bool = False) -> bool:
+        """Whether a trial has no row yet, or what was `kept` of it beside its row is gone.
 
-        It is, too, where what is `kept` of it beside its row has been removed.
+        One that has failed needs computing only with `retry`.
         """
         row = self.rows.get(trial)
         if row is None or (retry and row["status"] == FAILED):

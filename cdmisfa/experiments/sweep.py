@@ -19,10 +19,9 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.runs import module_table, run
-from cdmisfa.experiments.sources import Configuration, configure, open_source, preset_for
+from cdmisfa.experiments.sources import Configuration, configure, open_source, scene_kind_for
 from cdmisfa.experiments.store import DONE, FAILED, TrialStore, code, identity
-from cdmisfa.experiments.trial import has_trials
-from cdmisfa.experiments.trial import run_trial as run_oscillatory
+from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES, open_scene
@@ -35,7 +34,7 @@ UNKEPT = ("schema", "run", "source", "seed", "signals_sha256")
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class SweepTrial:
     """One run of a sweep, and everything a worker needs to compute it.
 
     Attributes:
@@ -138,15 +137,15 @@ def sweep(
     )
     with contextlib.closing(TrialStore(folder)) as store:
         write_json(folder / REQUEST, _request(grid or {}, trials))
-        open_trials = [t for t in trials if store.is_open(t.id, t.log, retry=retry_failed)]
-        outdated = _outdated(open_trials, store.rows.values())
-        finished = skipped = len(trials) - len(open_trials)
-        again = {trial.id for trial in open_trials}
+        missing = [t for t in trials if store.needs_computing(t.id, t.log, retry=retry_failed)]
+        outdated = _outdated(missing, store.rows.values())
+        finished = skipped = len(trials) - len(missing)
+        again = {trial.id for trial in missing}
         failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in again)
         for index, result in run_all(
-            run_trial, open_trials, jobs=jobs, engine=engine, scheduler=scheduler
+            compute, missing, jobs=jobs, engine=engine, scheduler=scheduler
         ):
-            trial = open_trials[index]
+            trial = missing[index]
             row = _row(trial, result)
             store.add(row)
             finished += 1
@@ -158,7 +157,7 @@ def sweep(
         folder=folder,
         trials=len(trials),
         skipped=skipped,
-        computed=sum(rows[t.id]["status"] == DONE for t in open_trials),
+        computed=sum(rows[t.id]["status"] == DONE for t in missing),
         failed=tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED),
         outdated=outdated,
     )
@@ -175,7 +174,7 @@ def plan(
     max_iterations: int | None = None,
     max_modules: int | None = None,
     logs: Path | None = None,
-) -> list[Trial]:
+) -> list[SweepTrial]:
     """Every trial of a sweep, in the grid's order, seeds innermost; checks all settings.
 
     Raises:
@@ -191,7 +190,7 @@ def plan(
     paths = tuple(str(w) if w == kind or "://" in str(w) else str(Path(w).resolve()) for w in words)
     each = tuple(dict.fromkeys(seeds))
     limits = [max_iterations, max_modules]
-    trials: dict[str, Trial] = {}
+    trials: dict[str, SweepTrial] = {}
     for point in points:
         chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
         seeded = _seeded(kind, preset, chosen)
@@ -201,7 +200,7 @@ def plan(
             if recorded is None:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
             name = identity(depends, seed, recorded, limits, code())
-            trial = Trial(
+            trial = SweepTrial(
                 id=name,
                 source=paths,
                 configuration=configuration,
@@ -234,7 +233,7 @@ def _identify(words: tuple[str | Path, ...], preset: str | None, loop: bool) -> 
     source, _ = open_source(words, loop=loop)
     try:
         described = dict(source.describe())
-        return preset_for(source.spec, described, preset), described
+        return scene_kind_for(source.spec, described, preset), described
     finally:
         source.close()
 
@@ -243,7 +242,7 @@ def _is_live(words: Sequence[str | Path]) -> bool:
     return len(words) == 1 and words[0] in SCENES
 
 
-def run_trial(trial: Trial) -> dict[str, Any]:
+def compute(trial: SweepTrial) -> dict[str, Any]:
     """Compute one trial: its result, or under "error" why there is none.
 
     Oscillatory trials without a log run as a whole in compiled code where the learner has it;
@@ -253,7 +252,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         return {"error": f"the worker has cdmisfa {code()}, not {trial.code}: install the same"}
     try:
         live = trial.source == ("oscillatory",) and trial.log is None
-        if live and has_trials(trial.configuration.learner):
+        if live and has_compiled_trials(trial.configuration.learner):
             return _compiled_trial(trial)
         return _logged_trial(trial)
     except CdmisfaError as error:
@@ -263,9 +262,9 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         return {"error": f"{type(error).__name__}: {error}"}
 
 
-def _compiled_trial(trial: Trial) -> dict[str, Any]:
+def _compiled_trial(trial: SweepTrial) -> dict[str, Any]:
     streams = cast(OscillatoryConfig, trial.configuration.scene).streams
-    result = run_oscillatory(
+    result = run_trial(
         trial.configuration.learner,
         streams,
         seed=trial.seed,
@@ -282,7 +281,7 @@ def _compiled_trial(trial: Trial) -> dict[str, Any]:
     }
 
 
-def _logged_trial(trial: Trial) -> dict[str, Any]:
+def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     configuration = trial.configuration
     if _is_live(trial.source):
         source = open_scene(trial.source[0], configuration.scene, configuration.record)
@@ -306,7 +305,7 @@ def _logged_trial(trial: Trial) -> dict[str, Any]:
     return {key: value for key, value in told.items() if key not in UNKEPT}
 
 
-def _row(trial: Trial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
+def _row(trial: SweepTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
     if isinstance(result, WorkerDied):
         result = {"error": result.what}
     failed = "error" in result
@@ -321,7 +320,7 @@ def _row(trial: Trial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]
     }
 
 
-def _outdated(trials: Sequence[Trial], rows: Iterable[Mapping[str, Any]]) -> int:
+def _outdated(trials: Sequence[SweepTrial], rows: Iterable[Mapping[str, Any]]) -> int:
     """How many trials are in the rows already, but computed by other code."""
     done = {
         (json.dumps(row["point"], sort_keys=True), row["seed"])
@@ -331,7 +330,7 @@ def _outdated(trials: Sequence[Trial], rows: Iterable[Mapping[str, Any]]) -> int
     return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)
 
 
-def _request(grid: Mapping[str, Sequence[Any]], trials: Sequence[Trial]) -> dict[str, Any]:
+def _request(grid: Mapping[str, Sequence[Any]], trials: Sequence[SweepTrial]) -> dict[str, Any]:
     return {
         "schema": 1,
         "source": [str(word) for word in trials[0].source] if trials else [],

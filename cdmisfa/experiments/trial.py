@@ -164,7 +164,7 @@ def run_iterations(
     return len(uniforms)
 
 
-def has_trials(config: Any) -> bool:
+def has_compiled_trials(config: Any) -> bool:
     """Whether the learner of a configuration, and what it learns with, has compiled code."""
     return _compiles(open_learner(config, OscillatorySource().spec, 0))
 

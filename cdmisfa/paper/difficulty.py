@@ -19,7 +19,7 @@ from cdmisfa.experiments.statistics import correlation, stays_above
 from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.features.sfa import batch_sfa, slowness
 from cdmisfa.paper import icub, oscillatory, panels
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, groups
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, groups
 from replay.recordings.source import RecordedSource
 
 TITLE = "Learning difficulty"
@@ -74,7 +74,7 @@ def _recording(request: Request) -> Path | None:
     return made if (made / "finished.json").exists() and not request.quick else None
 
 
-def run(settings: Settings) -> Ran:
+def run(settings: Settings) -> Output:
     """Learn one stream alone and compare with batch SFA as it goes."""
     task = _task(settings["scene"], settings["stream"], settings["recording"])
     return compare(task, settings["seed"])
@@ -129,7 +129,7 @@ def _view(recording: str, stream: int, count: int) -> NDArray[Any]:
         return source.take(stream, count).frames.reshape(count, -1)
 
 
-def compare(task: Task, seed: int) -> Ran:
+def compare(task: Task, seed: int) -> Output:
     """Frames until IncSFA's slowest output stays in the direction of batch SFA's."""
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     sfa = IncSFA(task.config, task.frames.shape[1], rng)

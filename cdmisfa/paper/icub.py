@@ -22,7 +22,7 @@ from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import learn
 from cdmisfa.experiments.statistics import correlation
 from cdmisfa.paper import panels
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, learned
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, learned
 from replay.recordings.source import RecordedSource
 
 TITLE = "Curiosity-driven, vision-enabled iCub"
@@ -94,7 +94,7 @@ def open_world(settings: Settings) -> FrameSource:
     return RecordedSource(settings["recording"])
 
 
-def run(settings: Settings) -> Ran:
+def run(settings: Settings) -> Output:
     """One trial: 1400 iterations, or as many as the recording has."""
     with contextlib.closing(open_world(settings)) as source:
         return watch(source, learner_config(), settings["seed"], ITERATIONS)
@@ -136,7 +136,7 @@ class Curves(Sink):
         self.arrays |= {name: np.stack(values) for name, values in self._curves.items()}
 
 
-def watch(source: FrameSource, config: LearnerConfig, seed: int, iterations: int) -> Ran:
+def watch(source: FrameSource, config: LearnerConfig, seed: int, iterations: int) -> Output:
     """Learn from a source, and keep the curves and each module's last outputs."""
     learner = open_learner(config, source.spec, seed)
     curves = Curves(learner.tau, source.spec.truth)

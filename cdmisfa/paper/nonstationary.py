@@ -14,7 +14,7 @@ from cdmisfa.experiments.statistics import Midpoint, Summary, logistic_midpoint
 from cdmisfa.experiments.trial import Swap, run_trial
 from cdmisfa.paper import panels
 from cdmisfa.paper.oscillatory import learner_config
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, groups
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, groups
 
 TITLE = "Non-stationary environments"
 
@@ -55,7 +55,7 @@ def plan(request: Request) -> list[dict[str, Any]]:
     ]
 
 
-def run(settings: Settings) -> Ran:
+def run(settings: Settings) -> Output:
     """Streams zero, x2, x3; the first becomes x1 when epsilon falls below epsilon^c."""
     config = learner_config(
         **{settings["key"]: settings["value"]},

@@ -15,7 +15,7 @@ from cdmisfa.core.modules import Module
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.features.slowness import instantaneous_slowness
 from cdmisfa.paper import panels
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, learned
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, learned
 from recorder.world.oscillatory import one_period
 
 TITLE = "Oscillatory streams"
@@ -38,7 +38,7 @@ def plan(request: Request) -> list[dict[str, Any]]:
     return [{"seed": seed} for seed in range(request.count(20, 4))]
 
 
-def run(settings: Settings) -> Ran:
+def run(settings: Settings) -> Output:
     """One trial until three modules are learned."""
     result = run_trial(
         learner_config(), seed=settings["seed"], max_iterations=MAX_ITERATIONS, curves=True

@@ -38,7 +38,7 @@ SETTING = "set_"
 
 Settings = Mapping[str, Any]
 Arrays = Mapping[str, NDArray[Any]]
-Ran = tuple[dict[str, Any], Arrays]
+Output = tuple[dict[str, Any], Arrays]
 """A trial's row, in plain values, and its arrays."""
 
 
@@ -179,7 +179,7 @@ class Experiment(Protocol):
     def plan(self, request: Request) -> list[dict[str, Any]]:
         """Settings of every trial, as JSON values."""
 
-    def run(self, settings: Settings) -> Ran:
+    def run(self, settings: Settings) -> Output:
         """One trial: its row and its arrays. Called in another process, maybe elsewhere."""
 
     def evaluate(self, trials: Sequence[Trial]) -> Findings:
@@ -221,7 +221,7 @@ def reproduce(
     names = [identity(name, settings, version) for settings in planned]
     curves = [request.folder / "trials" / f"{n}.npz" for n in names]
     with contextlib.closing(TrialStore(request.folder)) as store:
-        missing = [i for i, n in enumerate(names) if store.is_open(n, curves[i])]
+        missing = [i for i, n in enumerate(names) if store.needs_computing(n, curves[i])]
         tasks = [(name, planned[i]) for i in missing]
         if progress is not None:
             progress(len(planned) - len(missing), len(planned))
@@ -269,7 +269,7 @@ def reproduce(
     return document
 
 
-def run_one(task: tuple[str, Settings]) -> Ran:
+def run_one(task: tuple[str, Settings]) -> Output:
     """One trial of the named experiment, for any process to call."""
     name, settings = task
     return experiment(name).run(settings)

@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.paper import panels
 from cdmisfa.paper.oscillatory import learner_config
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Ran, Request, Settings, Trial, groups
+from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, groups
 
 TITLE = "CD-MISFA 1.0 against 2.0"
 
@@ -30,7 +30,7 @@ def plan(request: Request) -> list[dict[str, Any]]:
     return [{"algorithm": a, "seed": seed} for a in ALGORITHMS for seed in range(n)]
 
 
-def run(settings: Settings) -> Ran:
+def run(settings: Settings) -> Output:
     """Epsilon falls by .998 an iteration and is 0 from .8 on; count the policy's changes then."""
     config = learner_config(
         algorithm=settings["algorithm"], epsilon_decay=0.998, epsilon_tail_decay=0.0, **NEVER

@@ -14,6 +14,15 @@ from replay.mcap.reader import LogReader
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
 
+RUN_JSON = "run.json"
+"""Name of the file that says how a run was begun and what came of it."""
+
+MODULES_FILE = "modules.npz"
+"""Name of the file of the frozen modules."""
+
+VIEW_FILE = "run.rrd"
+"""Name of the view."""
+
 RUN_METADATA = "cdmisfa.run"
 """Name of the metadata record that makes a log that of a run."""
 
@@ -54,7 +63,7 @@ def is_run(path: Path) -> bool:
 def read_run_json(folder: Path) -> Mapping[str, Any]:
     """How a run was begun and what came of it; empty where nothing readable says so."""
     try:
-        document = json.loads((folder / "run.json").read_text("utf-8"))
+        document = json.loads((folder / RUN_JSON).read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, Mapping) else {}

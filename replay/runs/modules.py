@@ -14,9 +14,7 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.modules import Module
 from recorder.log.whole import whole
-
-MODULES_FILE = "modules.npz"
-"""Name of the file in a run's folder."""
+from replay.runs.folders import MODULES_FILE
 
 MAX_BYTES = 4 * 1024**3
 """Largest array that is read; asked for before anything is decompressed."""

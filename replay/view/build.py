@@ -15,9 +15,9 @@ from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import whole
-from replay.runs.folders import is_run, run_log
+from replay.runs.folders import MODULES_FILE, is_run, run_log
 from replay.runs.log import read_header
-from replay.runs.modules import MODULES_FILE, load_modules
+from replay.runs.modules import load_modules
 from replay.runs.outline import Tally, read_outline
 from replay.runs.stretches import read_stretches
 from replay.view.labels import label

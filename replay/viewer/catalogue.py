@@ -20,14 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from replay.runs.folders import run_log, runs_in
+from replay.runs.folders import VIEW_FILE, run_log, runs_in
 from replay.view.bindings import CatalogueClient, RrdReader
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
 from replay.viewer.display import has_display
 from replay.viewer.program import Program, free_port, open_address, running
-
-VIEW_FILE = "run.rrd"
-"""Name of the view in a run's folder."""
 
 ROWS = "base"
 """Name of the layer of rows."""
