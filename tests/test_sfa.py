@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.sfa import batch_sfa, direction_cosine, slowness
+from cdmisfa.features.sfa import batch_sfa, slowness
 from recorder.world.oscillatory import one_period
 
 
@@ -30,9 +30,3 @@ def test_more_features_than_directions_are_refused():
     frames = np.outer(np.sin(np.arange(100.0)), [1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="vary in 1 directions"):
         batch_sfa(frames, 2)
-
-
-def test_direction_cosine_ignores_sign_and_length():
-    a = np.array([3.0, 4.0])
-    assert direction_cosine(a, -7 * a) == pytest.approx(1.0)
-    assert direction_cosine(a, np.array([4.0, -3.0])) == pytest.approx(0.0)

@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 Show = Literal["line", "lane", "heat", "text", "hidden"]
 
+ACTIONS = ("stay", "switch")
+"""What each code of an action, or of a policy, says to do."""
+
 SCHEMA_VERSION = 2
 """Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""
 

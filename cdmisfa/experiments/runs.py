@@ -35,7 +35,7 @@ from cdmisfa.experiments.resume import (
     set_aside,
 )
 from cdmisfa.features.incsfa import strict
-from recorder.log.folder import held
+from recorder.log.folder import held, refuse_existing
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -221,8 +221,7 @@ def _run_log(
     from replay.runs.writer import RunWriter
 
     if not resume:
-        if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
-            raise UsageError(f"{out} exists: choose another folder, or say --force to replace it")
+        refuse_existing(out, force=force)
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
 
-FRAME_SIZE = (48, 128)
-"""Height and width of the paper's frames, which images of others are shrunk to."""
-
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
@@ -271,7 +268,7 @@ def open_cameras(
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> ForeignSource:
     """Open the camera logs of others as streams on one clock; see `ForeignSource`."""
-    from replay.camera_logs.source import ForeignSource
+    from replay.camera_logs.source import FRAME_SIZE, ForeignSource
 
     return ForeignSource(
         paths,

@@ -58,8 +58,3 @@ def slowness(y: Float) -> Float:
     """
     change = np.diff(y, axis=0)
     return np.asarray(np.sqrt((change**2).mean(axis=0) / y.var(axis=0)) / (2 * np.pi))
-
-
-def direction_cosine(a: Float, b: Float) -> float:
-    """|cos| of the angle between two vectors of weights: 1 for the same feature up to sign."""
-    return float(abs(a @ b) / np.sqrt((a @ a) * (b @ b)))

@@ -15,11 +15,10 @@ from cdmisfa.core.blocks import Block, SeekableSource
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import BlockSignals
+from cdmisfa.core.signals import ACTIONS, BlockSignals
 from cdmisfa.experiments.runs import RunResult, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source
 from cdmisfa.experiments.statistics import correlation
-from cdmisfa.features.projection import project
 
 SCENE = "icub"
 MODULES = 2
@@ -182,13 +181,13 @@ def _score(module: Module, source: SeekableSource) -> Learned:
     """Find the true quantity that a module's first output on its own view follows best."""
     source.seek(0)
     block = source.take(module.stream, SCORED_FRAMES)
-    y = project(module.phi, module.phi @ module.mean, block.frames.reshape(len(block), -1))
-    r = [correlation(y[:, 0], column) for column in block.truth.T]
+    y = module.transform(block.frames)[:, 0]
+    r = [correlation(y, column) for column in block.truth.T]
     best = int(np.argmax(r))
     return Learned(
         module.index,
         source.spec.streams[module.stream],
-        tuple(("stay", "switch")[action] for action in module.policy),
+        tuple(ACTIONS[action] for action in module.policy),
         module.iteration,
         source.spec.truth[best],
         r[best],

@@ -80,8 +80,7 @@ def recording_of(request: Request) -> Path:
 def identity(path: str) -> dict[str, Any]:
     """What a recording is, wherever it lies."""
     with contextlib.closing(RecordedSource(path)) as source:
-        described: dict[str, Any] = json.loads(json.dumps(source.describe(), default=str))
-    return {key: value for key, value in described.items() if key not in ("path", "files")}
+        return dict(json.loads(json.dumps(source.describe(), default=str)))
 
 
 def open_world(settings: Settings) -> FrameSource:

@@ -55,7 +55,7 @@ def view_logs(folder: Path, view: str) -> list[Path]:
 
 
 def refuse_existing(folder: Path, *, force: bool) -> None:
-    """Refuse to write a recording where there is something.
+    """Refuse to write a recording or a run where there is something.
 
     Raises:
         UsageError: the folder is not empty, or no folder, and `force` is not set.

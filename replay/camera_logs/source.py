@@ -31,6 +31,9 @@ from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
 
+FRAME_SIZE = (48, 128)
+"""Height and width of the paper's frames, which images are shrunk to where nothing is said."""
+
 Align = Literal["index", "time"]
 
 
@@ -61,7 +64,7 @@ class ForeignSource(SeekableSource):
         paths: str | Location | Sequence[str | Location],
         topics: Sequence[str] = (),
         *,
-        size: tuple[int, int] = (48, 128),
+        size: tuple[int, int] = FRAME_SIZE,
         align: Align | None = None,
         rate: float | None = None,
         loop: bool = False,

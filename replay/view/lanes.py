@@ -10,6 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.signals import ACTIONS
 from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
@@ -19,7 +20,7 @@ from replay.view.labels import label, part
 NameOf = Callable[[int], tuple[str, Rgb]]
 """The state that a code stands for, and its colour."""
 
-STAY, SWITCH = "stay", "switch"
+STAY, SWITCH = ACTIONS
 
 _NOVEL = -1
 

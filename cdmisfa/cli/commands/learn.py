@@ -200,6 +200,7 @@ class Reporter(Sink):
 
 def show(result: RunResult, *, as_json: bool) -> None:
     """Print what a run came to."""
+    from cdmisfa.core.signals import ACTIONS
     from cdmisfa.experiments.loop import ENDINGS
 
     if as_json:
@@ -210,7 +211,7 @@ def show(result: RunResult, *, as_json: bool) -> None:
             module.index,
             result.streams[module.stream],
             module.iteration,
-            " ".join(("stay", "switch")[action] for action in module.policy),
+            " ".join(ACTIONS[action] for action in module.policy),
             ", ".join(f"{eta:.4f}" for eta in module.eta),
         )
         for module in result.modules
