@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from recorder.recording import ViewRecording
 
 CONVERTED = ("foreign",)
-"""The source in the manifest of a recording that was converted from camera logs."""
+"""What a recording names as its source where it was converted from camera logs."""
 
 
 @click.command("record")
