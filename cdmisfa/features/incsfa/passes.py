@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.compiled import compiled, reordered
-from cdmisfa.features.incsfa.lanes import LANES, add, load, store
 from cdmisfa.features.incsfa.state import Float, State, mean_rate
+from cdmisfa.features.lanes import LANES, add, load, store
 
 GROUP = 4
 """Frames applied in one pass."""

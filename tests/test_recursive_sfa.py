@@ -1,0 +1,249 @@
+"""Recursive SFA: what batch SFA finds, in blocks, whatever the input's rank, type and cut."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.features.feature import Feature
+from cdmisfa.features.recursive.eigen import eigen
+from cdmisfa.features.recursive.recursive import PIECE, RecursiveSFA
+from cdmisfa.features.sfa import batch_sfa, direction_cosine
+
+FOREVER = 10**9
+
+
+def mixture(seed: int, n: int, sources: int, inputs: int) -> NDArray[np.float64]:
+    """A few sources from slow to fast, seen through a random matrix."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n)[:, None]
+    periods = 2.0 * np.pi / (90.0 / 2.3 ** np.arange(sources))
+    waves = np.sin(t * periods + rng.uniform(0, 6, sources)) + 0.1 * rng.normal(size=(n, sources))
+    return waves @ rng.normal(size=(sources, inputs)) + rng.normal(size=inputs)
+
+
+def learned(frames: NDArray[Any], cuts: list[int], **options: Any) -> RecursiveSFA:
+    sfa = RecursiveSFA(frames.shape[1], window=FOREVER, **options)
+    for i, piece in enumerate(np.split(frames, cuts)):
+        sfa.update(piece, gap=i == 0)
+    return sfa
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    sources=st.integers(1, 6),
+    block=st.integers(2, 150),
+    scale=st.sampled_from([1e-4, 1.0, 1e4]),
+)
+@settings(max_examples=25)
+def test_equals_batch_sfa_over_an_infinite_window(
+    seed: int, sources: int, block: int, scale: float
+) -> None:
+    frames = mixture(seed, 3000, sources, 20) * scale
+    outputs = min(2, sources)
+    sfa = learned(frames, list(range(block, 3000, block)), components=6, outputs=outputs)
+    for own, batch in zip(sfa.phi, batch_sfa(frames, outputs), strict=True):
+        assert abs(direction_cosine(own, batch)) > 1 - 1e-6
+    y = (frames - sfa.mean) @ sfa.phi.T
+    assert y.var(axis=0) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_pixels_count_as_the_values_they_stand_for() -> None:
+    values = mixture(1, 2000, 3, 30)
+    pixels = np.round(255 * (values - values.min()) / np.ptp(values)).astype(np.uint8)
+    a = learned(pixels, [500, 1201], components=8)
+    b = learned(pixels / 255.0, [500, 1201], components=8)
+    assert direction_cosine(a.phi[0], b.phi[0]) == pytest.approx(1.0, abs=1e-9)
+    assert a.slowness == pytest.approx(b.slowness, rel=1e-9)
+
+
+@given(seed=st.integers(0, 10**6), cuts=st.lists(st.integers(1, 999), max_size=8, unique=True))
+@settings(max_examples=25)
+def test_it_does_not_matter_how_frames_of_few_directions_are_cut(
+    seed: int, cuts: list[int]
+) -> None:
+    frames = mixture(seed, 1000, 4, 12)
+    whole = learned(frames, [], components=4)
+    pieces = learned(frames, sorted(cuts), components=4)
+    assert abs(direction_cosine(whole.phi[0], pieces.phi[0])) > 1 - 1e-9
+    assert pieces.state.spectrum == pytest.approx(whole.state.spectrum, rel=1e-6)
+
+
+def test_a_long_call_is_its_pieces() -> None:
+    frames = np.random.default_rng(2).integers(0, 256, (3 * PIECE + 5, 50), dtype=np.uint8)
+    a, b = RecursiveSFA(50, 8), RecursiveSFA(50, 8)
+    changes = a.update(frames)
+    each = [b.update(frames[i : i + PIECE]) for i in range(0, len(frames), PIECE)]
+    np.testing.assert_array_equal(changes, np.concatenate(each))
+    np.testing.assert_array_equal(a.phi, b.phi)
+
+
+def test_differences_over_a_gap_do_not_count() -> None:
+    a, b = mixture(3, 700, 3, 10), mixture(3, 700, 3, 10)[::-1] + 5.0
+    sfa = RecursiveSFA(10, 5, window=FOREVER)
+    sfa.update(a)
+    sfa.update(b, gap=True)
+    steps = np.concatenate([np.diff(a, axis=0), np.diff(b, axis=0)])
+    both = np.concatenate([a, b])
+    y_steps, y = steps @ sfa.phi[0], (both - both.mean(axis=0)) @ sfa.phi[0]
+    expected = np.sqrt((y_steps**2).mean() / y.var()) / (2 * np.pi)
+    assert sfa.slowness == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("value", [0, 93])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+def test_a_stream_that_shows_nothing_has_no_slow_feature(value: int, dtype: Any) -> None:
+    sfa = RecursiveSFA(40, 5)
+    for _ in range(4):
+        change = sfa.update(np.full((30, 40), value, dtype))
+        assert np.isnan(change).all()
+    assert np.isnan(sfa.slowness)
+    assert not sfa.phi.any()
+    sfa.update(np.random.default_rng(0).integers(0, 256, (60, 40)).astype(dtype))
+    assert np.isfinite(sfa.slowness)  # it comes to life as soon as something moves
+
+
+@given(rank=st.integers(1, 9), n=st.integers(1, 70), seed=st.integers(0, 1000))
+@settings(max_examples=40)
+def test_any_rank_and_any_block_length(rank: int, n: int, seed: int) -> None:
+    frames = mixture(seed, 4 * n + 12, rank, 9)
+    sfa = RecursiveSFA(9, 16, outputs=3)
+    for start in range(0, len(frames), n):
+        sfa.update(frames[start : start + n])
+    kept = sfa.state.counts[0]
+    assert kept <= rank
+    basis = sfa.state.basis[:kept]
+    assert np.allclose(basis @ basis.T, np.eye(kept), atol=1e-6)
+    assert np.isfinite(sfa.phi).all()
+
+
+def test_outputs_are_tested_before_they_are_learned_from() -> None:
+    frames = mixture(5, 600, 4, 15)
+    sfa = RecursiveSFA(15, 6)
+    sfa.update(frames[:500])
+    phi, mean = sfa.phi, sfa.mean.copy()
+    sfa.update(frames[500:560])
+    assert sfa.tested == pytest.approx((frames[500:560] - mean) @ phi.T, rel=1e-9, abs=1e-9)
+
+
+def test_other_outputs_are_judged_without_frames() -> None:
+    frames = mixture(6, 3000, 4, 15)
+    sfa = learned(frames, [700, 2100], components=8)
+    phi = np.random.default_rng(1).normal(size=(3, 15))
+    variance, slowness, rho = sfa.compare(np.concatenate([phi, sfa.phi]))
+    y = (frames - frames.mean(axis=0)) @ phi.T
+    own = (frames - frames.mean(axis=0)) @ sfa.phi[0]
+    assert variance[:3] == pytest.approx(y.var(axis=0), rel=1e-6)
+    steps = (np.diff(y, axis=0) ** 2).mean(axis=0)
+    assert slowness[:3] == pytest.approx(np.sqrt(steps / y.var(axis=0)) / (2 * np.pi), rel=1e-6)
+    assert rho[:3] == pytest.approx([abs(np.corrcoef(own, one)[0, 1]) for one in y.T], abs=1e-6)
+    assert (variance[3], slowness[3], rho[3]) == pytest.approx((1.0, sfa.slowness, 1.0))
+
+
+def test_change_is_free_of_scale_and_falls() -> None:
+    frames = mixture(7, 4000, 4, 15)
+    a, b = RecursiveSFA(15, 6), RecursiveSFA(15, 6)
+    first = [a.update(frames[i : i + 40])[-1] for i in range(0, 4000, 40)]
+    second = [b.update(1e-3 * frames[i : i + 40])[-1] for i in range(0, 4000, 40)]
+    assert np.isnan(first[0])
+    assert first[1:] == pytest.approx(second[1:], abs=1e-6)
+    assert np.mean(first[1:6]) > 5 * np.mean(first[-20:])
+    assert max(first[1:]) <= np.sqrt(2)
+
+
+def test_goes_on_from_its_state_with_the_same_bits() -> None:
+    frames = np.random.default_rng(3).integers(0, 256, (400, 60), dtype=np.uint8)
+    straight, restored = RecursiveSFA(60, 8, 2), RecursiveSFA(60, 8, 2)
+    straight.update(frames[:200])
+    for own, saved in zip(restored.state, straight.state, strict=True):
+        own[...] = saved
+    for sfa in (straight, restored):
+        sfa.update(frames[200:])
+    for one, other in zip(straight.state, restored.state, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_frames_are_neither_changed_nor_kept() -> None:
+    frames = mixture(8, 100, 3, 10)
+    before, sfa = frames.copy(), RecursiveSFA(10, 4)
+    sfa.update(frames)
+    phi = sfa.phi
+    np.testing.assert_array_equal(frames, before)
+    frames[:] = 7.0
+    np.testing.assert_array_equal(sfa.phi, phi)
+
+
+@pytest.mark.parametrize(
+    "frames", [np.zeros((5, 9)), np.zeros((5, 10), bool), np.zeros((5, 10), np.int8), np.zeros(10)]
+)
+def test_what_are_no_frames_is_refused(frames: NDArray[Any]) -> None:
+    with pytest.raises(UsageError, match="frames of"):
+        RecursiveSFA(10, 4).update(frames)
+
+
+@pytest.mark.parametrize("options", [(0, 4), (10, 0), (10, 4, 5), (10, 4, 1, 0)])
+def test_sizes_that_make_no_sense_are_refused(options: tuple[int, ...]) -> None:
+    with pytest.raises(UsageError, match="at least 1"):
+        RecursiveSFA(*options)
+
+
+def test_no_frames_change_nothing() -> None:
+    sfa = RecursiveSFA(10, 4)
+    assert sfa.update(np.zeros((0, 10))).shape == (0,)
+    assert not sfa.state.counts.any()
+
+
+def test_it_is_a_feature() -> None:
+    assert isinstance(RecursiveSFA(10, 4), Feature)
+
+
+def test_the_number_of_threads_changes_no_bit() -> None:
+    code = (
+        "import hashlib, numpy as np;"
+        "from cdmisfa.features.recursive.recursive import RecursiveSFA;"
+        "f = np.random.default_rng(0).integers(0, 256, (300, 3000), dtype=np.uint8);"
+        "s = RecursiveSFA(3000, 16, 3); [s.update(f[i:i + 40]) for i in range(0, 300, 40)];"
+        "print(hashlib.sha256(s.phi.tobytes() + s.compare(s.phi)[1].tobytes()).hexdigest())"
+    )
+    hashes = set()
+    for threads in ("1", "2", "5"):
+        names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
+        environment = {**os.environ, **dict.fromkeys(names, threads)}
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        hashes.add(done.stdout)
+    assert len(hashes) == 1
+
+
+@given(n=st.integers(0, 40), seed=st.integers(0, 10**6), kind=st.integers(0, 4))
+@settings(max_examples=60)
+def test_eigenvectors(n: int, seed: int, kind: int) -> None:
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n, n))
+    matrix = [
+        a + a.T,
+        a @ a.T,
+        np.diag(10.0 ** rng.integers(-15, 15, n)),
+        np.ones((n, n)),
+        np.zeros((n, n)),
+    ][kind]
+    values, vectors = np.empty(n), np.empty((n, n))
+    eigen(matrix.copy(), values, vectors)
+    size = max(np.abs(matrix).max(initial=0.0), 1e-300)
+    assert values / size == pytest.approx(np.linalg.eigvalsh(matrix)[::-1] / size, abs=1e-12)
+    assert vectors @ vectors.T == pytest.approx(np.eye(n), abs=1e-12)
+    assert vectors @ matrix @ vectors.T / size == pytest.approx(np.diag(values) / size, abs=1e-12)
