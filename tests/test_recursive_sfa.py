@@ -17,9 +17,13 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.features.feature import Feature
 from cdmisfa.features.recursive.eigen import eigen
 from cdmisfa.features.recursive.recursive import PIECE, RecursiveSFA
-from cdmisfa.features.sfa import batch_sfa, direction_cosine
+from cdmisfa.features.sfa import batch_sfa
 
 FOREVER = 10**9
+
+
+def direction_cosine(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 
 def mixture(seed: int, n: int, sources: int, inputs: int) -> NDArray[np.float64]:
