@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.log.begun import Begun, keep_recording, read_recording
-from recorder.log.folder import prepared_folder, refuse_existing, view_logs
+from recorder.log.folder import folder_here, prepared_folder, refuse_existing, view_logs
 from recorder.log.resume import FramesHeld, frames_held, resume_view, set_log_aside
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity
@@ -72,7 +72,7 @@ class RecordingStoppedError(CdmisfaError):
 
 def record(
     source: FrameSource,
-    folder: Path,
+    folder: str | Path,
     *,
     frames: int | None = None,
     views: Sequence[str] | None = None,
@@ -115,7 +115,7 @@ def record(
     """
     scene = scene_of(source)
     settings = settings or (RecordConfig() if scene is None else scene.record)
-    folder = Path(folder)
+    folder = folder_here(folder)
     length = source.spec.length
     if frames is not None and not 1 <= frames <= (length or frames):
         most = "" if length is None else f", and no more than the {length} that there are"
@@ -173,6 +173,7 @@ def record(
         )
         with contextlib.closing(blocks):
             for block in blocks:
+                _check(block, identity.spec)
                 logs[block.stream].write(block)
                 if progress is not None:
                     progress(min(log.t for log in logs.values()))
@@ -213,6 +214,16 @@ def _written(view: str, path: Path, frames: int) -> ViewRecording:
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)
 
 
+def _check(block: Block, spec: SourceSpec) -> None:
+    """Refuse a block that is not what its source says, before it spoils a file."""
+    shape, dtype = block.frames.shape[1:], block.frames.dtype
+    if shape != spec.frame_shape or dtype != spec.dtype:
+        raise CdmisfaError(
+            f"{spec.streams[block.stream]} shows {shape} {dtype} at frame {block.t}, not the "
+            f"{spec.frame_shape} {spec.dtype} that its source states: mend the source"
+        )
+
+
 def _identity(
     source: FrameSource,
     names: Sequence[str] | None,
@@ -220,6 +231,10 @@ def _identity(
     scene: OpenScene | None,
 ) -> Identity:
     """What a recording of a source states; refused where no recording can hold it."""
+    if names and len(names) != len(source.spec.streams):
+        raise UsageError(
+            f"{len(names)} names given for {len(source.spec.streams)} views: name each, or none"
+        )
     spec = replace(source.spec, streams=tuple(names or source.spec.streams))
     for name in spec.streams:
         if not _FILE_NAME.fullmatch(name) or spec.streams.count(name) > 1:

@@ -14,7 +14,7 @@ from source_contract import ForwardContract, same
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import run
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError, record
@@ -196,3 +196,24 @@ def test_what_no_recording_can_hold_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="only a scene can be opened by several processes"):
         record(Webcams(), tmp_path / "rec", frames=9, jobs=2)
     assert not (tmp_path / "rec").exists()
+
+
+@pytest.mark.parametrize("names", [["a"], ["a", "b", "c"]])
+def test_every_view_gets_a_name_or_none(tmp_path: Path, names: list[str]) -> None:
+    with pytest.raises(UsageError, match=f"{len(names)} names given for 2 views"):
+        record(Webcams(), tmp_path / "rec", frames=9, names=names)
+    assert not (tmp_path / "rec").exists()
+
+
+def test_a_source_that_shows_what_it_does_not_state_is_stopped_at_once(tmp_path: Path) -> None:
+    source = Webcams()
+    source.spec = SourceSpec(("left", "right"), (9, 9), "uint8")
+    with pytest.raises(CdmisfaError, match=r"left shows \(12, 16\) uint8 at frame 0, not the \(9"):
+        record(source, tmp_path / "rec", frames=9)
+
+
+def test_a_url_is_no_folder_for_the_library_either() -> None:
+    with pytest.raises(UsageError, match="s3://x/y is a URL: name a path on this machine"):
+        record(Webcams(), "s3://x/y", frames=9)
+    with pytest.raises(UsageError, match=r"s3:/.*x/y is a URL"):
+        run(Webcams(), CONFIG, Path("s3://x/y"), max_iterations=1)

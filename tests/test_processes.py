@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
@@ -87,6 +88,16 @@ def test_closing_does_not_wait_for_what_they_are_doing() -> None:
     assert time.monotonic() - start < 10
     with pytest.raises(BrokenProcessPool):
         future.result()
+
+
+def test_what_sends_large_results_finishes_and_is_not_waited_for_without_end() -> None:
+    workers = Workers(2)
+    futures = [workers.submit(bytes, 1 << 26) for _ in range(8)]
+    futures[0].result()  # others are in the midst of being sent
+    closing = threading.Thread(target=workers.close, kwargs={"finish": True}, daemon=True)
+    closing.start()
+    closing.join(60)
+    assert not closing.is_alive()
 
 
 def test_they_have_their_environment_before_anything_is_imported(tmp_path: Path) -> None:

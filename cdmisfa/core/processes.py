@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 class Workers:
     """Processes that are started as they are needed.
 
-    They end at `close`, whatever they are doing, and when this process is killed. A terminal's
+    They end at `close`, and when this process is killed, whatever they are doing. A terminal's
     Ctrl-C is for this process only. When one dies, what all of them were doing ends with
     `concurrent.futures.process.BrokenProcessPool`.
 
@@ -52,8 +52,16 @@ class Workers:
         with _inherited():
             return self._executor.submit(function, *arguments)
 
-    def close(self) -> None:
-        """End them all; harmless when called twice."""
+    def close(self, *, finish: bool = False) -> None:
+        """End them all; harmless when called twice.
+
+        Args:
+            finish: let them finish what they are computing. Whose results are larger than a
+                pipe takes at once must: one that ended in the midst of sending would be waited
+                for without end.
+        """
+        if finish:
+            self._executor.shutdown(wait=True, cancel_futures=True)
         self._ours.close()
         self._executor.shutdown(wait=True, cancel_futures=True)
         self._waits.close()

@@ -35,7 +35,7 @@ from cdmisfa.experiments.resume import (
     set_aside,
 )
 from cdmisfa.features.incsfa import strict
-from recorder.log.folder import held, refuse_existing
+from recorder.log.folder import folder_here, held, refuse_existing
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -101,7 +101,7 @@ def module_table(module: Module, streams: Sequence[str]) -> dict[str, Any]:
 def run(
     source: FrameSource,
     config: Any,
-    folder: Path | None = None,
+    folder: str | Path | None = None,
     *,
     seed: int = 0,
     max_iterations: int | None = None,
@@ -143,6 +143,7 @@ def run(
             run or one with another configuration or source, or the source cannot go back.
         RunExhaustedError: a recording ended first; what was learned is saved.
     """
+    folder = None if folder is None else folder_here(folder)
     learner = open_learner(config, source.spec, seed)
     digest = Digest()
     tables = {**(sections or {}), "learner": as_table(config)}

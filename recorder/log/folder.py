@@ -37,6 +37,17 @@ def held(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
+def folder_here(place: str | Path) -> Path:
+    """A folder of this machine, by its path.
+
+    Raises:
+        UsageError: it is a URL, which would become a folder `s3:`.
+    """
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(place)):
+        raise UsageError(f"{place} is a URL: name a path on this machine")
+    return Path(place)
+
+
 def part_name(view: str, number: int | None) -> str:
     """Name of a view's file, or of one of its parts."""
     return f"{view}.mcap" if number is None else f"{view}-{number:03d}.mcap"

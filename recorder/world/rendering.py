@@ -100,7 +100,7 @@ def render_in_processes(
             "a rendering process ended: record with --jobs 1 to see why, or give it more memory"
         ) from error
     finally:
-        workers.close()
+        workers.close(finish=True)  # blocks are large
 
 
 def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
