@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.compiled import compiled, reordered
 from cdmisfa.features.incsfa.state import Float, State, mean_rate
+from cdmisfa.features.inner_products import ROWS, measure_tile
 from cdmisfa.features.lanes import LANES, add, load, store
 
-GROUP = 4
+GROUP = ROWS
 """Frames applied in one pass."""
 
 TILE = 256
@@ -119,64 +120,6 @@ def apply_tile(v: Float, start: int, width: int, r: Float, steps: Float) -> None
             store(r, 1, i, r1)
             store(r, 2, i, r2)
             store(r, 3, i, r3)
-
-
-@reordered
-def measure_tile(v: Float, start: int, width: int, u: Float, e: Float) -> None:
-    """Add a tile's share of the inner products of all vectors with a group's frames.
-
-    Args:
-        v: (K, I) vectors.
-        start: first column.
-        width: columns.
-        u: (GROUP, TILE) centred frames.
-        e: (K, GROUP), in place.
-    """
-    K = v.shape[0]
-    u0, u1, u2, u3 = u[0, :width], u[1, :width], u[2, :width], u[3, :width]
-    for j in range(0, K - 2, 3):
-        vx, vy = v[j, start : start + width], v[j + 1, start : start + width]
-        vz = v[j + 2, start : start + width]
-        x0 = x1 = x2 = x3 = y0 = y1 = y2 = y3 = z0 = z1 = z2 = z3 = 0.0
-        for i in range(width):
-            x, y, z = vx[i], vy[i], vz[i]
-            x0 += x * u0[i]
-            y0 += y * u0[i]
-            z0 += z * u0[i]
-            x1 += x * u1[i]
-            y1 += y * u1[i]
-            z1 += z * u1[i]
-            x2 += x * u2[i]
-            y2 += y * u2[i]
-            z2 += z * u2[i]
-            x3 += x * u3[i]
-            y3 += y * u3[i]
-            z3 += z * u3[i]
-        e[j, 0] += x0
-        e[j, 1] += x1
-        e[j, 2] += x2
-        e[j, 3] += x3
-        e[j + 1, 0] += y0
-        e[j + 1, 1] += y1
-        e[j + 1, 2] += y2
-        e[j + 1, 3] += y3
-        e[j + 2, 0] += z0
-        e[j + 2, 1] += z1
-        e[j + 2, 2] += z2
-        e[j + 2, 3] += z3
-    for j in range(K - K % 3, K):
-        vx = v[j, start : start + width]
-        x0 = x1 = x2 = x3 = 0.0
-        for i in range(width):
-            x = vx[i]
-            x0 += x * u0[i]
-            x1 += x * u1[i]
-            x2 += x * u2[i]
-            x3 += x * u3[i]
-        e[j, 0] += x0
-        e[j, 1] += x1
-        e[j, 2] += x2
-        e[j, 3] += x3
 
 
 @reordered
@@ -341,8 +284,8 @@ def run_pass(
             state.v[:, start:] = v[:, :width]
         if count > 0:
             centre_tile(frames, first, count, start, state.mean, state.counts[0], window, u)
-            measure_tile(u, 0, width, u, work.g)
-            measure_tile(v, column, padded, u, work.e)
+            measure_tile(u, 0, width, GROUP, u, 0, work.g)
+            measure_tile(v, column, padded, len(work.e), u, 0, work.e)
     if settle:
         work.shrink[:] = 1.0
     for j in range(work.e.shape[0]):

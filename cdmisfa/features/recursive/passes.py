@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.compiled import compiled, reordered
+from cdmisfa.features.inner_products import ROWS, measure_tile
 from cdmisfa.features.lanes import LANES, add, load, store
 
 Float = NDArray[np.float64]
@@ -19,9 +20,6 @@ Int = NDArray[np.int64]
 
 TILE = 128
 """Columns of a tile: a block of 40 frames in it is 40 KB, about L1."""
-
-ROWS = 4
-"""Frames measured at once; a block is filled up to a multiple of it with rows of 0."""
 
 
 @compiled
@@ -55,8 +53,8 @@ def measure(
         width = min(TILE, size - start)
         _centre_tile(frames, scale, last, mean, start, width, u)
         for s in range(0, n, ROWS):
-            _measure_tile(basis, start, width, rank, u, s, e)
-            _measure_tile(u, 0, width, s + ROWS, u, s, g)
+            measure_tile(basis, start, width, rank, u, s, e)
+            measure_tile(u, 0, width, s + ROWS, u, s, g)
     for s in range(n):
         for t in range(s):
             g[s, t] = g[t, s]
@@ -74,48 +72,6 @@ def _centre_tile(
         shown, own = frames[t, start : start + width], u[t + 1, :width]
         for i in range(width):
             own[i] = shown[i] * scale - m[i]
-
-
-@reordered
-def _measure_tile(
-    v: Float, column: int, width: int, rows: int, u: Float, first: int, e: Float
-) -> None:
-    """Add a tile's share of `rows` rows of v times ROWS frames from `first` on to e."""
-    u0, u1 = u[first, :width], u[first + 1, :width]
-    u2, u3 = u[first + 2, :width], u[first + 3, :width]
-    for j in range(0, rows - 2, 3):
-        vx, vy = v[j, column : column + width], v[j + 1, column : column + width]
-        vz = v[j + 2, column : column + width]
-        x0 = x1 = x2 = x3 = y0 = y1 = y2 = y3 = z0 = z1 = z2 = z3 = 0.0
-        for i in range(width):
-            x, y, z = vx[i], vy[i], vz[i]
-            x0 += x * u0[i]
-            y0 += y * u0[i]
-            z0 += z * u0[i]
-            x1 += x * u1[i]
-            y1 += y * u1[i]
-            z1 += z * u1[i]
-            x2 += x * u2[i]
-            y2 += y * u2[i]
-            z2 += z * u2[i]
-            x3 += x * u3[i]
-            y3 += y * u3[i]
-            z3 += z * u3[i]
-        for k, (a, b, c) in enumerate(((x0, y0, z0), (x1, y1, z1), (x2, y2, z2), (x3, y3, z3))):
-            e[j, first + k] += a
-            e[j + 1, first + k] += b
-            e[j + 2, first + k] += c
-    for j in range(rows - rows % 3, rows):
-        vx = v[j, column : column + width]
-        x0 = x1 = x2 = x3 = 0.0
-        for i in range(width):
-            x = vx[i]
-            x0 += x * u0[i]
-            x1 += x * u1[i]
-            x2 += x * u2[i]
-            x3 += x * u3[i]
-        for k, a in enumerate((x0, x1, x2, x3)):
-            e[j, first + k] += a
 
 
 @compiled

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
 from cdmisfa.core.compiled import compiled
 from cdmisfa.core.errors import UsageError
+from cdmisfa.features.inner_products import ROWS
 from cdmisfa.features.projection import outputs
 from cdmisfa.features.recursive.eigen import eigen
 from cdmisfa.features.recursive.merge import merge, multiply
-from cdmisfa.features.recursive.passes import ROWS, measure, rebuild
+from cdmisfa.features.recursive.passes import measure, rebuild
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
