@@ -239,14 +239,6 @@ def test_the_sample_recording_s_noise_is_not_learnable() -> None:
     assert eta[1] > limit
 
 
-def test_leading_directions_are_those_of_an_exact_decomposition() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((300, 40)) * np.linspace(5, 0.1, 40)
-    exact = np.linalg.svd(x, full_matrices=False)[2][:4].T
-    found = difficulty.leading_directions(x, 4)
-    np.testing.assert_allclose(np.abs(np.sum(exact * found, axis=0)), 1.0, atol=1e-6)
-
-
 def test_difficulty_says_how_many_frames_of_a_view_it_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,6 +35,7 @@ def python(*args: str) -> subprocess.CompletedProcess[str]:
 FORBIDDEN = {
     "cdmisfa": ("cdmisfa.cli.app",),
     "cdmisfa.agents": ("cdmisfa.experiments.runs", "replay.palette", "recorder.config", "mcap"),
+    "cdmisfa.arena": ("cdmisfa.paper.panels", "cdmisfa.cli.app"),
     "cdmisfa.cli": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
@@ -42,7 +43,7 @@ FORBIDDEN = {
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
     "cdmisfa.features.recursive": ("cdmisfa.agents.learner", "recorder.config", "mcap"),
     "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),
-    "cdmisfa.paper": ("cdmisfa.cli.app",),
+    "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "cdmisfa.presets": ("cdmisfa.core.config",),
     "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),
     "recorder.log": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner"),

@@ -17,7 +17,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.statistics import correlation, stays_above
 from cdmisfa.features.incsfa.abstraction import IncSFA
-from cdmisfa.features.sfa import batch_sfa, slowness
+from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from cdmisfa.paper import icub, oscillatory, panels
 from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, groups
 from replay.recordings.source import RecordedSource
@@ -41,9 +41,6 @@ FRAMES = {"oscillatory": 10_000, "icub": 12_000}
 
 STEP = 20
 """Frames between two looks at the direction."""
-
-EXTRA, ROUNDS = 8, 20
-"""Directions beyond those wanted, and rounds, of the subspace iteration."""
 
 TEST = 1000
 """Held-out frames on which directions are compared."""
@@ -153,19 +150,6 @@ def slowest(frames: NDArray[Any], components: int) -> NDArray[np.float64]:
     x = x - x.mean(axis=0)
     leading = leading_directions(x, components)
     return np.asarray(leading @ batch_sfa(x @ leading, 1)[0])
-
-
-def leading_directions(x: NDArray[np.float64], components: int) -> NDArray[np.float64]:
-    """Orthonormal basis (I, K) of the leading principal components, by subspace iteration."""
-    size = x.shape[1]
-    if size <= components:
-        return np.eye(size)
-    rng = np.random.default_rng(0)
-    basis = rng.standard_normal((size, min(size, components + EXTRA)))
-    for _ in range(ROUNDS):
-        basis, _ = np.linalg.qr(x.T @ (x @ basis))
-    _, rotation = np.linalg.eigh((x @ basis).T @ (x @ basis))
-    return np.asarray(basis @ rotation[:, ::-1][:, :components])
 
 
 def _unit(frames: NDArray[Any]) -> float:

@@ -22,6 +22,7 @@ EXTRAS = {
     "video": (("av",), "videos: learn, convert, export --to mp4"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
+    "arena": (("ale_py", "av", "gymnasium", "skvideo"), "streams of the arena"),
     "sklearn": (("sklearn",), "the transformer for scikit-learn"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),
 }

@@ -1,0 +1,12 @@
+"""The arena: learners compared on sets of streams, each made anew where it is run."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "cdmisfa.arena.sets": "ArenaSet SETS",
+        "cdmisfa.arena.source": "ArenaSource",
+        "cdmisfa.arena.streams": "Kind STREAMS Shown",
+    },
+)

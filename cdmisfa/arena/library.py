@@ -1,0 +1,211 @@
+"""Streams on disk: made once, mapped into memory, with what batch SFA finds in each.
+
+FOLDER/NAME-SEED/ holds a stream, FOLDER/NAME-SEED-K-EXPANSION.npz its reference.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.arena.shown import Shown
+from cdmisfa.arena.streams import LEARNED_FROM, STREAMS, make, parse
+from cdmisfa.core.blocks import PIXEL, UINT8
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import expand
+from cdmisfa.core.modules import Module
+from cdmisfa.experiments.documents import write_json
+from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from recorder.log.whole import whole
+
+RECIPE: Final = 1
+"""Rises when streams are made in another way, so that those on disk are made anew."""
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """A stream that was made.
+
+    Attributes:
+        name: what it shows, `Signal.name`.
+        frames: (n, *frame_shape), all of them.
+        state: (n, C) float64.
+        loops: see `Kind`.
+    """
+
+    name: str
+    frames: NDArray[Any]
+    state: Float
+    loops: bool
+
+    @property
+    def learned_from(self) -> NDArray[Any]:
+        """The frames that a learner is shown, over and over."""
+        return self.frames if self.loops else self.frames[:LEARNED_FROM]
+
+    @property
+    def held_out(self) -> NDArray[Any]:
+        """The frames on which it is judged."""
+        return self.frames if self.loops else self.frames[LEARNED_FROM:]
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What batch SFA finds in the frames that a learner is shown.
+
+    Attributes:
+        slowness: of its slowest output, on the held-out frames.
+        slowest: the slowest output.
+        components: the leading principal components of the same frames.
+    """
+
+    slowness: float
+    slowest: Module
+    components: Module
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A stream to have on disk, with references.
+
+    Attributes:
+        name: `Signal.name`.
+        seed: of its frames.
+        references: (K, expansion) of each.
+    """
+
+    name: str
+    seed: int
+    references: tuple[tuple[int, str], ...]
+
+
+class Library:
+    """The streams in a folder.
+
+    Args:
+        folder: where they are; made where it does not exist.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def prepare(self, wanted: Wanted) -> None:
+        """Make what is not there yet; only one process at a time may make a stream.
+
+        Raises:
+            UsageError: it needs a package that is missing.
+        """
+        self._make(wanted.name, wanted.seed)
+        if parse(wanted.name)[0].learnable:
+            for components, expansion in wanted.references:
+                path = self._reference(wanted.name, wanted.seed, components, expansion)
+                if not path.is_file():
+                    found = refer(self.stream(wanted.name, wanted.seed), components, expansion)
+                    _save(path, found)
+
+    def stream(self, name: str, seed: int) -> Stream:
+        """A stream that was made before.
+
+        Raises:
+            UsageError: it was not.
+        """
+        folder = self._folder(name, seed)
+        try:
+            frames, state = (np.load(folder / f"{n}.npy", "r") for n in ("frames", "state"))
+        except (OSError, ValueError) as error:
+            raise UsageError(f"{folder} is damaged: delete it, and it is made anew") from error
+        (signal,) = parse(name)
+        return Stream(name, np.asarray(frames), np.asarray(state), STREAMS[signal.kind].loops)
+
+    def reference(self, name: str, seed: int, components: int, expansion: str) -> Reference:
+        """What batch SFA found in a stream, see `refer`.
+
+        Raises:
+            UsageError: it is not there.
+        """
+        path = self._reference(name, seed, components, expansion)
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                scale, mean = float(arrays["scale"]), arrays["mean"]
+                both = [linear(arrays[k], mean, expansion, scale) for k in ("phi", "directions")]
+                return Reference(float(arrays["slowness"]), *both)
+        except (OSError, ValueError, KeyError) as error:
+            raise UsageError(f"{path} is damaged: delete it, and it is made anew") from error
+
+    def _make(self, name: str, seed: int) -> None:
+        folder = self._folder(name, seed)
+        if _recipe(folder) == RECIPE:
+            return
+        (signal,) = parse(name)
+        plain = None
+        if signal.camera:
+            self._make(signal.kind, seed)
+            good = self.stream(signal.kind, seed)
+            plain = Shown(good.frames, good.state)
+        shown = make(name, seed, plain)
+        with whole(folder) as partial:
+            partial.mkdir(parents=True)
+            np.save(partial / "frames.npy", shown.frames)
+            np.save(partial / "state.npy", shown.state)
+            about = {"recipe": RECIPE, "name": name, "seed": seed, "state": list(shown.names)}
+            write_json(partial / "about.json", about)
+
+    def _folder(self, name: str, seed: int) -> Path:
+        return self.folder / f"{name.replace(':', '-')}-{seed}"
+
+    def _reference(self, name: str, seed: int, components: int, expansion: str) -> Path:
+        folder = self._folder(name, seed)
+        return folder.with_name(f"{folder.name}-{components}-{expansion}.npz")
+
+
+def refer(stream: Stream, components: int, expansion: str) -> Reference:
+    """Batch SFA within the leading principal components of what a learner is shown.
+
+    Args:
+        stream: the stream.
+        components: K, as many as the learner has.
+        expansion: the learner's.
+    """
+    scale = PIXEL if stream.frames.dtype == UINT8 else 1.0
+    rows = stream.learned_from.reshape(len(stream.learned_from), -1)
+    x = expand(expansion, rows.astype(np.float64) * scale)
+    mean = x.mean(axis=0)
+    x = x - mean
+    directions = leading_directions(x, components)
+    phi = batch_sfa(x @ directions, 1) @ directions.T
+    slowest = linear(phi, mean, expansion, scale)
+    eta = float(slowness(slowest.transform(stream.held_out))[0])
+    return Reference(eta, slowest, linear(directions.T, mean, expansion, scale))
+
+
+def linear(phi: Float, mean: Float, expansion: str, scale: float) -> Module:
+    """Weights (J, I) of a centred frame as a module that was never watched for."""
+    none, nowhere = np.zeros(len(phi)), np.zeros(0, np.int64)
+    return Module(0, 0, 0, phi, mean, none, none, none, nowhere, expansion=expansion, scale=scale)
+
+
+def _save(path: Path, found: Reference) -> None:
+    with whole(path, sync=False) as partial, open(partial, "wb") as file:
+        np.savez(
+            file,
+            slowness=found.slowness,
+            phi=found.slowest.phi,
+            directions=found.components.phi,
+            mean=found.slowest.mean,
+            scale=found.slowest.scale,
+        )
+
+
+def _recipe(folder: Path) -> Any:
+    """How the stream in a folder was made; None where there is none."""
+    try:
+        return json.loads((folder / "about.json").read_text("utf-8"))["recipe"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

