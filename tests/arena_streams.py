@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from cdmisfa.arena.shown import Rng, Shown, pixels, stateless
+from cdmisfa.arena.pictures import Rng, Shown, pixels, stateless
+from cdmisfa.arena.sets import SETS, ArenaSet
 from cdmisfa.arena.streams import STREAMS, Kind
 
 SHAPE = (6, 8)
@@ -41,11 +42,16 @@ KINDS = {
 }
 
 
+SET = ArenaSet(("sway", "hiss", "swing"), "two fading patterns, and noise", frames=60_000)
+
+
 @pytest.fixture(scope="module")
 def tiny() -> Iterator[None]:
-    """The small streams among those of the arena."""
+    """The small streams among those of the arena, and the set `tiny` of some."""
     for name, kind in KINDS.items():
         STREAMS.add(name, kind)
+    SETS.add("tiny", SET)
     yield
+    SETS.remove("tiny")
     for name in KINDS:
         STREAMS.remove(name)

@@ -215,4 +215,4 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_sample_recording_is_a_stream() -> None:
     shown = make("icub-right", 0)
     assert shown.frames.shape == (4000, 48, 128)
-    assert "object3_y" in shown.names
+    assert shown.names == ("object3_x", "object3_y")

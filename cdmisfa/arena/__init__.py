@@ -5,8 +5,10 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "cdmisfa.arena.contestants": "CONTESTANTS",
         "cdmisfa.arena.sets": "ArenaSet SETS",
         "cdmisfa.arena.source": "ArenaSource",
-        "cdmisfa.arena.streams": "Kind STREAMS Shown",
+        "cdmisfa.arena.pictures": "Shown",
+        "cdmisfa.arena.streams": "Kind STREAMS",
     },
 )

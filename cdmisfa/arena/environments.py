@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from cdmisfa.arena.shown import HEIGHT, WIDTH, Rng, Shown, stateless
+from cdmisfa.arena.pictures import HEIGHT, WIDTH, Rng, Shown, stateless
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.pixels import shrink
 
@@ -110,8 +110,8 @@ def clip(name: str) -> Callable[[Rng, int], Shown]:
     return make
 
 
-def icub(view: str) -> Callable[[Rng, int], Shown]:
-    """A view of the sample recording, and where the objects are."""
+def icub(view: str, thing: str) -> Callable[[Rng, int], Shown]:
+    """A view of the sample recording, and where the thing is that is seen in it."""
 
     def make(rng: Rng, n: int) -> Shown:
         from replay.recordings.source import RecordedSource
@@ -120,7 +120,9 @@ def icub(view: str) -> Callable[[Rng, int], Shown]:
             raise UsageError(f"{SAMPLE} is missing: run from a copy of the project")
         with contextlib.closing(RecordedSource(SAMPLE)) as source:
             block = source.take(source.spec.streams.index(view), source.frames)
-            return Shown(block.frames, block.truth, source.spec.truth)
+            names = tuple(name for name in source.spec.truth if name.startswith(thing))
+            columns = [source.spec.truth.index(name) for name in names]
+            return Shown(block.frames, block.truth[:, columns], names)
 
     return make
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.arena.shown import Shown
+from cdmisfa.arena.pictures import Shown
 from cdmisfa.arena.streams import LEARNED_FROM, STREAMS, make, parse
 from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.errors import UsageError
@@ -95,6 +95,15 @@ class Library:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+
+    def has(self, wanted: Wanted) -> bool:
+        """Whether nothing of it is left to make."""
+        learnable = parse(wanted.name)[0].learnable
+        return _recipe(self._folder(wanted.name, wanted.seed)) == RECIPE and all(
+            self._reference(wanted.name, wanted.seed, *each).is_file()
+            for each in wanted.references
+            if learnable
+        )
 
     def prepare(self, wanted: Wanted) -> None:
         """Make what is not there yet; only one process at a time may make a stream.

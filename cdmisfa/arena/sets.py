@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from cdmisfa.arena.source import CHANGE
 from cdmisfa.arena.streams import NOISE_SD
 from cdmisfa.core.registry import Registry
-
-CHANGE: Final = 60_000
-"""Frame from which on a stream that changes shows something else."""
 
 NOISES: Final = tuple(f"{name}-{sd:g}" for name in ("gaussian", "uniform") for sd in NOISE_SD)
 

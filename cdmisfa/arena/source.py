@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from cdmisfa.arena.library import Library
-from cdmisfa.arena.sets import CHANGE
 from cdmisfa.arena.streams import BEGIN_APART, Signal, parse
 from cdmisfa.core.blocks import (
     Block,
@@ -19,6 +18,9 @@ from cdmisfa.core.blocks import (
     freeze,
 )
 from cdmisfa.core.errors import UsageError
+
+CHANGE: Final = 60_000
+"""Frame from which on a stream that changes shows something else."""
 
 
 class ArenaSource(SeekableSource):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.arena import environments, pictures
-from cdmisfa.arena.shown import Rng, Shown
+from cdmisfa.arena.pictures import Rng, Shown
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry, did_you_mean
 from recorder.world.oscillatory import PERIOD, one_period
@@ -37,11 +37,13 @@ class Kind:
         make: frames, and the state behind them, from a generator and how many are wanted.
         learnable: it has a slow feature that a linear learner can find.
         loops: its frames are few and fixed, so that it is judged on those it was learned from.
+        images: its frames are pictures, and not a few values.
     """
 
     make: Callable[[Rng, int], Shown]
     learnable: bool = True
     loops: bool = False
+    images: bool = True
 
 
 SLOW_SOURCES: Mapping[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
@@ -90,11 +92,11 @@ STREAMS: Registry[Kind] = Registry(
         "bikes": Kind(environments.clip("bikes"), loops=True),
         "bigbuckbunny": Kind(environments.clip("bigbuckbunny"), loops=True),
         "carphone": Kind(environments.clip("carphone_pristine"), loops=True),
-        "icub-left": Kind(environments.icub("left"), loops=True),
-        "icub-center": Kind(environments.icub("center"), learnable=False, loops=True),
-        "icub-right": Kind(environments.icub("right"), loops=True),
-        **{name: Kind(oscillatory(name)) for name in SLOW_SOURCES},
-        "vector-noise": Kind(pictures.vector_noise, learnable=False),
+        "icub-left": Kind(environments.icub("left", "object1"), loops=True),
+        "icub-center": Kind(environments.icub("center", "object2"), learnable=False, loops=True),
+        "icub-right": Kind(environments.icub("right", "object3"), loops=True),
+        **{name: Kind(oscillatory(name), images=False) for name in SLOW_SOURCES},
+        "vector-noise": Kind(pictures.vector_noise, learnable=False, images=False),
         "light": Kind(pictures.light),
         "waves": Kind(pictures.waves),
         "noise": Kind(pictures.full_noise, learnable=False),

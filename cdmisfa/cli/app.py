@@ -44,6 +44,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "reproduce",
         "Reproduce an experiment of the paper: numbers, tables and figures.",
     ),
+    "arena": ("arena", "Compare learners on sets of streams: what they learn, and how soon."),
     "demo": ("demo", "Record, learn, check and show: the whole story in minutes."),
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }

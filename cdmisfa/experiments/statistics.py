@@ -17,6 +17,13 @@ CHI_SQUARE_95 = 3.841458820694124
 NORMAL_95 = 1.959963984540054
 """97.5 % quantile of the normal distribution: 95 % lie within this."""
 
+STUDENT_95 = (
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
+    2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
+    2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
+)  # fmt: skip
+"""97.5 % quantiles of Student's t distribution, from one degree of freedom on."""
+
 STEEPEST = 1e4
 """Largest slope a logistic fit may have, per unit of x."""
 
@@ -60,6 +67,23 @@ def wilson(successes: int, n: int) -> tuple[float, float]:
     centre = (share + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
     return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def mean_interval(values: ArrayLike) -> tuple[float, float]:
+    """95 % interval of the mean of the values that are numbers (Student); infinite for one.
+
+    Example:
+        >>> [round(bound, 2) for bound in mean_interval([1.0, 2.0, 3.0])]
+        [-0.48, 4.48]
+    """
+    found = summary(values)
+    if found.n < 2:
+        return -math.inf, math.inf
+    freedom = found.n - 1
+    beyond = NORMAL_95 + (NORMAL_95**3 + NORMAL_95) / (4 * freedom)
+    t = STUDENT_95[freedom - 1] if freedom <= len(STUDENT_95) else beyond
+    half = t * found.sd / math.sqrt(found.n)
+    return found.mean - half, found.mean + half
 
 
 @dataclass(frozen=True, slots=True)

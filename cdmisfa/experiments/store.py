@@ -1,4 +1,4 @@
-"""Trials that ended, a row each: none is computed twice, however often it is asked for.
+"""Trials, a row each when they end: none is computed twice, however often it is asked for.
 
 A trial is known by a hash of everything it depends on, the code included. A folder's
 rows.jsonl has a line of JSON for each; the last line of a trial counts.
@@ -9,13 +9,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol, TypeVar
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.experiments.engines import WorkerDied, run_all
 from recorder.log.folder import held
 
 ROWS = "rows.jsonl"
@@ -25,12 +27,17 @@ DONE, FAILED = "done", "failed"
 
 
 @cache
-def code() -> str:
-    """Version of what a trial computes: the package's, and a hash of learner and recorder."""
+def code(*more: str) -> str:
+    """Version of what a trial computes: the package's, and a hash of learner and recorder.
+
+    Args:
+        more: further modules that decide it: "cdmisfa/arena/trial".
+    """
     root = Path(__file__).parents[2]
     rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    files += [root / "cdmisfa/experiments" / f"{name}.py" for name in ("loop", "trial")]
+    modules = ("cdmisfa/experiments/loop", "cdmisfa/experiments/trial", *more)
+    files += [root / f"{module}.py" for module in modules]
     digest = hashlib.sha256()
     for file in sorted(files):
         digest.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
@@ -41,6 +48,33 @@ def identity(*depends: Any) -> str:
     """The name of a trial: a hash of what decides its result, as JSON values."""
     text = json.dumps(depends, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+class AnyTrial(Protocol):
+    """What there is to know of a trial to compute it only once."""
+
+    @property
+    def id(self) -> str:
+        """Hash of all it depends on."""
+
+    @property
+    def point(self) -> Mapping[str, str]:
+        """What it is a trial of."""
+
+    @property
+    def seed(self) -> int:
+        """Which of the trials there."""
+
+    @property
+    def log(self) -> Path | None:
+        """Folder in which to keep its log, or None."""
+
+    @property
+    def code(self) -> str:
+        """Version of the code that the hash is about; workers must have the same."""
+
+
+Task = TypeVar("Task", bound=AnyTrial)
 
 
 class TrialStore:
@@ -106,3 +140,127 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
                 f"{path} line {number} is no trial's row: remove the line"
             ) from error
     yield from rows.values()
+
+
+@dataclass(frozen=True, slots=True)
+class SweepReport:
+    """What a sweep came to.
+
+    Attributes:
+        trials: how many were asked for.
+        skipped: how many of them were finished before.
+        computed: how many finished now.
+        failed: rows of those that failed, now or before.
+        outdated: how many of them were finished before by other code, and not reused.
+    """
+
+    folder: Path
+    trials: int
+    skipped: int
+    computed: int
+    failed: tuple[Mapping[str, Any], ...] = field(default=())
+    outdated: int = 0
+
+
+def run_trials(
+    trials: Sequence[Task],
+    folder: Path,
+    compute: Callable[[Task], Mapping[str, Any]],
+    *,
+    jobs: int = 1,
+    engine: str = "local",
+    scheduler: str | None = None,
+    retry_failed: bool = False,
+    begin: Callable[[Sequence[Task]], None] = lambda missing: None,
+    progress: Callable[[int, int, int], None] | None = None,
+) -> SweepReport:
+    """Compute the trials that have no row in a folder yet.
+
+    Args:
+        trials: all that are asked for.
+        folder: where the rows are; made where it does not exist.
+        compute: a trial's result, or under "error" why there is none; importable by workers.
+        jobs: local processes.
+        engine: where to compute, see `engines.ENGINES`.
+        scheduler: address of a dask scheduler.
+        retry_failed: compute trials again that failed before.
+        begin: called with those to be computed, once the folder is held and before the first.
+        progress: called with the trials finished, failed, and asked for.
+
+    Raises:
+        UsageError: another process holds the folder, or there is no such engine.
+        EngineError: no scheduler answers.
+    """
+    with contextlib.closing(TrialStore(folder)) as store:
+        missing = [t for t in trials if store.needs_computing(t.id, t.log, retry=retry_failed)]
+        begin(missing)
+        outdated = _outdated(missing, store.rows.values())
+        finished = skipped = len(trials) - len(missing)
+        again = {trial.id for trial in missing}
+        failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in again)
+        for index, result in run_all(
+            compute, missing, jobs=jobs, engine=engine, scheduler=scheduler
+        ):
+            trial = missing[index]
+            row = _row(trial, result)
+            store.add(row)
+            finished += 1
+            failed += row["status"] == FAILED
+            if progress is not None:
+                progress(finished, failed, len(trials))
+    rows = store.rows
+    return SweepReport(
+        folder=folder,
+        trials=len(trials),
+        skipped=skipped,
+        computed=sum(rows[t.id]["status"] == DONE for t in missing),
+        failed=tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED),
+        outdated=outdated,
+    )
+
+
+def answer(
+    trial: Task, version: str, compute: Callable[[Task], Mapping[str, Any]]
+) -> Mapping[str, Any]:
+    """What a trial came to, or under "error" why it did not.
+
+    Args:
+        trial: the trial.
+        version: of the code that is here.
+        compute: how; whatever it raises is the answer.
+    """
+    if trial.code != version:
+        return {"error": f"the worker has cdmisfa {version}, not {trial.code}: install the same"}
+    try:
+        return compute(trial)
+    except CdmisfaError as error:
+        return {"error": str(error)}
+    except Exception as error:
+        # Whatever breaks in one trial must not end a sweep of thousands.
+        return {"error": f"{type(error).__name__}: {error}"}
+
+
+def _row(trial: AnyTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
+    if isinstance(result, WorkerDied):
+        result = {"error": result.what}
+    failed = "error" in result
+    return {
+        "id": trial.id,
+        "status": FAILED if failed else DONE,
+        "point": dict(trial.point),
+        "seed": trial.seed,
+        "code": trial.code,
+        "run": str(trial.log) if trial.log is not None and not failed else None,
+        **({"error": result["error"]} if failed else {"result": result}),
+    }
+
+
+def _outdated(trials: Sequence[AnyTrial], rows: Iterable[Mapping[str, Any]]) -> int:
+    """How many trials are in the rows already, but computed by other code."""
+    mine = {trial.code for trial in trials}
+    done = {
+        (json.dumps(row["point"], sort_keys=True), row["seed"])
+        for row in rows
+        if row["status"] == DONE and row.get("code") not in mine
+    }
+    return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)

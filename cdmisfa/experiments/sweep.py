@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.core.config import as_table
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
-from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_source, scene_kind_for
-from cdmisfa.experiments.store import DONE, FAILED, TrialStore, code, identity
+from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
 from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
@@ -57,26 +55,6 @@ class SweepTrial:
     max_modules: int | None
     log: Path | None
     code: str
-
-
-@dataclass(frozen=True, slots=True)
-class SweepReport:
-    """What a sweep came to.
-
-    Attributes:
-        trials: how many were asked for.
-        skipped: how many of them were finished before.
-        computed: how many finished now.
-        failed: rows of those that failed, now or before.
-        outdated: how many of them were finished before by other code, and not reused.
-    """
-
-    folder: Path
-    trials: int
-    skipped: int
-    computed: int
-    failed: tuple[Mapping[str, Any], ...] = field(default=())
-    outdated: int = 0
 
 
 def sweep(
@@ -135,31 +113,16 @@ def sweep(
         max_modules=max_modules,
         logs=folder / "trials" if keep_logs else None,
     )
-    with contextlib.closing(TrialStore(folder)) as store:
-        write_json(folder / REQUEST, _request(grid or {}, trials))
-        missing = [t for t in trials if store.needs_computing(t.id, t.log, retry=retry_failed)]
-        outdated = _outdated(missing, store.rows.values())
-        finished = skipped = len(trials) - len(missing)
-        again = {trial.id for trial in missing}
-        failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in again)
-        for index, result in run_all(
-            compute, missing, jobs=jobs, engine=engine, scheduler=scheduler
-        ):
-            trial = missing[index]
-            row = _row(trial, result)
-            store.add(row)
-            finished += 1
-            failed += row["status"] == FAILED
-            if progress is not None:
-                progress(finished, failed, len(trials))
-    rows = store.rows
-    return SweepReport(
-        folder=folder,
-        trials=len(trials),
-        skipped=skipped,
-        computed=sum(rows[t.id]["status"] == DONE for t in missing),
-        failed=tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED),
-        outdated=outdated,
+    return run_trials(
+        trials,
+        folder,
+        compute,
+        jobs=jobs,
+        engine=engine,
+        scheduler=scheduler,
+        retry_failed=retry_failed,
+        begin=lambda missing: write_json(folder / REQUEST, _request(grid or {}, trials)),
+        progress=progress,
     )
 
 
@@ -242,24 +205,20 @@ def _is_live(words: Sequence[str | Path]) -> bool:
     return len(words) == 1 and words[0] in SCENES
 
 
-def compute(trial: SweepTrial) -> dict[str, Any]:
+def compute(trial: SweepTrial) -> Mapping[str, Any]:
     """Compute one trial: its result, or under "error" why there is none.
 
     Oscillatory trials without a log run as a whole in compiled code where the learner has it;
     all others as `learn` does.
     """
-    if trial.code != code():
-        return {"error": f"the worker has cdmisfa {code()}, not {trial.code}: install the same"}
-    try:
-        live = trial.source == ("oscillatory",) and trial.log is None
-        if live and has_compiled_trials(trial.configuration.learner):
-            return _compiled_trial(trial)
-        return _logged_trial(trial)
-    except CdmisfaError as error:
-        return {"error": str(error)}
-    except Exception as error:
-        # Whatever breaks in one trial must not end a sweep of thousands.
-        return {"error": f"{type(error).__name__}: {error}"}
+    return answer(trial, code(), _compute)
+
+
+def _compute(trial: SweepTrial) -> dict[str, Any]:
+    live = trial.source == ("oscillatory",) and trial.log is None
+    if live and has_compiled_trials(trial.configuration.learner):
+        return _compiled_trial(trial)
+    return _logged_trial(trial)
 
 
 def _compiled_trial(trial: SweepTrial) -> dict[str, Any]:
@@ -303,31 +262,6 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
         )
     told = result.as_json()
     return {key: value for key, value in told.items() if key not in UNKEPT}
-
-
-def _row(trial: SweepTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
-    if isinstance(result, WorkerDied):
-        result = {"error": result.what}
-    failed = "error" in result
-    return {
-        "id": trial.id,
-        "status": FAILED if failed else DONE,
-        "point": dict(trial.point),
-        "seed": trial.seed,
-        "code": trial.code,
-        "run": str(trial.log) if trial.log is not None and not failed else None,
-        **({"error": result["error"]} if failed else {"result": result}),
-    }
-
-
-def _outdated(trials: Sequence[SweepTrial], rows: Iterable[Mapping[str, Any]]) -> int:
-    """How many trials are in the rows already, but computed by other code."""
-    done = {
-        (json.dumps(row["point"], sort_keys=True), row["seed"])
-        for row in rows
-        if row["status"] == DONE and row.get("code") != code()
-    }
-    return sum((json.dumps(dict(t.point), sort_keys=True), t.seed) in done for t in trials)
 
 
 def _request(grid: Mapping[str, Sequence[Any]], trials: Sequence[SweepTrial]) -> dict[str, Any]:

@@ -1,0 +1,44 @@
+"""The learners that are compared, each a name for a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from cdmisfa.core.registry import Registry
+from cdmisfa.experiments.sources import configure
+
+ATTENTIONS = ("random", "robin", "novel", "sticky", "gamma", "ucb")
+"""Choosing rules other than the learner's own; see `learner.attention`."""
+
+CONTESTANTS: Registry[tuple[str, ...]] = Registry(
+    "learner of the arena",
+    {
+        "progress": ("learner.algorithm=progress",),
+        "2.0": ("learner.algorithm=2.0",),
+        "1.0": ("learner.algorithm=1.0",),
+        **{
+            name: ("learner.algorithm=progress", f"learner.attention={name}") for name in ATTENTIONS
+        },
+    },
+)
+"""Settings of every learner, over its preset; `CONTESTANTS.add` adds one."""
+
+
+def configured(name: str, settings: Sequence[str], *, images: bool) -> Any:
+    """The configuration of a learner.
+
+    Args:
+        name: in `CONTESTANTS`.
+        settings: `section.key=value` words that win over its own.
+        images: frames are pictures, and not the few values of the oscillatory streams, whose
+            slow features are quadratic.
+
+    Raises:
+        UsageError: no such learner or key, or a value that does not fit.
+    """
+    own = CONTESTANTS[name]
+    if images:
+        return configure("icub", settings=(*own, *settings)).learner
+    quadratic = "learner.expansion=quadratic"
+    return configure("oscillatory", settings=(*own, quadratic, *settings)).learner

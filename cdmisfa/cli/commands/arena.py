@@ -1,0 +1,98 @@
+"""`cdmisfa arena`: learners compared on sets of streams."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.commands.sweep import parse_seeds
+from cdmisfa.cli.progress import bar
+
+ALL = "all"
+
+
+@click.command("arena")
+@click.argument("sets", nargs=-1, metavar="[SET]...")
+@click.option("--learners", metavar="NAME,...", help="Which learners [default: all].")
+@click.option(
+    "--seeds",
+    default="0:10",
+    show_default=True,
+    metavar="FIRST:END",
+    help="Seeds of learners and streams: a range without its end, or numbers with commas.",
+)
+@options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
+@click.option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")
+@click.option("--frames", type=click.IntRange(1), help="Stop a run after so many, not the set's.")
+@options.settings
+@options.jobs
+@options.engine
+@click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
+@click.option("--page", type=options.OUT, help="Write this Markdown page of all results in OUT.")
+@options.as_json
+@click.pass_context
+def arena_command(
+    ctx: click.Context,
+    /,
+    sets: tuple[str, ...],
+    learners: str | None,
+    seeds: str,
+    out: Path | None,
+    page: Path | None,
+    as_json: bool,
+    **each: Any,
+) -> None:
+    """Compare learners on sets of streams: what they learn, and how soon.
+
+    SET is one of those that docs/arena.md lists, or all; without one the six of the public suite
+    are run, or, with --page, the page made from the results that are there. Most sets need the
+    extra [arena]; the set small needs nothing.
+    """
+    from cdmisfa.arena.page import draw, table, write_page
+    from cdmisfa.arena.results import write_results
+
+    folder = out or Path("arena")
+    failed = () if page is not None and not sets else _run(folder, sets, learners, seeds, each)
+    document = write_page(folder, page) if page is not None else write_results(folder)
+    figure, _ = draw(document, folder)
+    click.echo(f"figure {figure}" + (f", page {page}" if page is not None else ""), err=True)
+    if as_json:
+        options.print_json(document | {"schema": options.SCHEMA, "folder": folder})
+    else:
+        options.print_table(*table(document))
+    for row in failed:
+        at = " ".join(f"{key}={value}" for key, value in row["point"].items())
+        click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=True)
+    if failed:
+        ctx.exit(1)
+
+
+def _run(
+    folder: Path, sets: tuple[str, ...], learners: str | None, seeds: str, each: dict[str, Any]
+) -> Any:
+    """Compute what is missing; the rows of the trials that failed."""
+    from cdmisfa.arena.arena import arena
+    from cdmisfa.arena.sets import SETS, SUITE
+
+    names = [name for word in sets for name in (SETS if word == ALL else (word,))]
+    chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
+    with bar("arena", "trials") as shown:
+        report = arena(
+            folder,
+            names or SUITE,
+            chosen,
+            parse_seeds(seeds),
+            making=lambda done, total, note: shown.update(done, total, "streams, made first"),
+            progress=shown.update,
+            **each,
+        )
+    again = f" ({report.outdated} again: the code has changed since)" if report.outdated else ""
+    click.echo(
+        f"{report.trials} trials: {report.computed} computed{again}, {report.skipped} finished "
+        f"before, {len(report.failed)} failed",
+        err=True,
+    )
+    return report.failed

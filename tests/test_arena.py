@@ -1,0 +1,285 @@
+"""The arena: known answers of its measures, and a small one from the command line to the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from arena_streams import tiny as tiny
+from conftest import Cdmisfa
+
+from cdmisfa.arena import measures
+from cdmisfa.arena.arena import plan
+from cdmisfa.arena.contestants import configured
+from cdmisfa.arena.library import Library, Wanted, linear
+from cdmisfa.arena.measures import Saved, probe
+from cdmisfa.arena.results import results
+from cdmisfa.arena.source import ArenaSource
+from cdmisfa.arena.streams import LEARNED_FROM
+from cdmisfa.arena.trial import History, follow, judge
+from cdmisfa.core.blocks import PIXEL
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.modules import Module
+
+pytestmark = pytest.mark.usefixtures("tiny")
+
+WORDS = ("sway", "hiss", "swing>hiss", "sway#1", "blank")
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory: pytest.TempPathFactory, tiny: None) -> Library:
+    found = Library(tmp_path_factory.mktemp("streams"))
+    for name in ("sway", "swing", "hiss", "short", "blank"):
+        found.prepare(Wanted(name, 0, ((8, "none"),)))
+    return found
+
+
+def module(library: Library, name: str, stream: int, *, pixel: int | None = None) -> Module:
+    """Batch SFA of a signal as a module of a stream, or one pixel."""
+    if pixel is None:
+        return dataclasses.replace(library.reference(name, 0, 8, "none").slowest, stream=stream)
+    phi = np.zeros((1, 48))
+    phi[0, pixel] = 1.0
+    return dataclasses.replace(linear(phi, np.zeros(48), "none", PIXEL), stream=stream)
+
+
+def judged(library: Library, *saved: tuple[Module, int], words: Any = WORDS) -> dict[str, Any]:
+    """What a run that saved modules, each at a frame, came to; every stream was watched in turn."""
+    source = ArenaSource(words, library, 0, change=2000)
+    watched = [(40 * k, k % len(words)) for k in range(100)]
+    told = []
+    for one, frame in saved:
+        signal = source.shown(one.stream, frame - 1)
+        told.append(Saved(one, signal.name, signal.learnable, frame, frame // 40))
+    names = {s.name for phases in source.phases for s in phases if s.learnable}
+    references = {name: library.reference(name, 0, 8, "none") for name in names}
+    return judge(History(told, watched, 4000, ""), source, references)
+
+
+def learned(row: dict[str, Any]) -> dict[str, int | None]:
+    return {t["stream"]: t["frame"] for t in row["targets"]}
+
+
+def test_batch_sfa_itself_has_learned_and_knows_the_stream_shown_twice(library: Library) -> None:
+    row = judged(library, (module(library, "sway", 0), 400), (module(library, "swing", 2), 800))
+    assert learned(row) == {"sway": 400, "swing>hiss": 800, "sway#1": 400}
+    assert (row["wrong"], row["doubles"]) == (0, 0)
+    assert [t["block"] for t in row["targets"]] == [10, 20, 10]
+    assert [t["watched"] for t in row["targets"]] == [2, 4, 2]
+    for tells in row["probes"]:
+        assert tells["modules"] == pytest.approx(1.0, abs=0.01)
+        assert tells["outputs"] == 1
+
+
+def test_a_module_that_is_not_slow_has_learned_nothing(library: Library) -> None:
+    row = judged(library, (module(library, "sway", 0, pixel=3), 400))
+    assert set(learned(row).values()) == {None}
+    ((only,), tells) = row["modules"], row["probes"]
+    assert only["slowness"] > only["allowed"]
+    assert 0 < tells[0]["modules"] < 0.999
+
+
+def test_a_module_of_noise_is_wrong_however_it_was_learned(library: Library) -> None:
+    noise = module(library, "sway", 1)
+    row = judged(library, (noise, 400), (dataclasses.replace(noise, stream=2), 2400))
+    assert row["wrong"] == 2
+    assert row["modules"][0]["allowed"] is None
+    assert learned(row)["sway"] == 400  # its output there is that of batch SFA
+
+
+def test_the_same_module_again_is_double_but_another_of_the_stream_is_not(
+    library: Library,
+) -> None:
+    sway = module(library, "sway", 0)
+    again = dataclasses.replace(sway, stream=3, phi=-sway.phi)
+    row = judged(library, (sway, 400), (again, 800), (module(library, "swing", 2), 1200))
+    assert row["doubles"] == 1
+    other = dataclasses.replace(sway, phi=noise_direction(library))
+    assert judged(library, (sway, 400), (other, 800))["doubles"] == 0
+
+
+def noise_direction(library: Library) -> np.ndarray:
+    """Weights of a sway's flickering pattern, (1, I), blind to what fades."""
+    x = library.stream("sway", 0).learned_from.reshape(LEARNED_FROM, -1) * PIXEL
+    x = x - x.mean(axis=0)
+    slow = (x * (x @ library.reference("sway", 0, 8, "none").slowest.phi.T)).mean(axis=0)
+    directions = np.linalg.svd(x, full_matrices=False)[2][:2]
+    a, b = directions @ slow
+    return np.asarray([b * directions[0] - a * directions[1]])
+
+
+def test_what_changes_counts_from_its_change(library: Library) -> None:
+    words = ("sway>swing", "hiss")
+    both = (module(library, "sway", 0), 400), (module(library, "swing", 0), 3000)
+    row = judged(library, *both, words=words)
+    assert [(t["signal"], t["frame"]) for t in row["targets"]] == [("sway", 400), ("swing", 3000)]
+    assert [t["watched"] for t in row["targets"]] == [5, 13]  # 3000 - 2000 frames, every other
+    early = judged(library, (module(library, "swing", 0), 400), words=words)
+    assert [t["frame"] for t in early["targets"]] == [None, 2000]
+
+
+def test_clips_that_loop_are_judged_on_themselves_and_more_mildly(library: Library) -> None:
+    reference = library.reference("short", 0, 8, "none")
+    stream = library.stream("short", 0)
+    assert len(stream.held_out) == len(stream.learned_from) == 400
+    assert measures.allowed(stream, reference) == 1.5 * reference.slowness
+    sway = library.stream("sway", 0)
+    assert measures.allowed(sway, reference) == 1.25 * reference.slowness
+
+
+def test_an_output_that_never_moves_is_not_slow(library: Library) -> None:
+    dead = module(library, "sway", 4)
+    assert measures.slowest(dead, library.stream("blank", 0).held_out).slowness == math.inf
+    assert judged(library, (dead, 400))["wrong"] == 1
+
+
+def test_a_probe_tells_what_is_in_the_features_and_no_more() -> None:
+    rng = np.random.default_rng(0)
+    features = rng.standard_normal((40000, 3))
+    told = features @ [[1.0], [2.0], [-0.5]]
+    hidden, still = rng.standard_normal((40000, 1)), np.ones((40000, 1))
+    assert probe(features, told) == pytest.approx(1.0, abs=1e-5)
+    assert probe(features, told + 2.2913 * hidden) == pytest.approx(0.5, abs=0.03)
+    assert probe(features, hidden) == pytest.approx(0.0, abs=0.01)
+    assert probe(features, np.hstack([told, still])) == pytest.approx(1.0, abs=1e-5)
+    assert math.isnan(probe(features, still))
+    assert probe(np.zeros((40000, 1)), told) == 0.0
+
+
+class Chooser:
+    """A learner that saves a module a stream, at given iterations, and then has nothing left."""
+
+    tau = 40
+
+    def __init__(self, saves: dict[int, Module], ends: int) -> None:
+        self.saves, self.ends = saves, ends
+        self.iteration, self.modules = 0, list[Module]()
+
+    @property
+    def stream(self) -> int:
+        return self.iteration % 2
+
+    @property
+    def over(self) -> bool:
+        return self.iteration >= self.ends
+
+    def step(self, block: Any) -> None:
+        assert block.t == 40 * self.iteration
+        self.iteration += 1
+        if self.iteration in self.saves:
+            self.modules.append(self.saves[self.iteration])
+
+
+@pytest.mark.parametrize(
+    ("ends", "goes_on", "blocks", "ended"),
+    [(9, False, 9, "nothing_left"), (99, False, 20, ""), (9, True, 20, None)],
+)
+def test_a_run_ends_by_itself_or_with_its_frames(
+    library: Library, ends: int, goes_on: bool, blocks: int, ended: str | None
+) -> None:
+    learner: Any = Chooser({5: module(library, "sway", 0)}, ends)
+    source = ArenaSource(("sway", "hiss"), library, 0)
+    history = follow(learner, source, 800, goes_on=goes_on)
+    assert (len(history.watched), history.frames, history.ended) == (blocks, 40 * blocks, ended)
+    assert [(s.signal, s.frame, s.block) for s in history.saved] == [("sway", 200, 5)]
+
+
+def test_trials_are_named_by_what_they_depend_on(tmp_path: Path) -> None:
+    def names(*settings: str, frames: int | None = None, learner: str = "2.0") -> set[str]:
+        return {t.id for t in plan(["tiny"], [learner], [0, 1], settings, frames, tmp_path)}
+
+    others = [
+        names(),
+        names("learner.nu=0.02"),
+        names(frames=100),
+        names(learner="1.0"),
+        {t.id for t in plan(["oscillatory"], ["2.0"], [0, 1], (), None, tmp_path)},
+    ]
+    assert len(set.union(*others)) == 10
+    assert names() == names("learner.nu=0.01")
+    (first, _) = plan(["tiny"], ["2.0"], [0, 1], (), None, tmp_path)
+    assert {w.name for w in first.wanted()} == {"sway", "swing", "hiss"}
+    assert first.reference == (7, "none")
+    assert configured("2.0", (), images=False).expansion == "quadratic"
+
+
+def test_what_does_not_exist_is_refused_before_anything_runs(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    out = ("-o", tmp_path / "out")
+    for words, said in (
+        (("tini",), "no set 'tini': did you mean tiny?"),
+        (("tiny", "--learners", "3.0"), "no learner of the arena '3.0'"),
+        (("tiny", "--learners", "2.0", "--set", "learner.no=1"), "unknown key learner.no"),
+        (("--page", tmp_path / "page.md"), "holds no trials: run cdmisfa arena"),
+    ):
+        done = cdmisfa("arena", *words, *out)
+        assert (done.code, done.out) == (2, "")
+        assert said in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_small_arena_from_trials_to_page(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ("arena", "tiny", "oscillatory", "--learners", "2.0", "--seeds", "0:2")
+    out = ("-o", tmp_path / "out", "--streams", tmp_path / "streams")
+    page = tmp_path / "docs" / "arena.md"
+    first = cdmisfa(*words, *out, "--page", page)
+    assert first.code == 0, first.err
+    assert "4 trials: 4 computed, 0 finished before, 0 failed" in first.err
+    again = cdmisfa(*words, *out, "--json")
+    assert "4 trials: 0 computed, 4 finished before, 0 failed" in again.err
+    waves, tiny = again.json["entries"]
+    assert [e["point"] for e in (waves, tiny)] == [
+        {"set": name, "learner": "2.0"} for name in ("oscillatory", "tiny")
+    ]
+    measured = waves["measures"]
+    assert measured["learned"] == {"mean": 1.0, "sd": 0.0, "n": 2, "low": 1.0, "high": 1.0}
+    assert (measured["wrong"]["mean"], measured["doubles"]["mean"]) == (0, 0)
+    assert measured["ended"]["mean"] == 1
+    assert measured["probe"]["mean"] > 0.99 > measured["probe_components"]["mean"]
+    assert 1000 < measured["blocks_learned"]["mean"] == measured["blocks"]["mean"] < 2000
+    assert waves["curve"]["mean"][0] == 0.0
+    assert waves["curve"]["mean"][-1] == 1.0
+    assert tiny["measures"]["learned"]["mean"] == 0.0
+    assert json.loads((tmp_path / "out" / "results.json").read_text()) == {
+        k: v for k, v in again.json.items() if k != "folder"
+    }
+    text = page.read_text("utf-8")
+    assert "**2.0**, tiny: `sway` not learned with 2 of 2 seeds" in text
+    assert "| 2.0 | 2 | 1.00 | 0.0 | 0.0 | 1.00" in text
+    assert "oscillatory: " not in text.partition("## What did not work")[2].partition("## tiny")[0]
+    assert (page.with_suffix("") / "arena.png").stat().st_size > 0
+    head, _, *rows = first.out.splitlines()
+    assert head.split()[:3] == ["set", "learner", "seeds"]
+    assert [row.split()[:3] for row in rows] == [["oscillatory", "2.0", "2"], ["tiny", "2.0", "2"]]
+
+
+def test_a_trial_that_breaks_is_a_failure_and_the_others_go_on(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from cdmisfa.arena import arena
+
+    def broken(trial: Any) -> dict[str, Any]:
+        if trial.seed == 1:
+            raise UsageError("it broke")
+        return {**judged_nothing, "frames": 400}
+
+    judged_nothing = {
+        "blocks": 10, "ended": "", "modules": [], "wrong": 0, "doubles": 0, "probes": [],
+        "targets": [{"stream": "sway", "signal": "sway", "frame": None, "block": None,
+                     "watched": None}],
+    }  # fmt: skip
+    monkeypatch.setattr(arena, "run_trial", broken)
+    words = ("arena", "tiny", "--learners", "2.0", "--seeds", "0:3", "-o", tmp_path)
+    done = cdmisfa(*words)
+    assert done.code == 1
+    assert "failed: set=tiny learner=2.0 seed 1: it broke" in done.err
+    (entry,) = results(tmp_path)["entries"]
+    assert (entry["seeds"], entry["failed"]) == ([0, 1, 2], ["it broke"])
+    assert entry["measures"]["learned"]["n"] == 2
+    assert "1 failed" in done.out
