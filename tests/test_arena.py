@@ -39,23 +39,26 @@ def library(tmp_path_factory: pytest.TempPathFactory, tiny: None) -> Library:
     return found
 
 
-def module(library: Library, name: str, stream: int, *, pixel: int | None = None) -> Module:
-    """Batch SFA of a signal as a module of a stream, or one pixel."""
-    if pixel is None:
-        return dataclasses.replace(library.reference(name, 0, 8, "none").slowest, stream=stream)
+def batch(library: Library, name: str) -> Module:
+    """Batch SFA of a signal, as a module."""
+    return library.reference(name, 0, 8, "none").slowest
+
+
+def pixel(place: int) -> Module:
+    """A module whose output is one of the pixels."""
     phi = np.zeros((1, 48))
-    phi[0, pixel] = 1.0
-    return dataclasses.replace(linear(phi, np.zeros(48), "none", PIXEL), stream=stream)
+    phi[0, place] = 1.0
+    return linear(phi, np.zeros(48), "none", PIXEL)
 
 
-def judged(library: Library, *saved: tuple[Module, int], words: Any = WORDS) -> dict[str, Any]:
-    """What a run that saved modules, each at a frame, came to; every stream was watched in turn."""
+def judged(library: Library, *saved: tuple[Module, int, int], words: Any = WORDS) -> dict[str, Any]:
+    """What a run came to that watched every stream in turn, and saved modules at (stream, frame)."""
     source = ArenaSource(words, library, 0, change=2000)
     watched = [(40 * k, k % len(words)) for k in range(100)]
     told = []
-    for one, frame in saved:
-        signal = source.shown(one.stream, frame - 1)
-        told.append(Saved(one, signal.name, signal.learnable, frame, frame // 40))
+    for one, stream, frame in saved:
+        signal = source.shown(stream, frame - 1)
+        told.append(Saved(one, stream, signal.name, signal.learnable, frame, frame // 40))
     names = {s.name for phases in source.phases for s in phases if s.learnable}
     references = {name: library.reference(name, 0, 8, "none") for name in names}
     return judge(History(told, watched, 4000, ""), source, references)
@@ -66,7 +69,7 @@ def learned(row: dict[str, Any]) -> dict[str, int | None]:
 
 
 def test_batch_sfa_itself_has_learned_and_knows_the_stream_shown_twice(library: Library) -> None:
-    row = judged(library, (module(library, "sway", 0), 400), (module(library, "swing", 2), 800))
+    row = judged(library, (batch(library, "sway"), 0, 400), (batch(library, "swing"), 2, 800))
     assert learned(row) == {"sway": 400, "swing>hiss": 800, "sway#1": 400}
     assert (row["wrong"], row["doubles"]) == (0, 0)
     assert [t["block"] for t in row["targets"]] == [10, 20, 10]
@@ -77,7 +80,7 @@ def test_batch_sfa_itself_has_learned_and_knows_the_stream_shown_twice(library: 
 
 
 def test_a_module_that_is_not_slow_has_learned_nothing(library: Library) -> None:
-    row = judged(library, (module(library, "sway", 0, pixel=3), 400))
+    row = judged(library, (pixel(3), 0, 400))
     assert set(learned(row).values()) == {None}
     ((only,), tells) = row["modules"], row["probes"]
     assert only["slowness"] > only["allowed"]
@@ -85,8 +88,8 @@ def test_a_module_that_is_not_slow_has_learned_nothing(library: Library) -> None
 
 
 def test_a_module_of_noise_is_wrong_however_it_was_learned(library: Library) -> None:
-    noise = module(library, "sway", 1)
-    row = judged(library, (noise, 400), (dataclasses.replace(noise, stream=2), 2400))
+    noise = batch(library, "sway")
+    row = judged(library, (noise, 1, 400), (noise, 2, 2400))
     assert row["wrong"] == 2
     assert row["modules"][0]["allowed"] is None
     assert learned(row)["sway"] == 400  # its output there is that of batch SFA
@@ -95,12 +98,12 @@ def test_a_module_of_noise_is_wrong_however_it_was_learned(library: Library) -> 
 def test_the_same_module_again_is_double_but_another_of_the_stream_is_not(
     library: Library,
 ) -> None:
-    sway = module(library, "sway", 0)
-    again = dataclasses.replace(sway, stream=3, phi=-sway.phi)
-    row = judged(library, (sway, 400), (again, 800), (module(library, "swing", 2), 1200))
+    sway = batch(library, "sway")
+    again = dataclasses.replace(sway, phi=-sway.phi)
+    row = judged(library, (sway, 0, 400), (again, 3, 800), (batch(library, "swing"), 2, 1200))
     assert row["doubles"] == 1
     other = dataclasses.replace(sway, phi=noise_direction(library))
-    assert judged(library, (sway, 400), (other, 800))["doubles"] == 0
+    assert judged(library, (sway, 0, 400), (other, 0, 800))["doubles"] == 0
 
 
 def noise_direction(library: Library) -> np.ndarray:
@@ -115,11 +118,11 @@ def noise_direction(library: Library) -> np.ndarray:
 
 def test_what_changes_counts_from_its_change(library: Library) -> None:
     words = ("sway>swing", "hiss")
-    both = (module(library, "sway", 0), 400), (module(library, "swing", 0), 3000)
+    both = (batch(library, "sway"), 0, 400), (batch(library, "swing"), 0, 3000)
     row = judged(library, *both, words=words)
     assert [(t["signal"], t["frame"]) for t in row["targets"]] == [("sway", 400), ("swing", 3000)]
     assert [t["watched"] for t in row["targets"]] == [5, 13]  # 3000 - 2000 frames, every other
-    early = judged(library, (module(library, "swing", 0), 400), words=words)
+    early = judged(library, (batch(library, "swing"), 0, 400), words=words)
     assert [t["frame"] for t in early["targets"]] == [None, 2000]
 
 
@@ -133,9 +136,9 @@ def test_clips_that_loop_are_judged_on_themselves_and_more_mildly(library: Libra
 
 
 def test_an_output_that_never_moves_is_not_slow(library: Library) -> None:
-    dead = module(library, "sway", 4)
+    dead = batch(library, "sway")
     assert measures.slowest(dead, library.stream("blank", 0).held_out).slowness == math.inf
-    assert judged(library, (dead, 400))["wrong"] == 1
+    assert judged(library, (dead, 4, 400))["wrong"] == 1
 
 
 def test_a_probe_tells_what_is_in_the_features_and_no_more() -> None:
@@ -182,11 +185,11 @@ class Chooser:
 def test_a_run_ends_by_itself_or_with_its_frames(
     library: Library, ends: int, goes_on: bool, blocks: int, ended: str | None
 ) -> None:
-    learner: Any = Chooser({5: module(library, "sway", 0)}, ends)
+    learner: Any = Chooser({5: batch(library, "sway")}, ends)
     source = ArenaSource(("sway", "hiss"), library, 0)
     history = follow(learner, source, 800, goes_on=goes_on)
     assert (len(history.watched), history.frames, history.ended) == (blocks, 40 * blocks, ended)
-    assert [(s.signal, s.frame, s.block) for s in history.saved] == [("sway", 200, 5)]
+    assert [(s.stream, s.signal, s.frame, s.block) for s in history.saved] == [(0, "sway", 200, 5)]
 
 
 def test_trials_are_named_by_what_they_depend_on(tmp_path: Path) -> None:
@@ -205,7 +208,9 @@ def test_trials_are_named_by_what_they_depend_on(tmp_path: Path) -> None:
     (first, _) = plan(["tiny"], ["2.0"], [0, 1], (), None, tmp_path)
     assert {w.name for w in first.wanted()} == {"sway", "swing", "hiss"}
     assert first.reference == (7, "none")
-    assert configured("2.0", (), images=False).expansion == "quadratic"
+    (vectors,) = plan(["oscillatory"], ["2.0"], [0], (), None, tmp_path)
+    assert vectors.reference == (5, "quadratic")
+    assert configured("1.0", ["learner.tau=20"], images=True).tau == 20
 
 
 def test_what_does_not_exist_is_refused_before_anything_runs(

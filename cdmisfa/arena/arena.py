@@ -14,7 +14,7 @@ from typing import Any, Final
 from cdmisfa.arena.contestants import CONTESTANTS, configured
 from cdmisfa.arena.library import Library, Wanted
 from cdmisfa.arena.sets import SETS, SUITE
-from cdmisfa.arena.streams import STREAMS, parse
+from cdmisfa.arena.streams import parse
 from cdmisfa.arena.trial import ArenaTrial, run_trial
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError
@@ -114,10 +114,9 @@ def plan(
     trials = []
     for name in dict.fromkeys(sets):
         entry = SETS[name] if frames is None else replace(SETS[name], frames=frames)
-        images = all(STREAMS[s.kind].images for word in entry.words for s in parse(word))
         shown = {key: value for key, value in asdict(entry).items() if key != "about"}
         for learner in dict.fromkeys(learners):
-            configuration = configured(learner, settings, images=images)
+            configuration = configured(learner, settings, images=entry.images)
             table = as_table(configuration)
             trials += [
                 ArenaTrial(

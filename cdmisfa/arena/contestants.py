@@ -31,14 +31,10 @@ def configured(name: str, settings: Sequence[str], *, images: bool) -> Any:
     Args:
         name: in `CONTESTANTS`.
         settings: `section.key=value` words that win over its own.
-        images: frames are pictures, and not the few values of the oscillatory streams, whose
-            slow features are quadratic.
+        images: frames are pictures, and not the few values of the oscillatory streams.
 
     Raises:
         UsageError: no such learner or key, or a value that does not fit.
     """
-    own = CONTESTANTS[name]
-    if images:
-        return configure("icub", settings=(*own, *settings)).learner
-    quadratic = "learner.expansion=quadratic"
-    return configure("oscillatory", settings=(*own, quadratic, *settings)).learner
+    scene = "icub" if images else "oscillatory"
+    return configure(scene, settings=(*CONTESTANTS[name], *settings)).learner

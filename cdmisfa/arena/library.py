@@ -196,8 +196,20 @@ def refer(stream: Stream, components: int, expansion: str) -> Reference:
 
 def linear(phi: Float, mean: Float, expansion: str, scale: float) -> Module:
     """Weights (J, I) of a centred frame as a module that was never watched for."""
-    none, nowhere = np.zeros(len(phi)), np.zeros(0, np.int64)
-    return Module(0, 0, 0, phi, mean, none, none, none, nowhere, expansion=expansion, scale=scale)
+    none = np.zeros(len(phi))
+    return Module(
+        index=0,
+        stream=0,
+        iteration=0,
+        phi=phi,
+        mean=mean,
+        band_mean=none,
+        band_sd=none,
+        eta=none,
+        policy=np.zeros(0, np.int64),
+        expansion=expansion,
+        scale=scale,
+    )
 
 
 def _save(path: Path, found: Reference) -> None:

@@ -38,13 +38,15 @@ class Saved:
     """A module, and when it was learned.
 
     Attributes:
-        signal: name of what its stream showed.
+        stream: index of the stream that was watched when it was saved.
+        signal: name of what that showed.
         learnable: whether there was anything to be learned.
         frame: frames seen by then.
         block: blocks seen by then.
     """
 
     module: Module
+    stream: int
     signal: str
     learnable: bool
     frame: int

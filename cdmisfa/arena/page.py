@@ -199,6 +199,9 @@ def _text(document: Mapping[str, Any], figure: str) -> str:
             words = ", ".join(f"`{word}`" for word in _shortened(entry.words))
             parts += [f"{entry.about[0].upper()}{entry.about[1:]}: {words}.", ""]
         parts.append(markdown(HEAD, [_cells(e) for e in entries]))
+        if told := [row for e in entries for row in _told(e)]:
+            head = ("learner", "stream", "outputs", "R²", "of components")
+            parts += ["", markdown(head, told)]
         if changes := [row for e in entries for row in _changes(e)]:
             head = ("learner", "after the change shows", "learned", "blocks of watching it")
             parts += ["", markdown(head, changes)]
@@ -241,6 +244,22 @@ def _shortened(words: Sequence[str]) -> list[str]:
     first = [word for word in words if "#" not in word]
     others = list(dict.fromkeys(word.partition("#")[0] for word in words if "#" in word))
     return [*first, *(f"{word}#k" for word in others)]
+
+
+def _told(entry: Entry) -> list[tuple[str, ...]]:
+    """Rows on what the modules of the first learner tell of the world, stream by stream."""
+    if entry["point"]["learner"] != next(iter(CONTESTANTS)):
+        return []
+    return [
+        (
+            entry["point"]["learner"],
+            f"`{signal}`",
+            _number(tells["outputs"], 1),
+            _within(tells["modules"], 2, highest=1.0),
+            _within(tells["components"], 2, highest=1.0),
+        )
+        for signal, tells in entry["probes"].items()
+    ]
 
 
 def _changes(entry: Entry) -> list[tuple[str, ...]]:

@@ -85,6 +85,7 @@ def _entry(point: Mapping[str, str], rows: Sequence[Row]) -> dict[str, Any]:
         "measures": _measures(found),
         "targets": _targets(found),
         "wrong": _wrong(found),
+        "probes": _probes(found),
         "curve": _curve(found),
     }
 
@@ -147,6 +148,18 @@ def _targets(found: Sequence[Row]) -> list[dict[str, Any]]:
             }
         )
     return tables
+
+
+def _probes(found: Sequence[Row]) -> dict[str, Any]:
+    """Of each signal that a module was saved of, what the modules tell of the world."""
+    told = [probe for row in found for probe in row["probes"] if probe["modules"] is not None]
+    return {
+        signal: {
+            key: _measure([p[key] for p in told if p["signal"] == signal])
+            for key in ("outputs", "modules", "components")
+        }
+        for signal in sorted({p["signal"] for p in told})
+    }
 
 
 def _wrong(found: Sequence[Row]) -> dict[str, int]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from cdmisfa.arena.source import CHANGE
-from cdmisfa.arena.streams import NOISE_SD
+from cdmisfa.arena.streams import NOISE_SD, STREAMS, parse
 from cdmisfa.core.registry import Registry
 
 NOISES: Final = tuple(f"{name}-{sd:g}" for name in ("gaussian", "uniform") for sd in NOISE_SD)
@@ -33,6 +33,11 @@ class ArenaSet:
     about: str
     frames: int = 240_000
     goes_on: bool = False
+
+    @property
+    def images(self) -> bool:
+        """Whether frames are pictures."""
+        return all(STREAMS[s.kind].images for word in self.words for s in parse(word))
 
 
 SUITE: Final = ("control", "pendulum-pong", "clips", "games", "light", "cameras")

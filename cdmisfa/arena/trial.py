@@ -57,8 +57,12 @@ class ArenaTrial:
 
     @property
     def reference(self) -> tuple[int, str]:
-        """Components and expansion of the batch SFA that it is compared with."""
-        return self.learner.components, self.learner.expansion
+        """Components and expansion of the batch SFA that it is compared with.
+
+        Where the learner leaves the expansion open: none of pictures, and quadratic else.
+        """
+        expansion = self.learner.expansion or ("none" if self.streams.images else "quadratic")
+        return self.learner.components, expansion
 
     def wanted(self) -> list[Wanted]:
         """What it wants of the library, what others are made from first."""
@@ -103,8 +107,10 @@ def follow(learner: Learner, source: ArenaSource, frames: int, *, goes_on: bool)
         learner.step(block)
         watched.append((block.t, block.stream))
         for module in learner.modules[len(saved) :]:
-            shown = source.shown(module.stream, source.t - 1)
-            saved.append(Saved(module, shown.name, shown.learnable, source.t, len(watched)))
+            shown = source.shown(block.stream, source.t - 1)
+            saved.append(
+                Saved(module, block.stream, shown.name, shown.learnable, source.t, len(watched))
+            )
     return History(saved, watched, source.t, None if goes_on else ended)
 
 
@@ -151,7 +157,7 @@ def judge(
         "targets": _targets(history, source, of_signal),
         "modules": [
             {
-                "stream": source.spec.streams[one.module.stream],
+                "stream": source.spec.streams[one.stream],
                 "signal": one.signal,
                 "learnable": one.learnable,
                 "frame": one.frame,
