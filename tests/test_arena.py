@@ -52,7 +52,7 @@ def pixel(place: int) -> Module:
 
 
 def judged(library: Library, *saved: tuple[Module, int, int], words: Any = WORDS) -> dict[str, Any]:
-    """What a run came to that watched every stream in turn, and saved modules at (stream, frame)."""
+    """What a run came to that watched all streams in turn and saved modules at (stream, frame)."""
     source = ArenaSource(words, library, 0, change=2000)
     watched = [(40 * k, k % len(words)) for k in range(100)]
     told = []
@@ -124,12 +124,14 @@ def test_what_changes_counts_from_its_change(library: Library) -> None:
     assert [t["watched"] for t in row["targets"]] == [5, 13]  # 3000 - 2000 frames, every other
     early = judged(library, (batch(library, "swing"), 0, 400), words=words)
     assert [t["frame"] for t in early["targets"]] == [None, 2000]
+    again = (batch(library, "swing"), 0, 400), (batch(library, "swing"), 0, 3000)
+    assert judged(library, *again, words=words)["targets"][1]["frame"] == 3000
 
 
 def test_clips_that_loop_are_judged_on_themselves_and_more_mildly(library: Library) -> None:
     reference = library.reference("short", 0, 8, "none")
     stream = library.stream("short", 0)
-    assert len(stream.held_out) == len(stream.learned_from) == 400
+    assert len(stream.held_out) == len(stream.learned_from) + 1 == 401
     assert measures.allowed(stream, reference) == 1.5 * reference.slowness
     sway = library.stream("sway", 0)
     assert measures.allowed(sway, reference) == 1.25 * reference.slowness

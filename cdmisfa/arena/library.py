@@ -1,6 +1,6 @@
 """Streams on disk: made once, mapped into memory, with what batch SFA finds in each.
 
-FOLDER/NAME-SEED/ holds a stream, FOLDER/NAME-SEED-K-EXPANSION.npz its reference.
+FOLDER/NAME-SEED/ holds a stream, K-EXPANSION.npz in it a reference.
 """
 
 from __future__ import annotations
@@ -52,13 +52,15 @@ class Stream:
 
     @property
     def held_out(self) -> NDArray[Any]:
-        """The frames on which it is judged."""
-        return self.frames if self.loops else self.frames[LEARNED_FROM:]
+        """The frames on which it is judged: of one that loops a round, with the cut of it."""
+        if self.loops:
+            return np.concatenate([self.frames, self.frames[:1]])
+        return self.frames[LEARNED_FROM:]
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What batch SFA finds in the frames that a learner is shown.
+    """What batch SFA finds in the frames that a learner is shown, the cut of a loop with them.
 
     Attributes:
         slowness: of its slowest output, on the held-out frames.
@@ -170,8 +172,7 @@ class Library:
         return self.folder / f"{name.replace(':', '-')}-{seed}"
 
     def _reference(self, name: str, seed: int, components: int, expansion: str) -> Path:
-        folder = self._folder(name, seed)
-        return folder.with_name(f"{folder.name}-{components}-{expansion}.npz")
+        return self._folder(name, seed) / f"{components}-{expansion}.npz"
 
 
 def refer(stream: Stream, components: int, expansion: str) -> Reference:
@@ -183,7 +184,8 @@ def refer(stream: Stream, components: int, expansion: str) -> Reference:
         expansion: the learner's.
     """
     scale = PIXEL if stream.frames.dtype == UINT8 else 1.0
-    rows = stream.learned_from.reshape(len(stream.learned_from), -1)
+    shown = stream.held_out if stream.loops else stream.learned_from
+    rows = shown.reshape(len(shown), -1)
     x = expand(expansion, rows.astype(np.float64) * scale)
     mean = x.mean(axis=0)
     x = x - mean

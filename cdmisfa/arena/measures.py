@@ -19,7 +19,7 @@ SLOW_ENOUGH: Final = 1.25
 """A learned output may be so many times as fast as the slowest that batch SFA finds."""
 
 SLOW_ENOUGH_LOOPED: Final = 1.5
-"""The same for short clips, whose cut a learner sees and batch SFA does not."""
+"""The same for short clips, on which the cut where they begin again weighs much."""
 
 KNOWS: Final = 0.8
 """Correlation with batch SFA from which on a module knows a stream that it was not learned on."""
@@ -86,7 +86,8 @@ def learned_by(
 ) -> list[int]:
     """Which modules are of a stream: slow enough on it, and learned on it or on its like.
 
-    One that was learned on another stream counts where its output is that of batch SFA.
+    Where there is none, those count that were learned on another stream and whose output on this
+    one is that of batch SFA.
 
     Args:
         saved: the modules.
@@ -96,12 +97,9 @@ def learned_by(
     """
     answer = reference.slowest.transform(stream.held_out)[:, 0]
     limit = allowed(stream, reference)
-    return [
-        k
-        for k, (one, output) in enumerate(zip(saved, outputs, strict=True))
-        if output.slowness <= limit
-        and (one.signal == stream.name or correlation(output.values, answer) > KNOWS)
-    ]
+    slow = [k for k, output in enumerate(outputs) if output.slowness <= limit]
+    own = [k for k in slow if saved[k].signal == stream.name]
+    return own or [k for k in slow if correlation(outputs[k].values, answer) > KNOWS]
 
 
 def doubles(saved: Sequence[Saved], output: Callable[[int, str], Output]) -> list[int]:

@@ -31,15 +31,20 @@ HEAD: Final = (
     "learner", "seeds", "learned", "not learnable", "twice", "ends", "blocks", "all learned", "R²"
 )  # fmt: skip
 
+TOLD: Final = ("learner", "stream", "outputs", "R²", "of components")
+
+CHANGED: Final = ("learner", "after the change shows", "learned", "blocks of watching it")
+
 Entry = Mapping[str, Any]
 
 DEFINITIONS: Final = f"""\
 - *Learned*: the share of the learnable streams of a set of which a module was saved whose slowest
   output is, on held-out frames, at most {SLOW_ENOUGH} times as fast as that of batch SFA with as
   many components, fitted on all {LEARNED_FROM:,} frames that the stream consists of
-  ({SLOW_ENOUGH_LOOPED} times for clips and recordings that loop, which are judged on themselves).
-  The {HELD_OUT:,} frames that follow are held out. A module that was learned on another stream
-  counts if its output there is that of batch SFA (correlation above {KNOWS:g}).
+  ({SLOW_ENOUGH_LOOPED} times for clips and recordings that loop, which are judged on themselves;
+  their cut is shown to batch SFA, too). The {HELD_OUT:,} frames that follow are held out. Where no
+  module was learned on a stream, one learned on another counts if its output there is that of
+  batch SFA (correlation above {KNOWS:g}).
 - *Not learnable*: modules a run saved on streams that have nothing slow. There should be none.
 - *Twice*: modules a run saved that are an earlier one again (correlation above {THE_SAME:g}).
 - *Ends*: the share of runs that ended by themselves; *blocks*: after how many, of those that did.
@@ -200,11 +205,9 @@ def _text(document: Mapping[str, Any], figure: str) -> str:
             parts += [f"{entry.about[0].upper()}{entry.about[1:]}: {words}.", ""]
         parts.append(markdown(HEAD, [_cells(e) for e in entries]))
         if told := [row for e in entries for row in _told(e)]:
-            head = ("learner", "stream", "outputs", "R²", "of components")
-            parts += ["", markdown(head, told)]
+            parts += ["", markdown(TOLD, told)]
         if changes := [row for e in entries for row in _changes(e)]:
-            head = ("learner", "after the change shows", "learned", "blocks of watching it")
-            parts += ["", markdown(head, changes)]
+            parts += ["", markdown(CHANGED, changes)]
     versions = sorted(document["versions"].items())
     parts += ["", f"Versions: {', '.join(map(' '.join, versions))}.", ""]
     if len(document["code"]) > 1:
