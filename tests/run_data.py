@@ -91,6 +91,12 @@ def signals_of(
         explored=bool(rng.random() < 0.5),
         action=int(rng.integers(2)),
         next_stream=int(rng.integers(n)),
+        change=float(rng.random()),
+        tested=float(rng.random()),
+        fitted=float(rng.random()),
+        learning_error=float(rng.random()),
+        interest=rng.random(n),
+        state=rng.integers(-1, 4, n),
     )
 
 

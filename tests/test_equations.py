@@ -10,9 +10,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-EQUATIONS = range(1, 10)
+PAGES = {
+    "docs/algorithm.md": [str(number) for number in range(1, 10)],
+    "docs/progress.md": [f"P{number}" for number in range(1, 5)],
+}
+"""The page that explains equations, and their numbers: the paper's, and the progress learner's."""
+
+EQUATIONS = [number for numbers in PAGES.values() for number in numbers]
 LINE = re.compile(r"^\s*Equation:(.*)$", re.MULTILINE)
-ROW = re.compile(r"^\| \((\d+)\) \|.*?\| `([\w/]+\.py)` `(\w+)` \|$", re.MULTILINE)
+ROW = re.compile(r"^\| \((P?\d+)\) \|.*?\| `([\w/]+\.py)` `(\w+)` \|$", re.MULTILINE)
 
 Place = tuple[str, str]
 
@@ -28,20 +34,20 @@ def stated() -> Iterator[tuple[str, Place]]:
                         yield text.strip(), (file.relative_to(ROOT).as_posix(), name)
 
 
-def stated_by_number() -> dict[int, set[Place]]:
-    places: dict[int, set[Place]] = {}
+def stated_by_number() -> dict[str, set[Place]]:
+    places: dict[str, set[Place]] = {}
     for text, place in stated():
-        places.setdefault(int(text), set()).add(place)
+        places.setdefault(text, set()).add(place)
     return places
 
 
 @pytest.mark.parametrize("number", EQUATIONS)
-def test_equation_is_in_the_code(number: int) -> None:
+def test_equation_is_in_the_code(number: str) -> None:
     assert number in stated_by_number()
 
 
-def test_every_equation_line_names_one_equation_of_the_paper() -> None:
-    dangling = [(t, p) for t, p in stated() if not t.isdigit() or int(t) not in EQUATIONS]
+def test_every_equation_line_names_one_equation_of_a_page() -> None:
+    dangling = [(text, place) for text, place in stated() if text not in EQUATIONS]
     assert dangling == []
 
 
@@ -49,9 +55,9 @@ def test_equations_are_functions() -> None:
     assert [place for _, place in stated() if not place[1] or place[1][0].isupper()] == []
 
 
-def test_the_page_says_where_every_equation_is() -> None:
-    page = (ROOT / "docs" / "algorithm.md").read_text("utf-8")
-    listed: dict[int, set[Place]] = {}
-    for number, file, name in ROW.findall(page):
-        listed.setdefault(int(number), set()).add((file, name))
-    assert listed == stated_by_number()
+@pytest.mark.parametrize("page", PAGES)
+def test_the_page_says_where_every_equation_is(page: str) -> None:
+    listed: dict[str, set[Place]] = {}
+    for number, file, name in ROW.findall((ROOT / page).read_text("utf-8")):
+        listed.setdefault(number, set()).add((file, name))
+    assert listed == {n: where for n, where in stated_by_number().items() if n in PAGES[page]}

@@ -53,7 +53,7 @@ def whole() -> Trial:
 @pytest.mark.parametrize("seed", [11, 12, 13, 14, 15])
 def test_the_oscillatory_experiment(seed: int) -> None:
     learner = trial(seed).learner
-    assert [m.stream for m in learner.modules] == [0, 1, 2]
+    assert [m.stream_index for m in learner.modules] == [0, 1, 2]
     assert [m.policy.tolist() for m in learner.modules] == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]
     for module, eta in zip(learner.modules, (0.008, 0.006, 0.004), strict=True):
         assert 0.6 * eta < module.eta[0] < 1.3 * eta  # Var(y) remembers the search
@@ -65,7 +65,7 @@ def test_modules_encode_the_slow_features_of_their_streams(whole: Trial) -> None
     slow = [np.sin(4 * theta - np.pi / 4), np.sin(3 * theta), np.cos(2 * theta)]
     for module, expected in zip(whole.learner.modules, slow, strict=True):
         source = OscillatorySource()
-        x = source.take(module.stream, 500).frames
+        x = source.take(module.stream_index, 500).frames
         i, j = np.triu_indices(2)
         expanded = np.concatenate([x, x[:, i] * x[:, j]], axis=1)
         y = (expanded - module.mean) @ module.phi[0]
@@ -168,7 +168,7 @@ def test_after_a_save_everything_begins_anew(whole: Trial) -> None:
 def test_a_saved_module_is_what_the_signals_said(whole: Trial) -> None:
     saves = [record for record in whole.signals if record.saved]
     for module, record in zip(whole.learner.modules, saves, strict=True):
-        assert (module.iteration, module.stream) == (record.iteration, record.stream)
+        assert (module.iteration, module.stream_index) == (record.iteration, record.stream)
         assert (record.eta_dot < CONFIG.delta).all()
         assert (record.variance >= CONFIG.min_variance).all()
         assert record.share >= CONFIG.novel_share

@@ -63,7 +63,7 @@ def test_the_width_does_not_decide_where_the_expansion_is_known() -> None:
 
 def with_width(width: int, **values: Any) -> Module:
     phi, mean, zero, policy = np.ones((1, width)), np.zeros(width), np.zeros(1), np.zeros(1, int)
-    return Module(1, 0, 9, phi, mean, zero, zero, zero, policy, **values)
+    return Module(1, "a", 0, 9, phi, mean, zero, zero, zero, policy, **values)
 
 
 def test_values_are_values_even_as_uint8() -> None:

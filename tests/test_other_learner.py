@@ -57,12 +57,20 @@ class Watcher:
         return int(self._count[0])
 
     @property
+    def events(self) -> tuple[str, ...]:
+        return ()
+
+    @property
     def phi(self) -> NDArray[np.float64]:
         return self._mean.copy()
 
     @property
-    def over(self) -> bool:
-        return self.iteration >= self.config.patience
+    def over(self) -> str:
+        return "nothing_left" if self.iteration >= self.config.patience else ""
+
+    @property
+    def max_modules(self) -> None:
+        return None
 
     def step(self, block: Block) -> BlockSignals:
         k = self.iteration

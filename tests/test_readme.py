@@ -66,7 +66,7 @@ def test_python_example_works(elsewhere: Path) -> None:
         timeout=120,
         check=False,
     )
-    assert (done.returncode, done.stdout.strip()) == (0, "0"), done.stderr
+    assert (done.returncode, done.stdout.strip()) == (0, "x1"), done.stderr
 
 
 def test_links_lead_somewhere() -> None:

@@ -138,7 +138,7 @@ def test_2_0_has_no_clustering_error() -> None:
 def test_1_0_can_learn_the_paper_s_modules_too() -> None:
     config = LearnerConfig(algorithm="1.0")
     trials = [run_trial(config, seed=seed, max_iterations=6000) for seed in range(1000, 1006)]
-    assert sum([m.stream for m in trial.modules] == [0, 1, 2] for trial in trials) >= 3
+    assert sum([m.stream_index for m in trial.modules] == [0, 1, 2] for trial in trials) >= 3
 
 
 def test_1_0_refuses_more_streams_than_its_table_has() -> None:

@@ -48,7 +48,7 @@ def after(n: int) -> Callable[[], bool]:
 def test_it_ends_when_every_stream_is_learned(tmp_path: Path) -> None:
     result = run(tmp_path / "run", max_iterations=None)
     assert result.ended == "max_modules"
-    assert [m.stream for m in result.modules] == [0, 1, 2]
+    assert [m.stream_index for m in result.modules] == [0, 1, 2]
     assert result.iterations == result.modules[-1].iteration + 1
     assert result.summary["epsilon"] == 1.2
     assert logged(tmp_path / "run").hexdigest() == result.signals_sha256
@@ -107,6 +107,7 @@ def test_every_ending_has_words() -> None:
         "max_modules",
         "max_iterations",
         "nothing_left",
+        "all_decided",
         "log_exhausted",
         "interrupted",
     }

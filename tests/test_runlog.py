@@ -221,7 +221,8 @@ def test_modules_come_back(tmp_path):
     modules = [
         Module(
             index=i,
-            stream=i % 2,
+            stream="ab"[i % 2],
+            stream_index=i % 2,
             iteration=100 * i,
             phi=rng.standard_normal((2, 5)),
             mean=rng.standard_normal(5),

@@ -17,7 +17,7 @@ from run_data import VECTOR, having, parts_of, read_signals, rows_of, write_run
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
+from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
 from cdmisfa.experiments.resume import refuse_difference
 from replay.runs.compare import first_difference
 from replay.runs.log import read_header
@@ -30,7 +30,17 @@ OLD = Path(__file__).parent / "data" / "signals_v1"
 SIGNALS_SHA256 = "b86ab92af6b8ba255cb239dd54c187a1adbdccc9b43f096a348ad4f83bd85a2f"
 """What the version that wrote it said of its signals."""
 
-LACKS = ("roc_error_inst", "roc_error", "roc_error_frozen")
+LACKS = (
+    "roc_error_inst",
+    "roc_error",
+    "roc_error_frozen",
+    "change",
+    "tested",
+    "fitted",
+    "learning_error",
+    "interest",
+    "state",
+)
 
 
 def test_every_bit_of_the_old_signals_is_read() -> None:
@@ -48,9 +58,9 @@ def test_what_it_lacks_is_nan_in_its_shape() -> None:
     for record in records:
         for name in LACKS:
             value = np.asarray(getattr(record, name))
-            assert value.dtype == np.float64
+            assert value.dtype == SIGNALS[name].dtype
             assert value.ndim == len(SIGNALS[name].dims)
-            assert np.isnan(value).all()
+            assert (np.isnan(value) | (value == NO_STATE)).all()
 
 
 def test_info_says_so(cdmisfa) -> None:
@@ -114,7 +124,7 @@ def test_two_versions_that_differ_elsewhere_too(tmp_path) -> None:
     assert difference is not None
     assert (difference.iteration, difference.signal) == (5, "epsilon")
     assert difference.versions == (1, SCHEMA_VERSION)
-    assert str(difference).startswith("signals of version 1 against 2; of those in both: iteration")
+    assert str(difference).startswith("signals of version 1 against 3; of those in both: iteration")
 
 
 @pytest.mark.parametrize("command", ["view", "plot", "compare"])

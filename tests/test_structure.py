@@ -40,6 +40,7 @@ FORBIDDEN = {
     "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
     "cdmisfa.experiments": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
+    "cdmisfa.agents.progress": ("cdmisfa.experiments.runs", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
     "cdmisfa.features.recursive": ("cdmisfa.agents.learner", "recorder.config", "mcap"),
     "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),

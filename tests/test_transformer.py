@@ -41,7 +41,8 @@ def image_module(**changes):
     rng = np.random.default_rng(0)
     values = {
         "index": 1,
-        "stream": 0,
+        "stream": "a",
+        "stream_index": 0,
         "iteration": 5,
         "phi": rng.standard_normal((2, 12)),
         "mean": rng.random(12),

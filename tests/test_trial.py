@@ -94,5 +94,5 @@ def test_trial_ends_for_the_reason_it_gives() -> None:
 def test_the_paper_s_trial_finds_the_optimal_order_and_policies() -> None:
     for seed in (0, 1, 2):
         trial = run_trial(LearnerConfig(), seed=seed)
-        assert [m.stream for m in trial.modules] == [0, 1, 2]
+        assert [m.stream_index for m in trial.modules] == [0, 1, 2]
         assert [m.policy.tolist() for m in trial.modules] == [[0, 1, 1], [1, 0, 1], [1, 1, 0]]

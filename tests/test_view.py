@@ -75,7 +75,8 @@ def shown(request, tmp_path_factory):
     size = int(np.prod(request.param.frame_shape))
     module = Module(
         index=1,
-        stream=0,
+        stream="a",
+        stream_index=0,
         iteration=8,
         phi=np.ones((1, size)),
         mean=np.zeros(size),

@@ -7,6 +7,7 @@ blocks give the same signals, bit for bit.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,16 @@ from numpy.typing import NDArray
 
 from cdmisfa.agents.agent import OUTCOME, begin_abstraction, new_agent, rules
 from cdmisfa.agents.gate import Frozen
+from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.policy import action_values
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.expansion import expand, expanded_size
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import BlockSignals
+from cdmisfa.core.signals import NO_STATE, BlockSignals
 from cdmisfa.features.feature import Feature, MakeFeature
 from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.features.projection import mean_output
@@ -31,10 +33,6 @@ Float = NDArray[np.float64]
 
 POLICY_KEY, WEIGHTS_KEY = 1, 2
 """Spawn keys of the learner's two random generators, beneath the run's seed."""
-
-
-MAX_INPUTS = 2_000_000
-"""An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused."""
 
 
 class CuriousLearner:
@@ -51,6 +49,7 @@ class CuriousLearner:
         spec: the source it learns from.
         seed: where its random generators started.
         modules: what it learned so far.
+        events: what the last iteration brought, one line each.
         scale: factor from a frame's values to the learner's (1/255 for pixels).
         policy_rng: three draws an iteration, whatever is done with them.
         rules: the configuration's numbers, for compiled code.
@@ -80,8 +79,13 @@ class CuriousLearner:
         self.spec = spec
         self.seed = seed
         self.modules: list[Module] = []
+        self.events: tuple[str, ...] = ()
         self._feature = feature
-        self._n_inputs = self._count_inputs()
+        self._n_inputs = count_inputs(config.expansion, spec)
+        if config.components > self._n_inputs:
+            raise UsageError(
+                f"learner.components is {config.components}, more than the {self._n_inputs} inputs"
+            )
         self.scale = PIXEL if spec.dtype == "uint8" else 1.0
         self.policy_rng = np.random.Generator(
             np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(POLICY_KEY,)))
@@ -130,9 +134,14 @@ class CuriousLearner:
         return getattr(self.abstraction, "kernel", None)
 
     @property
-    def over(self) -> bool:
-        """Whether exploration has ended long ago and still nothing converged."""
-        return bool(self.agent.memory["idle"][0] > self.config.patience)
+    def over(self) -> str:
+        """Whether exploration has ended long ago and still nothing converged; see `Learner`."""
+        return "nothing_left" if self.agent.memory["idle"][0] > self.config.patience else ""
+
+    @property
+    def max_modules(self) -> int:
+        """Modules after which a run ends where nothing else is said: as many as streams."""
+        return len(self.spec.streams)
 
     @property
     def state(self) -> LearnerState:
@@ -173,7 +182,7 @@ class CuriousLearner:
             ValueError: the block is of another stream, length, frame shape or type.
             CdmisfaError: it holds a value that is no finite number.
         """
-        frames = self._checked(block)
+        frames = rows_of(block, self.spec, self.stream, self.tau)
         outputs, count = self.config.outputs, len(self.modules)
         y_frozen = np.empty((count, len(block), outputs))
         eta_frozen, roc_error_frozen = np.empty((count, outputs)), np.empty(count)
@@ -194,60 +203,19 @@ class CuriousLearner:
             np.full((len(block), outputs), np.nan),
         )
         signals = self._signals(block, y, y_frozen, eta_frozen, roc_error_frozen)
+        self.events = ()
         if self.out["saved"][0]:
             self.save_abstraction()
+            module = self.modules[-1]
+            self.events = (
+                f"module {module.index} saved on stream {module.stream}, "
+                f"policy {module.policy.tolist()}",
+            )
         return signals
 
     def summary(self) -> dict[str, Any]:
         """Its part of a run's result, as JSON values."""
         return {"final_policy": self.agent.policy.tolist(), "epsilon": self.epsilon}
-
-    def _count_inputs(self) -> int:
-        """Number of inputs after expansion.
-
-        Raises:
-            UsageError: too many to hold, or fewer than components.
-        """
-        values = int(np.prod(self.spec.frame_shape))
-        inputs = expanded_size(self.config.expansion, values)
-        if inputs > MAX_INPUTS:
-            raise UsageError(
-                f"learner.expansion {self.config.expansion} makes {inputs:,} inputs of {values:,}, "
-                f"more than {MAX_INPUTS:,}: set learner.expansion=none or take smaller frames"
-            )
-        if self.config.components > inputs:
-            raise UsageError(
-                f"learner.components is {self.config.components}, more than the {inputs} inputs"
-            )
-        return inputs
-
-    def _checked(self, block: Block) -> NDArray[Any]:
-        """The frames of a block as rows.
-
-        A block that was not asked for is refused, as is one that would spoil every estimate.
-        """
-        if not isinstance(block, Block):
-            raise UsageError(
-                f"{type(block).__name__} given: a learner takes the blocks of a source, as "
-                "source.take(learner.stream, learner.tau) gives them"
-            )
-        if block.stream != self.stream or len(block) != self.tau:
-            raise ValueError(
-                f"the learner asked for {self.tau} frames of stream {self.stream}, "
-                f"not {len(block)} of stream {block.stream}"
-            )
-        shape, dtype = block.frames.shape[1:], block.frames.dtype
-        if shape != self.spec.frame_shape or dtype != self.spec.dtype:
-            raise ValueError(
-                f"the learner asked for frames of {self.spec.frame_shape} {self.spec.dtype}, "
-                f"not {shape} {dtype}"
-            )
-        if dtype.kind == "f" and not np.isfinite(block.frames).all():
-            raise CdmisfaError(
-                f"stream {self.spec.streams[block.stream]} holds a value that is no finite number "
-                f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
-            )
-        return block.frames.reshape(len(block), -1)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """Every array that changes in place, by name."""
@@ -282,6 +250,12 @@ class CuriousLearner:
             band_mean=self.frozen.band_mean.copy(),
             band_sd=self.frozen.band_sd.copy(),
             roc_error_frozen=roc_error_frozen,
+            change=math.nan,
+            tested=math.nan,
+            fitted=math.nan,
+            learning_error=math.nan,
+            interest=np.full(len(agent.policy), np.nan),
+            state=np.full(len(agent.policy), NO_STATE),
             R=agent.dense / (scale or 1.0),
             Q=Q,
             policy=agent.policy.copy(),
@@ -293,7 +267,8 @@ class CuriousLearner:
         agent, memory = self.agent, self.agent.memory[0]
         module = Module(
             index=len(self.modules) + 1,
-            stream=int(memory["last_stream"]),
+            stream=self.spec.streams[int(memory["last_stream"])],
+            stream_index=int(memory["last_stream"]),
             iteration=int(memory["iteration"]) - 1,
             phi=self.abstraction.phi.copy(),
             mean=self.abstraction.mean.copy(),

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.registry import Registry
 
@@ -36,9 +37,19 @@ def _curious(config: LearnerConfig, spec: SourceSpec, seed: int) -> Learner:
     return CuriousLearner(config, spec, seed)
 
 
+def _progress(config: ProgressConfig, spec: SourceSpec, seed: int) -> Learner:
+    from cdmisfa.agents.progress.learner import ProgressLearner
+
+    return ProgressLearner(config, spec, seed)
+
+
 LEARNERS: Registry[LearnerEntry] = Registry(
     "learner.algorithm",
-    {name: LearnerEntry(LearnerConfig, _curious) for name in ("2.0", "1.0")},
+    {
+        "2.0": LearnerEntry(LearnerConfig, _curious),
+        "1.0": LearnerEntry(LearnerConfig, _curious),
+        "progress": LearnerEntry(ProgressConfig, _progress, preset="cameras"),
+    },
 )
 """Every learner; `LEARNERS.add` adds one."""
 

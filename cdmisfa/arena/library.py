@@ -201,7 +201,8 @@ def linear(phi: Float, mean: Float, expansion: str, scale: float) -> Module:
     none = np.zeros(len(phi))
     return Module(
         index=0,
-        stream=0,
+        stream="",
+        stream_index=0,
         iteration=0,
         phi=phi,
         mean=mean,

@@ -55,12 +55,20 @@ class Learner(Protocol):
         """What it learned so far."""
 
     @property
+    def events(self) -> Sequence[str]:
+        """What the last iteration brought that a person wants to read, one line each."""
+
+    @property
     def phi(self) -> NDArray[np.float64]:
         """Weights of what it is learning now, (J, I), a copy."""
 
     @property
-    def over(self) -> bool:
-        """Whether it has nothing left to learn."""
+    def over(self) -> str:
+        """Why it has nothing left to learn, a key of `loop.ENDINGS`; "" where it has."""
+
+    @property
+    def max_modules(self) -> int | None:
+        """Modules after which a run ends where nothing else is said; None: when it is over."""
 
     def step(self, block: Block) -> BlockSignals:
         """One iteration: look at tau frames, learn, and decide what to watch next.

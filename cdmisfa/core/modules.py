@@ -23,7 +23,9 @@ class Module:
 
     Attributes:
         index: order of learning, from 1.
-        stream: stream that was watched when it was saved, from 0.
+        stream: name of the stream that was watched when it was saved; "" where modules.npz is
+            from before that was kept, and no run says.
+        stream_index: that stream, from 0.
         iteration: iteration at whose end it was saved.
         phi: (J, I) weights; y = phi (x - mean), x after scaling and expansion.
         mean: (I,) mean of the input.
@@ -39,7 +41,8 @@ class Module:
     """
 
     index: int
-    stream: int
+    stream: str
+    stream_index: int
     iteration: int
     phi: NDArray[np.float64]
     mean: NDArray[np.float64]

@@ -3,14 +3,15 @@
 Every consumer walks over its fields: the schema of run.mcap, Rerun's entities and
 layout, the columns of an export, the table of signals in the docs. Adding a signal is
 raising `SCHEMA_VERSION` and adding a field whose `since` is the new version. Its value is
-set in `agents/learner.py` or, if it is a scalar of the iteration, is a field of `OUTCOME`
-(`agents/agent.py`) set in `agents/iteration.py`.
+set in `agents/learner.py` and `agents/progress/learner.py` or, if it is a scalar of the paper's
+iteration, is a field of `OUTCOME` (`agents/agent.py`) set in `agents/iteration.py`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -23,7 +24,16 @@ Show = Literal["line", "lane", "heat", "text", "hidden"]
 ACTIONS = ("stay", "switch")
 """What each code of an action, or of a policy, says to do."""
 
-SCHEMA_VERSION = 2
+STATES = ("learning", "learned", "known", "given_up")
+"""What each code of a stream's state says has become of it."""
+
+NO_STATE = -1
+"""State of a stream where a learner, or a run of a version without it, tells none."""
+
+MISSING: Mapping[str, float | int] = {"float64": math.nan, "int64": NO_STATE}
+"""What stands for a value that there is not, by the type of the signal."""
+
+SCHEMA_VERSION = 3
 """Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""
 
 
@@ -200,6 +210,44 @@ class BlockSignals:
         "a", "Action taken after the block: 0 stay, 1 switch.", dtype="int64", show="lane"
     )
     next_stream: int = _signal("s'", "Stream watched next.", dtype="int64", show="lane")
+    change: float = _signal(
+        "c",
+        "Mean change of the candidate's outputs with a block, 0 to 1.41; progress learner only.",
+        since=3,
+    )
+    tested: float = _signal(
+        "η_test",
+        "Slowness of the candidate on frames before it learned from them; progress learner only.",
+        unit="1/frame",
+        since=3,
+    )
+    fitted: float = _signal(
+        "η_fit",
+        "Slowness of the candidate on what it learned from; progress learner only.",
+        unit="1/frame",
+        since=3,
+    )
+    learning_error: float = _signal(
+        "e",
+        "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only.",
+        since=3,
+    )
+    interest: Float = _signal(
+        "",
+        "What each stream promises: the recent progress of its learning error, 0 where nothing is "
+        "being learned; progress learner only.",
+        dims="S",
+        since=3,
+    )
+    state: Int = _signal(
+        "",
+        "What has become of each stream: 0 learning, 1 learned, 2 known, 3 given up; -1 of a "
+        "learner that does not say.",
+        dims="S",
+        dtype="int64",
+        show="lane",
+        since=3,
+    )
 
 
 DENSE_STREAMS = 64

@@ -13,6 +13,7 @@ ENDINGS: Mapping[str, str] = {
     "max_modules": "as many modules as asked for were learned",
     "max_iterations": "the asked number of iterations is over",
     "nothing_left": "exploration ended long ago and no further abstraction converged",
+    "all_decided": "every stream is learned, known or given up",
     "log_exhausted": "the recording ended",
     "interrupted": "it was interrupted",
 }
@@ -36,7 +37,7 @@ def learn(
         sinks: told of everything, one after the other.
         stop: asked before every block; true ends the run.
         max_iterations: end after so many.
-        max_modules: end after so many modules; by default as many as there are streams.
+        max_modules: end after so many modules; by default as the learner says.
 
     Returns:
         Why it ended, a key of `ENDINGS`.
@@ -45,7 +46,7 @@ def learn(
         LogExhaustedError: a recording ended first; the sinks are finished.
     """
     exhausted: LogExhaustedError | None = None
-    modules = len(source.spec.streams) if max_modules is None else max_modules
+    modules = learner.max_modules if max_modules is None else max_modules
     while True:
         ended = ending(learner, modules, max_iterations) or ("interrupted" if stop() else "")
         if ended:
@@ -60,8 +61,8 @@ def learn(
         signals = learner.step(block)
         for sink in sinks:
             sink.block(block, signals, learner)
-            if signals.saved:
-                sink.event(block.t, signals.iteration, _saved(source, learner))
+            for text in learner.events:
+                sink.event(block.t, signals.iteration, text)
     for sink in sinks:
         sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
         sink.finish()
@@ -70,13 +71,13 @@ def learn(
     return ended
 
 
-def ending(learner: Learner, max_modules: int, max_iterations: int | None) -> str:
+def ending(learner: Learner, max_modules: int | None, max_iterations: int | None) -> str:
     """The key of `ENDINGS` for which a learner is to stop now, or "" where it is to learn on."""
-    if len(learner.modules) >= max_modules:
+    if max_modules is not None and len(learner.modules) >= max_modules:
         return "max_modules"
     if max_iterations is not None and learner.iteration >= max_iterations:
         return "max_iterations"
-    return "nothing_left" if learner.over else ""
+    return learner.over
 
 
 class Digest(SignalsHash, Sink):
@@ -85,11 +86,3 @@ class Digest(SignalsHash, Sink):
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self.add(signals)
-
-
-def _saved(source: FrameSource, learner: Learner) -> str:
-    module = learner.modules[-1]
-    return (
-        f"module {module.index} saved on stream {source.spec.streams[module.stream]}, "
-        f"policy {module.policy.tolist()}"
-    )

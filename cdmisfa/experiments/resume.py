@@ -51,7 +51,7 @@ OPTIONS = (
 SET_ASIDE = "run.before.mcap.partial"
 """The log of a run that is being resumed, until the new one has taken over what counts."""
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of a checkpoint; rises when the state of a learner changes its meaning."""
 
 KEPT = 2
@@ -59,7 +59,7 @@ KEPT = 2
 
 _HEAD = "checkpoint"
 _MODULES = "modules."
-_INTEGERS = ("index", "stream", "iteration")
+_PLAIN = ("index", "stream", "stream_index", "iteration")
 
 
 def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def _plain_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
     values: Any = {
-        name: column.tolist() if name in _INTEGERS else list(column)
+        name: column.tolist() if name in _PLAIN else list(column)
         for name, column in columns.items()
     }
     rows = zip(*values.values(), strict=True)

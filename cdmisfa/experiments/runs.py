@@ -74,7 +74,7 @@ class RunResult:
             "iterations": self.iterations,
             "frames": self.frames,
             "signals_sha256": self.signals_sha256,
-            "modules": [module_table(module, self.streams) for module in self.modules],
+            "modules": [module_table(module) for module in self.modules],
             **self.summary,
             "ended": self.ended,
         }
@@ -86,12 +86,12 @@ class RunExhaustedError(LogExhaustedError):
     result: RunResult
 
 
-def module_table(module: Module, streams: Sequence[str]) -> dict[str, Any]:
+def module_table(module: Module) -> dict[str, Any]:
     """What a result says about a module, as JSON values."""
     return {
         "index": module.index,
-        "stream": streams[module.stream],
-        "stream_index": module.stream,
+        "stream": module.stream,
+        "stream_index": module.stream_index,
         "iteration": module.iteration,
         "policy": module.policy.tolist(),
         "eta": module.eta.tolist(),
@@ -125,7 +125,7 @@ def run(
         folder: of the run, or None to log nothing.
         seed: seed of the policy and of the abstractions' first weights.
         max_iterations: end after so many.
-        max_modules: end after so many modules; by default as many as there are streams.
+        max_modules: end after so many modules; by default as the learner says.
         sections: further configuration tables (`scene`, `record`) for the manifest.
         force: replace an existing run.
         rerun: also build the Rerun view.

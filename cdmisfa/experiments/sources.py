@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from replay.camera_logs.source import Align, ForeignSource
     from replay.storage.location import Location
 
+OF_CAMERAS = "progress"
+"""The learner of streams that are no scene of ours, nor recorded from one."""
+
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
 
@@ -63,7 +66,12 @@ class CameraOptions:
 
 
 def configure(
-    kind: str, preset: str | None = None, settings: Sequence[str] = (), seed: int = 0
+    kind: str,
+    preset: str | None = None,
+    settings: Sequence[str] = (),
+    seed: int = 0,
+    *,
+    learner: str | None = None,
 ) -> Configuration:
     """Fill the configuration for a kind of scene.
 
@@ -73,19 +81,23 @@ def configure(
         preset: name of a preset or a .toml file.
         settings: `section.key=value` words; they win over the preset.
         seed: becomes `scene.seed` where that is not set.
+        learner: the learner where neither `preset` nor `settings` choose one; by default that of
+            the scene's preset.
 
     Raises:
         UsageError: an unknown scene, preset, learner, section or key, or a value that misfits.
     """
     words = parse_settings(settings)
-    algorithm = words.get("learner", {}).get("algorithm")
+    algorithm = words.get("learner", {}).get("algorithm", learner if preset is None else None)
     own = LEARNERS[algorithm].preset if algorithm is not None else None
     tables = load_preset(preset or own or SCENES[kind].preset)
     for section in (*tables, *words):
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
 
-    layers = {name: (tables.get(name, {}), words.get(name, {})) for name in SECTIONS}
+    layers: dict[str, tuple[Mapping[str, Any], ...]] = {
+        name: (tables.get(name, {}), words.get(name, {})) for name in SECTIONS
+    }
     of_preset, of_words = layers["scene"]
     if of_preset.get("kind", kind) != kind:
         raise UsageError(
@@ -104,6 +116,7 @@ def configure(
             )
     if algorithm is None:
         algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
+    layers["learner"] = (*layers["learner"], {"algorithm": algorithm})
     scene = build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind})
     return Configuration(
         learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"]),
@@ -194,7 +207,8 @@ def open_source(
         source = _open_log(paths, cameras, loop=loop, salvage=salvage)
     try:
         kind = scene_kind_for(source.spec, source.describe(), preset)
-        return source, configure(kind, preset, settings, seed)
+        learner = None if source.describe().get("scene") in SCENES else OF_CAMERAS
+        return source, configure(kind, preset, settings, seed, learner=learner)
     except BaseException:
         source.close()
         raise

@@ -233,7 +233,7 @@ def _compiled_trial(trial: SweepTrial) -> dict[str, Any]:
     return {
         "iterations": result.iterations,
         "frames": result.frames,
-        "modules": [module_table(module, streams) for module in result.modules],
+        "modules": [module_table(module) for module in result.modules],
         "final_policy": list(result.final_policy),
         "epsilon": result.epsilon,
         "ended": result.ended,

@@ -180,13 +180,13 @@ def _check(
 def _score(module: Module, source: SeekableSource) -> Learned:
     """Find the true quantity that a module's first output on its own view follows best."""
     source.seek(0)
-    block = source.take(module.stream, SCORED_FRAMES)
+    block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]
     r = [correlation(y, column) for column in block.truth.T]
     best = int(np.argmax(r))
     return Learned(
         module.index,
-        source.spec.streams[module.stream],
+        module.stream,
         tuple(ACTIONS[action] for action in module.policy),
         module.iteration,
         source.spec.truth[best],

@@ -44,7 +44,7 @@ def run(settings: Settings) -> Output:
         learner_config(), seed=settings["seed"], max_iterations=MAX_ITERATIONS, curves=True
     )
     curves: Any = result.curves
-    found = tuple((m.stream, tuple(m.policy.tolist())) for m in result.modules)
+    found = tuple((m.stream_index, tuple(m.policy.tolist())) for m in result.modules)
     row = {
         "optimal": found == OPTIMAL,
         "iterations": result.iterations,
@@ -62,7 +62,7 @@ def expanded_period(stream: int) -> NDArray[np.float64]:
 
 def slowness_on(module: Module) -> float:
     """Slowness of a module's output on one period of its own stream, in cycles per frame."""
-    x = expanded_period(module.stream)
+    x = expanded_period(module.stream_index)
     return float(instantaneous_slowness((x - module.mean) @ module.phi[0]))
 
 

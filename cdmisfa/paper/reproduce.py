@@ -165,7 +165,7 @@ def groups(trials: Sequence[Trial], *keys: str) -> dict[tuple[Any, ...], list[Tr
 def learned(modules: Sequence[Module]) -> dict[str, list[Any]]:
     """What a row says of the modules of a trial; a policy as "011", 0 stay and 1 switch."""
     return {
-        "streams": [m.stream for m in modules],
+        "streams": [m.stream_index for m in modules],
         "policies": ["".join(map(str, m.policy)) for m in modules],
         "saved_at": [m.iteration for m in modules],
     }

@@ -23,7 +23,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message, message_fa
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
+from cdmisfa.core.signals import MISSING, SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
 from recorder.log.messages import varint
 from replay.mcap.records import MalformedRecord
 
@@ -144,7 +144,7 @@ def decode_signals(
             shape = tuple(known[letter] for letter in signal.dims)
             if math.prod(shape) > len(data):
                 raise LogDamagedError(f"{where}: sizes without values, see cdmisfa verify")
-            fields[signal.name] = np.full(shape, math.nan)
+            fields[signal.name] = np.full(shape, MISSING[signal.dtype], dtype=signal.dtype)
     return BlockSignals(**fields)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -19,10 +20,14 @@ from replay.runs.folders import MODULES_FILE
 MAX_BYTES = 4 * 1024**3
 """Largest array that is read; asked for before anything is decompressed."""
 
-_NUMBERS = ("index", "stream", "iteration")
+_FIRST = re.compile(r"module\d+_index")
+_NUMBERS = ("index", "stream_index", "iteration")
 _OPTIONAL = ("centres", "counts", "expansion", "scale")  # not in every version's files
+_PLAIN = (("stream", "U", str), ("expansion", "U", str), ("scale", "f", float))
 _ARRAYS = tuple(
-    f.name for f in dataclasses.fields(Module) if f.name not in (*_NUMBERS, "expansion", "scale")
+    f.name
+    for f in dataclasses.fields(Module)
+    if f.name not in (*_NUMBERS, *(name for name, _, _ in _PLAIN))
 )
 
 
@@ -52,7 +57,8 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             _refuse_large(stored.zip)
-            indices = sorted(int(stored[name]) for name in stored.files if name.endswith("_index"))
+            first = (name for name in stored.files if _FIRST.fullmatch(name))
+            indices = sorted(int(stored[name]) for name in first)
             return tuple(_module(stored, index) for index in indices)
     except FileNotFoundError as error:
         raise UsageError(f"{path} does not exist: name a run's folder") from error
@@ -63,7 +69,11 @@ def load_modules(path: Path) -> tuple[Module, ...]:
 
 
 def _module(stored: Any, index: int) -> Module:
-    values: dict[str, Any] = {name: int(stored[_key(index, name)]) for name in _NUMBERS}
+    before_names = _key(index, "stream_index") not in stored.files  # then "stream" is the index
+    values: dict[str, Any] = {"stream": ""}
+    for name in _NUMBERS:
+        kept = "stream" if before_names and name == "stream_index" else name
+        values[name] = int(stored[_key(index, kept)])
     for name in _ARRAYS:
         if name in _OPTIONAL and _key(index, name) not in stored.files:
             continue
@@ -71,8 +81,8 @@ def _module(stored: Any, index: int) -> Module:
         if array.dtype.kind not in "fi":
             raise ValueError(f"{name} is no array of numbers")
         values[name] = array
-    for name, kind, of_type in (("expansion", "U", str), ("scale", "f", float)):
-        if _key(index, name) in stored.files:
+    for name, kind, of_type in _PLAIN:
+        if _key(index, name) in stored.files and not (before_names and name == "stream"):
             array = stored[_key(index, name)]
             if array.dtype.kind != kind:
                 raise ValueError(f"{name} is no {of_type.__name__}")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
+from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import joined
@@ -47,7 +49,11 @@ class Run:
     @cached_property
     def modules(self) -> tuple[Module, ...]:
         """What it learned, in order."""
-        return load_modules(self.log.parent)
+        found = load_modules(self.log.parent)
+        names = self.streams
+        if any(module.stream_index >= len(names) for module in found):
+            raise LogDamagedError(f"{self.log.parent} holds modules of streams it does not have")
+        return tuple(replace(module, stream=names[module.stream_index]) for module in found)
 
 
 class _Signals(Mapping[str, "NDArray[Any]"]):

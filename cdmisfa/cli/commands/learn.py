@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -189,13 +190,26 @@ class Reporter(Sink):
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self.told, modules = True, len(learner.modules)
-        if signals.saved:
-            self._shown.say(f"module {modules} saved at iteration {signals.iteration}")
+        for text in learner.events:
+            self._shown.say(f"iteration {signals.iteration}: {text}")
         now = time.monotonic()
         if now >= self._next:
             self._next = now + TICK
-            note = f"{modules} saved, ε {signals.epsilon:.2f}"
+            learning = int((signals.state == 0).sum())
+            left = f"{learning} being learned" if learning else f"ε {signals.epsilon:.2f}"
+            note = f"{modules} saved, {left}"
             self._shown.update(learner.iteration, self._max_iterations, note)
+
+
+def outcome_line(outcome: Mapping[str, Any]) -> str:
+    """What became of a stream, in words."""
+    came = outcome["state"].replace("_", " ")
+    if outcome["module"] is not None:
+        came += f" by module {outcome['module']}"
+    if outcome["slowness"] is not None:
+        came += f", slowness {outcome['slowness']:.4f} on frames not learned from"
+    because = f": {outcome['why']}" if outcome["why"] else ""
+    return f"{outcome['stream']}: {came}, after {outcome['blocks']} blocks{because}"
 
 
 def show(result: RunResult, *, as_json: bool) -> None:
@@ -209,7 +223,7 @@ def show(result: RunResult, *, as_json: bool) -> None:
     rows = [
         (
             module.index,
-            result.streams[module.stream],
+            module.stream,
             module.iteration,
             " ".join(ACTIONS[action] for action in module.policy),
             ", ".join(f"{eta:.4f}" for eta in module.eta),
@@ -220,6 +234,8 @@ def show(result: RunResult, *, as_json: bool) -> None:
         options.print_table(("module", "stream", "iteration", "policy", "eta"), rows)
     else:
         click.echo("no module was learned")
+    for outcome in result.summary.get("streams", ()):
+        click.echo(outcome_line(outcome))
     click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     click.echo(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:

@@ -170,6 +170,8 @@ def _slowest(state: State) -> None:
 def _align(state: State, before: Float) -> float:
     """Keep the signs that the outputs had, and say how much they changed.
 
+    Equation: P1
+
     Args:
         state: with new weights.
         before: (J, k) the old weights, of the new directions.

@@ -1,0 +1,70 @@
+"""What a learner takes in: the number of its inputs, and the block that it asked for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.expansion import expanded_size
+
+MAX_INPUTS = 2_000_000
+"""An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused."""
+
+
+def count_inputs(expansion: str, spec: SourceSpec) -> int:
+    """Number of inputs after expansion.
+
+    Raises:
+        UsageError: too many to hold.
+    """
+    values = int(np.prod(spec.frame_shape))
+    inputs = expanded_size(expansion, values)
+    if inputs > MAX_INPUTS:
+        raise UsageError(
+            f"learner.expansion {expansion} makes {inputs:,} inputs of {values:,}, "
+            f"more than {MAX_INPUTS:,}: set learner.expansion=none or take smaller frames"
+        )
+    return inputs
+
+
+def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[Any]:
+    """The frames of a block as rows, (tau, values).
+
+    A block that was not asked for is refused, as is one that would spoil every estimate.
+
+    Args:
+        block: as a source gave it.
+        spec: of that source.
+        stream: the stream that was asked for.
+        tau: the frames that were asked for.
+
+    Raises:
+        UsageError: it is no block.
+        ValueError: the block is of another stream, length, frame shape or type.
+        CdmisfaError: it holds a value that is no finite number.
+    """
+    if not isinstance(block, Block):
+        raise UsageError(
+            f"{type(block).__name__} given: a learner takes the blocks of a source, as "
+            "source.take(learner.stream, learner.tau) gives them"
+        )
+    if block.stream != stream or len(block) != tau:
+        raise ValueError(
+            f"the learner asked for {tau} frames of stream {stream}, "
+            f"not {len(block)} of stream {block.stream}"
+        )
+    shape, dtype = block.frames.shape[1:], block.frames.dtype
+    if shape != spec.frame_shape or dtype != spec.dtype:
+        raise ValueError(
+            f"the learner asked for frames of {spec.frame_shape} {spec.dtype}, not {shape} {dtype}"
+        )
+    if dtype.kind == "f" and not np.isfinite(block.frames).all():
+        raise CdmisfaError(
+            f"stream {spec.streams[block.stream]} holds a value that is no finite number "
+            f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
+        )
+    return block.frames.reshape(len(block), -1)

@@ -1,0 +1,143 @@
+"""Where to look: the rules that choose the next stream, by the name `learner.attention`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+HALF = 8
+"""Blocks of each half of the errors that progress is told from."""
+
+RECENT = 2 * HALF
+"""Blocks whose learning errors a rule is told."""
+
+LEAVE = 0.2
+"""Probability with which the rule `sticky` leaves a stream after a visit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a rule decides by.
+
+    Attributes:
+        stream: the one watched last.
+        learning: (S,) whether each is being learned, and may be watched now.
+        errors: for each stream its last learning errors, the newest last.
+        visits: (S,) blocks each was watched so far.
+        draws: (2,) uniform in [0, 1): whether to explore, and which.
+        explore: probability of any stream, of the rules that explore.
+    """
+
+    stream: int
+    learning: NDArray[np.bool_]
+    errors: tuple[Float, ...]
+    visits: NDArray[np.int64]
+    draws: Float
+    explore: float
+
+    @property
+    def any_stream(self) -> int:
+        """A stream drawn at random."""
+        n = len(self.learning)
+        return min(int(self.draws[1] * n), n - 1)
+
+
+Rule = Callable[[Situation], tuple[int, bool]]
+"""The next stream, and whether it was drawn at random."""
+
+
+def relative_progress(errors: Float) -> float:
+    """Fall of the learning error over the last blocks, weighted towards what is nearly done.
+
+    That is (max(0, before - now) / before + .001) / now, with before and now the means of the
+    learning error over the last but one and the last 8 blocks.
+
+    Equation: P3
+
+    Args:
+        errors: learning errors, the newest last; with fewer than 16 of them a stream promises
+            more than any other, and most with none.
+    """
+    if len(errors) < RECENT:
+        return 1e3 * (1.0 + 1.0 / (1.0 + len(errors)))
+    before, now = float(errors[-RECENT:-HALF].mean()), float(errors[-HALF:].mean())
+    fall = max(0.0, before - now) / max(before, 1e-9)
+    return (fall + 1e-3) / max(now, 1e-3)
+
+
+def interest(situation: Situation) -> Float:
+    """(S,) `relative_progress` of each stream, 0 of those that are not being learned."""
+    return _of_each(situation, lambda errors, _: relative_progress(errors), 0.0)
+
+
+def _of_each(s: Situation, value: Callable[[Float, int], float], otherwise: float) -> Float:
+    rows = zip(s.errors, s.visits.tolist(), s.learning, strict=True)
+    return np.array([value(errors, visits) if on else otherwise for errors, visits, on in rows])
+
+
+def _exploring(value: Callable[[Situation], Float]) -> Rule:
+    """The stream of the largest value; with a probability, or where all is learned, any."""
+
+    def choose(s: Situation) -> tuple[int, bool]:
+        if s.draws[0] < s.explore or not s.learning.any():
+            return s.any_stream, True
+        return int(np.argmax(value(s))), False
+
+    return choose
+
+
+def _gamma_progress(s: Situation) -> Float:
+    """Slow mean of the learning error less its fast mean (Kim et al. 2020)."""
+
+    def value(errors: Float, _: int) -> float:
+        if len(errors) < RECENT:
+            return 1e3
+        ages = np.arange(len(errors))[::-1]
+        slow, fast = 0.95**ages, 0.7**ages
+        return float((errors * slow).sum() / slow.sum() - (errors * fast).sum() / fast.sum())
+
+    return _of_each(s, value, -1e3)
+
+
+def _upper_bound(s: Situation) -> Float:
+    """Upper confidence bound on the relative fall of the learning error (UCB1)."""
+    total = math.log(max(int(s.visits.sum()), 2))
+
+    def value(errors: Float, visits: int) -> float:
+        if len(errors) < RECENT:
+            return 1e3
+        before, now = float(errors[-RECENT:-HALF].mean()), float(errors[-HALF:].mean())
+        fall = max(0.0, before - now) / max(before, 1e-9)
+        return fall + math.sqrt(total / (2.0 * visits))
+
+    return _of_each(s, value, -1e3)
+
+
+def _robin(s: Situation) -> tuple[int, bool]:
+    return (s.stream + 1) % len(s.learning), False
+
+
+def _while_novel(s: Situation) -> tuple[int, bool]:
+    return (s.stream, False) if s.learning[s.stream] else _robin(s)
+
+
+def _sticky(s: Situation) -> tuple[int, bool]:
+    return (s.stream, False) if s.draws[0] >= LEAVE else (s.any_stream, True)
+
+
+RULES: Mapping[str, Rule] = {
+    "progress": _exploring(interest),
+    "random": lambda s: (s.any_stream, True),
+    "robin": _robin,
+    "novel": _while_novel,
+    "sticky": _sticky,
+    "gamma": _exploring(_gamma_progress),
+    "ucb": lambda s: (int(np.argmax(_upper_bound(s))), False),
+}
+"""Every rule by its name."""

@@ -1,0 +1,200 @@
+"""`Candidate`: the slow features of one stream as they are learned, tested before they learn."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.features.recursive.recursive import RecursiveSFA, State
+from cdmisfa.features.slowness import block_moments, slowness, window_rate
+
+Float = NDArray[np.float64]
+
+WHITE_NOISE = math.sqrt(2.0) / (2.0 * math.pi)
+"""Slowness of white noise."""
+
+FEWEST = 4
+"""With fewer slow features than this there is no typical one; white noise stands for it."""
+
+ERRORS = 90
+"""Blocks whose learning error is kept."""
+
+_TINY = 1e-12
+
+UNTESTED = 3.0
+"""Learning error of a block before anything was tested: more than any that is."""
+
+
+def log_ratio(a: float, b: float) -> float:
+    """ln(a / b) of two slownesses, finite where one of them is 0."""
+    return math.log(max(a, _TINY) / max(b, _TINY))
+
+
+def learning_error(change: float, tested: float, fitted: float) -> float:
+    """How much the outputs change yet, and how little is known of them: e = c + |ln(test / fit)|.
+
+    Equation: P2
+
+    Args:
+        change: mean change c of the outputs with a block.
+        tested: slowness on frames not yet learned from.
+        fitted: slowness on those learned from.
+    """
+    return change + abs(log_ratio(tested, fitted))
+
+
+class Candidate:
+    """What is being learned of a stream.
+
+    Args:
+        n_inputs: I.
+        components: K.
+        outputs: J.
+        window: frames of the exponential window of its SFA.
+        test_window: blocks of that of its tests.
+
+    Attributes:
+        sfa: the recursive SFA.
+        blocks: blocks learned from.
+        tests: blocks tested before they were learned from.
+        change: mean change of the outputs with a block, see `RecursiveSFA.update`.
+        regret: log of the slowness that the outputs of some time ago have now, over that of
+            today's: 0 where nothing was gained since.
+        errors: (ERRORS,) learning error of the last blocks, the newest last; NaN before.
+    """
+
+    def __init__(
+        self, n_inputs: int, components: int, outputs: int, window: int, test_window: int
+    ) -> None:
+        self.sfa = RecursiveSFA(n_inputs, components, outputs, window)
+        n_outputs = len(self.sfa.state.weights)
+        self.test_window = test_window
+        self.blocks = self.tests = self._reference_age = 0
+        self.change = self.regret = math.nan
+        self.errors = np.full(ERRORS, np.nan)
+        self._moments = np.zeros((3, n_outputs))
+        self._reference = np.zeros((1, n_inputs))
+
+    def learn(self, frames: NDArray[Any], gap: bool) -> None:
+        """Test on a block, then learn from it.
+
+        Args:
+            frames: (n, I) consecutive frames.
+            gap: they do not follow those before.
+        """
+        begun = bool(self.sfa.state.weights.any())
+        changes = self.sfa.update(frames, gap)
+        self.blocks += 1
+        if begun:
+            self._test(self.sfa.tested)
+        changes = changes[np.isfinite(changes)]
+        if len(changes):
+            change = min(float(changes.sum()), math.sqrt(2.0))
+            if math.isnan(self.change):
+                self.change = change
+            else:
+                self.change += window_rate(self.test_window, max(self.tests, 1)) * (
+                    change - self.change
+                )
+        self.errors[:-1] = self.errors[1:]
+        self.errors[-1] = self.error
+        self._reference_age += 1
+        if self._reference_age >= self.test_window:
+            self._look_back()
+
+    def _test(self, y: Float) -> None:
+        self.tests += 1
+        rate = window_rate(self.test_window, self.tests)
+        for j in range(y.shape[1]):
+            self._moments[:, j] += rate * (block_moments(y[:, j].copy()) - self._moments[:, j])
+
+    def _look_back(self) -> None:
+        if self._reference.any():
+            now = self.sfa.compare(self._reference)[1]
+            self.regret = log_ratio(float(now[0]), self.fitted)
+        self._reference[0] = self.sfa.phi[0]
+        self._reference_age = 0
+
+    @property
+    def alive(self) -> bool:
+        """Whether the stream has shown anything that varies."""
+        return bool(self.sfa.state.weights.any())
+
+    @property
+    def fitted(self) -> float:
+        """Slowness of the slowest output on what was learned from; NaN where there is none."""
+        return self.sfa.slowness
+
+    @property
+    def tested(self) -> Float:
+        """(J,) slowness of each output on frames not yet learned from; NaN before any."""
+        return np.array(
+            [
+                slowness(derivative, square - mean * mean) if self.tests else math.nan
+                for mean, square, derivative in self._moments.T
+            ]
+        )
+
+    @property
+    def variance(self) -> Float:
+        """(J,) variance of each output on frames not yet learned from."""
+        mean, square, _ = self._moments
+        return np.asarray(square - mean * mean)
+
+    @property
+    def error(self) -> float:
+        """Its `learning_error`; `UNTESTED` before anything was tested."""
+        if not self.tests or math.isnan(self.change):
+            return UNTESTED
+        return learning_error(self.change, float(self.tested[0]), self.fitted)
+
+    def recent_errors(self, most: int) -> Float:
+        """The last learning errors, at most so many, the newest last."""
+        recent = self.errors[-most:]
+        return np.asarray(recent[np.isfinite(recent)])
+
+    @property
+    def typical(self) -> float:
+        """Slowness of the stream's typical direction: the median of all slow features'."""
+        spectrum = self.sfa.state.spectrum
+        known = spectrum[np.isfinite(spectrum)]
+        if len(known) < FEWEST:
+            return WHITE_NOISE
+        return float(known[len(known) // 2])
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything that changes in it, by name; copies."""
+        counters = np.array([self.blocks, self.tests, self._reference_age], dtype=np.int64)
+        measures = np.array([self.change, self.regret])
+        own = {
+            "counters": counters,
+            "measures": measures,
+            "errors": self.errors.copy(),
+            "moments": self._moments.copy(),
+            "reference": self._reference.copy(),
+        }
+        sfa = self.sfa.state
+        return own | {f"sfa.{n}": a.copy() for n, a in zip(State._fields, sfa, strict=True)}
+
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Go to where another of the same sizes was.
+
+        Raises:
+            ValueError: an array is missing or of another shape or type.
+        """
+        own = self.arrays
+        for name, array in own.items():
+            found = arrays.get(name)
+            if found is None or found.shape != array.shape or found.dtype != array.dtype:
+                raise ValueError(f"{name} is missing or of another shape or type")
+        self.blocks, self.tests, self._reference_age = arrays["counters"].tolist()
+        self.change, self.regret = arrays["measures"].tolist()
+        self.errors[:] = arrays["errors"]
+        self._moments[:] = arrays["moments"]
+        self._reference[:] = arrays["reference"]
+        for name, array in zip(State._fields, self.sfa.state, strict=True):
+            array[...] = arrays[f"sfa.{name}"]

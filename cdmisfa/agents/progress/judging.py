@@ -1,0 +1,145 @@
+"""What a candidate has come to: pure functions of what is known of it."""
+
+from __future__ import annotations
+
+from cdmisfa.agents.progress.candidate import Candidate, log_ratio
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.core.modules import Module
+
+FULL = 3.0
+"""Windows of tests after which an output counts as settled at `learner.settled`."""
+
+STEEPNESS = 4
+"""Power with which that threshold grows until then."""
+
+STILL_GAINING = 0.1
+"""Regret above which nothing is settled, however little the output changes with a block."""
+
+EARLY = 0.6
+"""Windows of tests before a candidate may be given up."""
+
+PATIENCE = 20
+"""Windows of tests after which a candidate that has made no progress of late is given up."""
+
+LIVELY = (0.3, 3.0)
+"""Variance of an output on frames not yet learned from, where its mean and scale hold."""
+
+PASSED_ON = 0.03
+"""Regret below which nothing was gained of late, however much the output changes."""
+
+TURNING = 4.0
+"""Change over `learner.settled` from which an output has no direction at all."""
+
+SLOW_AGAIN = 0.65
+"""Share of the typical slowness below which what was fitted counts as slow."""
+
+TOO_EVEN = 0.75
+"""Share of the typical slowness above which what was fitted counts as no slower than the rest."""
+
+PRESENT = (0.1, 10.0)
+"""Variance of a module's output, which had 1, on a stream that shows what it encodes."""
+
+SAME = 0.8
+"""Correlation from which two outputs are one."""
+
+AS_SLOW = 1.15
+"""Slowness of a module over the candidate's, up to which it is as slow."""
+
+STILL_SAME, STILL_SLOW, STILL_ITSELF = 0.6, 1.35, 0.3
+"""The same for the stream's own module, which a candidate of few frames must not put in doubt."""
+
+
+def gain(candidate: Candidate) -> float:
+    """Tested slowness over that of the stream's typical direction: 1 where nothing is slow.
+
+    Equation: P4
+    """
+    return float(candidate.tested[0]) / max(candidate.typical, 1e-12)
+
+
+def flatness(candidate: Candidate) -> float:
+    """Fitted slowness over that of the stream's typical direction, see `gain`."""
+    return candidate.fitted / max(candidate.typical, 1e-12)
+
+
+def disagreement(candidate: Candidate) -> float:
+    """|ln(tested / fitted)|: what the slowness on new frames says of that on old ones."""
+    return abs(log_ratio(float(candidate.tested[0]), candidate.fitted))
+
+
+def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
+    """Whether a candidate has become a module: slow on new frames too, alive, and settled.
+
+    The change that counts as settled grows with the tests: the firmer an output stands, the
+    sooner it is a module. An output that goes on turning among directions that are equally slow
+    is settled when nothing is gained by it.
+    """
+    windows = candidate.tests / candidate.test_window
+    if windows < 1.0:
+        return False
+    firm = candidate.change < config.settled * min(1.0, windows / FULL) ** STEEPNESS
+    turning = (
+        windows >= FULL
+        and candidate.change < TURNING * config.settled
+        and abs(candidate.regret) < PASSED_ON
+    )
+    low, high = LIVELY
+    return (
+        (firm or turning)
+        and not candidate.regret > STILL_GAINING
+        and disagreement(candidate) < config.agreement
+        and low < float(candidate.variance[0]) < high
+        and gain(candidate) < config.slow
+        and flatness(candidate) < SLOW_AGAIN
+    )
+
+
+def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
+    """Why a candidate is given up, or "" where it is not."""
+    if not candidate.alive:
+        return "it is constant" if candidate.blocks >= EARLY * candidate.test_window else ""
+    if (
+        candidate.tests >= EARLY * candidate.test_window
+        and gain(candidate) > config.even
+        and flatness(candidate) > TOO_EVEN
+    ):
+        return "nothing in it is slow"
+    if candidate.blocks >= PATIENCE * candidate.test_window:
+        errors = candidate.errors
+        if errors[-30:].mean() > 0.95 * errors[:-30].mean():
+            return "it made no progress"
+    return ""
+
+
+def promising(candidate: Candidate, config: ProgressConfig) -> bool:
+    """Whether a stream that was given up is worth learning after all."""
+    return (
+        candidate.alive
+        and candidate.tests >= EARLY * candidate.test_window
+        and gain(candidate) < config.slow
+        and flatness(candidate) < SLOW_AGAIN
+    )
+
+
+def known_by(candidate: Candidate, modules: list[Module], own: int) -> int | None:
+    """Index in `modules` of the one that gives what the candidate found, its own first, if any.
+
+    Args:
+        candidate: tells by the statistics of its stream, without frames.
+        modules: frozen.
+        own: index of the stream's own module, -1 where it has none.
+    """
+    low, high = PRESENT
+    for index in sorted(range(len(modules)), key=lambda index: index != own):
+        module = modules[index]
+        variance, eta, rho = (float(v[0]) for v in candidate.sfa.compare(module.phi[:1]))
+        if not low < variance < high:
+            continue
+        if rho > SAME and eta <= AS_SLOW * candidate.fitted:
+            return index
+        if index == own:
+            before = float(module.eta[0])
+            itself = abs(log_ratio(eta, before)) < STILL_ITSELF
+            if rho > STILL_SAME or (itself and eta <= STILL_SLOW * candidate.fitted):
+                return index
+    return None

@@ -1,0 +1,390 @@
+"""`ProgressLearner`: every slow feature of any streams, with one candidate a stream.
+
+A candidate is tested on each block before it learns from it. What is slow on frames not yet
+learned from, and settled, becomes a module; what a module gives already is known; what is no
+slower than anything else in its stream is given up. The learner looks where the learning error
+falls fastest, and it is over when no stream is being learned.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.agents.inputs import count_inputs, rows_of
+from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
+from cdmisfa.agents.progress.candidate import Candidate
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.judging import PATIENCE, hopeless, known_by, mastered, promising
+from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
+from cdmisfa.core.expansion import expand
+from cdmisfa.core.learning import LearnerState
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import STATES, BlockSignals
+from cdmisfa.features.projection import mean_output, outputs
+from cdmisfa.features.slowness import instantaneous_slowness
+
+Float = NDArray[np.float64]
+
+LEARNING, LEARNED, KNOWN, GIVEN_UP = range(len(STATES))
+
+REASONS = ("", "it is constant", "nothing in it is slow", "it made no progress")
+"""Why a stream was given up, by the code that is kept."""
+
+FEW_VALUES = 32
+"""Frames of at most so many values are expanded quadratically where nothing else is said."""
+
+FEWEST_BLOCKS = 20
+"""Of a window of tests, however long a block is."""
+
+HELD = 32
+"""Candidates that are held at once; those of other streams are begun anew when they are watched."""
+
+MEMORY = 2 * 1024**3
+"""Bytes that candidates may take together; where frames are large fewer of them are held."""
+
+SHADOW = 4
+"""Windows of tests after which the candidate of a stream that is not being learned begins anew."""
+
+STREAM = np.dtype(
+    [
+        ("state", "i8"),  # code in STATES
+        ("module", "i8"),  # place in the modules of the one that gives its slow feature; -1 none
+        ("why", "i8"),  # code in REASONS
+        ("next", "i8"),  # frame after its last block; -1 where it was never watched
+        ("last", "i8"),  # iteration of its last block
+        ("visits", "i8"),  # blocks it was watched
+        ("decided", "i8"),  # blocks it had been watched when its state was decided
+        ("looks", "i8"),  # times it was begun anew after it had been given up
+        ("slowness", "f8"),  # of what it came to, on frames not learned from
+    ]
+)
+
+COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
+
+
+class ProgressLearner:
+    """One candidate a stream, attention by learning progress, and an end of its own.
+
+    At most `HELD` candidates are held at once, and no more than fit into `MEMORY`.
+
+    Args:
+        config: what it is told.
+        spec: the source it learns from.
+        seed: where its random generator starts.
+
+    Attributes:
+        modules: what it learned so far.
+        events: what the last iteration brought, one line each.
+    """
+
+    def __init__(self, config: ProgressConfig, spec: SourceSpec, seed: int) -> None:
+        self.config, self.spec = config, spec
+        self.modules: list[Module] = []
+        self.events: tuple[str, ...] = ()
+        few = math.prod(spec.frame_shape) <= FEW_VALUES
+        self._expansion = config.expansion or ("quadratic" if few else "none")
+        self._n_inputs = count_inputs(self._expansion, spec)
+        self._scale = PIXEL if spec.dtype == "uint8" else 1.0
+        size = 8 * self._n_inputs * (2 * config.components + 4)
+        self._held = max(2, min(HELD, MEMORY // size))
+        self._window = max(FEWEST_BLOCKS, -(-config.test_frames // config.tau))
+        self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+        self._counts = np.zeros(1, COUNTS)
+        self._counts["stream"] = int(self._rng.random() * len(spec.streams))
+        self._streams = np.zeros(len(spec.streams), STREAM)
+        self._streams["module"] = self._streams["next"] = -1
+        self._streams["slowness"] = np.nan
+        self._candidates: dict[int, Candidate] = {}
+        self._freeze()
+
+    @property
+    def tau(self) -> int:
+        """Frames the learner wants in each block."""
+        return self.config.tau
+
+    @property
+    def stream(self) -> int:
+        """Stream the learner wants to watch next."""
+        return int(self._counts["stream"][0])
+
+    @property
+    def iteration(self) -> int:
+        """Iterations so far."""
+        return int(self._counts["iteration"][0])
+
+    @property
+    def phi(self) -> Float:
+        """Weights of the candidate of the stream to watch next, (J, I), a copy."""
+        held = self._candidates.get(self.stream)
+        return np.zeros((self._n_outputs, self._n_inputs)) if held is None else held.sfa.phi
+
+    @property
+    def over(self) -> str:
+        """Whether no stream is being learned, nor was for `learner.watch` blocks; see `Learner`."""
+        learning = (self._streams["state"] == LEARNING).any()
+        idle = int(self._counts["idle"][0])
+        return "all_decided" if not learning and idle > self.config.watch else ""
+
+    @property
+    def max_modules(self) -> None:
+        """It ends by itself."""
+        return None
+
+    @property
+    def state(self) -> LearnerState:
+        """The learner's state, a copy."""
+        held = sorted(self._candidates)
+        arrays = {
+            f"candidate.{stream}.{name}": array
+            for stream in held
+            for name, array in self._candidates[stream].arrays.items()
+        }
+        arrays["streams"], arrays["counts"] = self._streams.copy(), self._counts.copy()
+        arrays["held"] = np.array(held, dtype=np.int64)
+        return LearnerState(arrays, tuple(self.modules), self._rng.bit_generator.state)
+
+    def restore(self, state: LearnerState) -> None:
+        """Go to a state of a learner with the same configuration, spec and seed.
+
+        Raises:
+            ValueError: an array is missing or of another shape or type.
+        """
+        arrays = dict(state.arrays)
+        for name, own in (("streams", self._streams), ("counts", self._counts)):
+            found = arrays.get(name)
+            if found is None or found.shape != own.shape or found.dtype != own.dtype:
+                raise ValueError(f"{name} is missing or of another shape or type")
+            own[...] = found
+        self._candidates = {}
+        for stream in arrays.get("held", np.zeros(0, np.int64)).tolist():
+            prefix = f"candidate.{stream}."
+            parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+            self._candidates[stream] = self._new_candidate()
+            self._candidates[stream].restore(parts)
+        self.modules = list(state.modules)
+        self._freeze()
+        self._rng.bit_generator.state = dict(state.policy_rng)
+
+    def step(self, block: Block) -> BlockSignals:
+        """One iteration: test on tau frames, learn from them, and decide what to watch next.
+
+        Args:
+            block: tau frames of the stream the learner asked for.
+
+        Raises:
+            UsageError: it is no block.
+            ValueError: the block is of another stream, length, frame shape or type.
+            CdmisfaError: it holds a value that is no finite number.
+        """
+        frames = expand(self._expansion, rows_of(block, self.spec, self.stream, self.tau))
+        stream, count = block.stream, len(self.modules)
+        own, counts = self._streams[stream], self._counts[0]
+        novel = int(own["state"]) == LEARNING
+        candidate = self._candidate(stream)
+        y_frozen = outputs(self._phi, self._offset, frames)
+        error = candidate.error
+        candidate.learn(frames, gap=int(own["next"]) != block.t)
+        own["next"], own["last"] = block.t + len(block), counts["iteration"]
+        own["visits"] += 1
+        counts["iteration"] += 1
+        self.events = self._judge(stream, candidate) + self._look_again()
+        learning = self._streams["state"] == LEARNING
+        counts["idle"] = 0 if learning.any() else counts["idle"] + 1
+        values, explored = self._choose(self._rng.random(2))
+        y = candidate.sfa.tested
+        tested = candidate.tested
+        y_frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
+        none, shape = np.full(len(tested), np.nan), (count, self._n_outputs)
+        return BlockSignals(
+            iteration=self.iteration - 1,
+            t=block.t,
+            log_time=self.spec.time_ns(block.t),
+            stream=stream,
+            module=count + 1,
+            novel=novel and candidate.alive,
+            known_by=int(own["module"]) + 1 if candidate.alive else -1,
+            saved=len(self.modules) > count,
+            share=math.nan,
+            novel_blocks=candidate.blocks,
+            y=y if candidate.tests else np.full(y.shape, np.nan),
+            y_frozen=np.ascontiguousarray(y_frozen),
+            eta=tested,
+            eta_dot=none,
+            variance=candidate.variance if candidate.tests else none,
+            eta_inst=_each(y) if candidate.tests else none,
+            gate_mean=none,
+            gate_sd=none,
+            eta_inst_frozen=np.array([_each(module) for module in y_frozen]).reshape(shape),
+            band_mean=np.array([m.eta for m in self.modules[:count]]).reshape(shape),
+            band_sd=np.full(shape, np.nan),
+            roc_error_inst=math.nan,
+            roc_error=math.nan,
+            roc_error_frozen=np.full(count, np.nan),
+            xi=math.nan,
+            xi_dot=math.nan,
+            curiosity=error - candidate.error,
+            expert=math.nan,
+            reward=error - candidate.error,
+            R=np.empty((0, 2, 0)),
+            Q=np.full((len(learning), 2), np.nan),
+            policy=np.where(learning, 0, 1),
+            epsilon=self.config.explore,
+            explored=explored,
+            action=int(self.stream != stream),
+            next_stream=self.stream,
+            change=candidate.change,
+            tested=float(tested[0]),
+            fitted=candidate.fitted,
+            learning_error=candidate.error,
+            interest=values,
+            state=self._streams["state"].copy(),
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """What became of each stream, as JSON values."""
+        policy = np.where(self._streams["state"] == LEARNING, 0, 1)
+        return {
+            "final_policy": policy.tolist(),
+            "epsilon": self.config.explore,
+            "streams": [self._outcome(stream) for stream in range(len(self._streams))],
+        }
+
+    def _outcome(self, stream: int) -> dict[str, Any]:
+        own = self._streams[stream]
+        slowness, module = float(own["slowness"]), int(own["module"])
+        learning = int(own["state"]) == LEARNING
+        if learning and stream in self._candidates:
+            slowness = float(self._candidates[stream].tested[0])
+        return {
+            "stream": self.spec.streams[stream],
+            "state": STATES[int(own["state"])],
+            "module": module + 1 if module >= 0 else None,
+            "blocks": int(own["visits" if learning else "decided"]),
+            "slowness": slowness if math.isfinite(slowness) else None,
+            "why": REASONS[int(own["why"])],
+        }
+
+    @property
+    def _n_outputs(self) -> int:
+        return min(self.config.outputs, self._n_inputs)
+
+    def _new_candidate(self) -> Candidate:
+        c = self.config
+        return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._window)
+
+    def _candidate(self, stream: int) -> Candidate:
+        """The candidate of a stream, for which another may have to go."""
+        if stream not in self._candidates:
+            while len(self._candidates) >= self._held:
+                idle = [s for s in self._candidates if self._streams["state"][s] != LEARNING]
+                oldest = min(idle or self._candidates, key=lambda s: self._streams["last"][s])
+                del self._candidates[oldest]
+            self._candidates[stream] = self._new_candidate()
+        return self._candidates[stream]
+
+    def _judge(self, stream: int, candidate: Candidate) -> tuple[str, ...]:
+        """Decide what the stream has come to; the lines that say so."""
+        own = self._streams[stream]
+        name, state = self.spec.streams[stream], int(own["state"])
+        if mastered(candidate, self.config):
+            del self._candidates[stream]
+            index = known_by(candidate, self.modules, int(own["module"]))
+            if index is None:
+                self._save(stream, candidate)
+                index = len(self.modules) - 1
+                self._decide(stream, LEARNED, index, float(candidate.tested[0]))
+                what = "has changed: what it shows now" if state in (LEARNED, KNOWN) else "is"
+                what += f" learned by module {index + 1}"
+            elif index != int(own["module"]):
+                eta = float(candidate.sfa.compare(self.modules[index].phi[:1])[1][0])
+                self._decide(stream, KNOWN, index, eta)
+                what = f"is known by module {index + 1} (of {self.modules[index].stream})"
+            else:
+                return ()
+            eta = float(own["slowness"])
+            return (f"stream {name} {what} after {own['decided']} blocks, slowness {eta:.4f}",)
+        if state in (LEARNED, KNOWN):
+            if candidate.blocks >= SHADOW * self._window:
+                del self._candidates[stream]
+        elif state == LEARNING:
+            why = hopeless(candidate, self.config)
+            if why:
+                self._decide(stream, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
+                return (f"stream {name} is given up after {own['decided']} blocks: {why}",)
+        elif candidate.blocks < PATIENCE * self._window and promising(candidate, self.config):
+            self._decide(stream, LEARNING, -1, math.nan)
+            return (f"stream {name} is learned after all: something in it is slow",)
+        return ()
+
+    def _decide(self, stream: int, state: int, module: int, slowness: float, why: int = 0) -> None:
+        own = self._streams[stream]
+        own["state"], own["module"], own["why"] = state, module, why
+        own["decided"], own["slowness"] = own["visits"], slowness
+
+    def _look_again(self) -> tuple[str, ...]:
+        """Begin what was given up once more, before all is over; the lines that say so."""
+        streams = self._streams
+        if (streams["state"] == LEARNING).any():
+            return ()
+        again = (streams["state"] == GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
+        for stream in np.flatnonzero(again).tolist():
+            streams["looks"][stream] += 1
+            self._candidates.pop(stream, None)
+            self._decide(stream, LEARNING, -1, math.nan)
+        names = ", ".join(self.spec.streams[s] for s in np.flatnonzero(again))
+        return (f"looking once more at what was given up: {names}",) if names else ()
+
+    def _save(self, stream: int, candidate: Candidate) -> None:
+        self.modules.append(
+            Module(
+                index=len(self.modules) + 1,
+                stream=self.spec.streams[stream],
+                stream_index=stream,
+                iteration=self.iteration - 1,
+                phi=candidate.sfa.phi,
+                mean=candidate.sfa.mean.copy(),
+                band_mean=candidate.tested,
+                band_sd=np.full(self._n_outputs, np.nan),
+                eta=candidate.tested,
+                policy=np.where(self._streams["state"] == LEARNING, 0, 1),
+                expansion=self._expansion,
+                scale=self._scale,
+            )
+        )
+        self._freeze()
+
+    def _freeze(self) -> None:
+        """Stack the modules' rows, so that one pass over a block serves all of them."""
+        found = self.modules
+        self._phi = np.array([m.phi for m in found]).reshape(-1, self._n_inputs)
+        self._offset = np.array([mean_output(m.phi, m.mean) for m in found]).reshape(-1)
+
+    def _choose(self, draws: Float) -> tuple[Float, bool]:
+        """Choose the next stream; what each promises, and whether one was drawn at random."""
+        counts, learning = self._counts[0], self._streams["state"] == LEARNING
+        held = np.zeros(len(learning), dtype=bool)
+        held[list(self._candidates)] = True
+        if (learning & held).sum() >= self._held:
+            learning &= held
+        errors = tuple(
+            self._candidates[s].recent_errors(RECENT) if held[s] else np.zeros(0)
+            for s in range(len(learning))
+        )
+        situation = Situation(
+            self.stream, learning, errors, self._streams["visits"], draws, self.config.explore
+        )
+        counts["stay"] += 1
+        explored = False
+        if counts["stay"] >= self.config.visit or not learning[self.stream]:
+            counts["stay"] = 0
+            counts["stream"], explored = RULES[self.config.attention](situation)
+        return interest(situation), explored
+
+
+def _each(y: Float) -> Float:
+    """Slowness of each output within a block, (J,), from its (n, J) values."""
+    return np.array([instantaneous_slowness(y[:, j].copy()) for j in range(y.shape[1])])
