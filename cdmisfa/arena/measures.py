@@ -25,7 +25,7 @@ KNOWS: Final = 0.8
 """Correlation with batch SFA from which on a module knows a stream that it was not learned on."""
 
 THE_SAME: Final = 0.9
-"""Correlation above which two modules of one stream are the same one twice."""
+"""Correlation above which modules of a stream shown twice are the same one."""
 
 RIDGE: Final = 1e-3
 """Penalty of the linear probe, as a share of the number of frames."""
@@ -103,7 +103,10 @@ def learned_by(
 
 
 def doubles(saved: Sequence[Saved], output: Callable[[int, str], Output]) -> list[int]:
-    """Which modules are an earlier one of the same signal again.
+    """Which modules are too many: a stream that shows the same has one already.
+
+    Where it is another stream on which the same is shown, too, those count whose output is the
+    same.
 
     Args:
         saved: the modules, in order.
@@ -111,8 +114,12 @@ def doubles(saved: Sequence[Saved], output: Callable[[int, str], Output]) -> lis
     """
 
     def same(k: int, j: int) -> bool:
+        if saved[j].signal != saved[k].signal:
+            return False
+        if saved[j].stream == saved[k].stream:
+            return True
         values = (output(i, saved[k].signal).values for i in (j, k))
-        return saved[j].signal == saved[k].signal and correlation(*values) > THE_SAME
+        return correlation(*values) > THE_SAME
 
     return [k for k in range(len(saved)) if any(same(k, j) for j in range(k))]
 

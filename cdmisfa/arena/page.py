@@ -46,7 +46,8 @@ DEFINITIONS: Final = f"""\
   module was learned on a stream, one learned on another counts if its output there is that of
   batch SFA (correlation above {KNOWS:g}).
 - *Not learnable*: modules a run saved on streams that have nothing slow. There should be none.
-- *Twice*: modules a run saved that are an earlier one again (correlation above {THE_SAME:g}).
+- *Twice*: modules a run saved on a stream that had one already and still shows the same, or on
+  the same stream shown once more, if the outputs are the same (correlation above {THE_SAME:g}).
 - *Ends*: the share of runs that ended by themselves; *blocks*: after how many, of those that did.
   Others are stopped when their frames are over, the same number for every learner.
 - *All learned*: blocks until the last learnable stream was learned, of the runs that learned all.
