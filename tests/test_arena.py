@@ -160,6 +160,7 @@ class Chooser:
     """A learner that saves a module a stream, at given iterations, and then has nothing left."""
 
     tau = 40
+    max_modules = None
 
     def __init__(self, saves: dict[int, Module], ends: int) -> None:
         self.saves, self.ends = saves, ends
@@ -170,8 +171,8 @@ class Chooser:
         return self.iteration % 2
 
     @property
-    def over(self) -> bool:
-        return self.iteration >= self.ends
+    def over(self) -> str:
+        return "nothing_left" if self.iteration >= self.ends else ""
 
     def step(self, block: Any) -> None:
         assert block.t == 40 * self.iteration
@@ -210,8 +211,8 @@ def test_trials_are_named_by_what_they_depend_on(tmp_path: Path) -> None:
     (first, _) = plan(["tiny"], ["2.0"], [0, 1], (), None, tmp_path)
     assert {w.name for w in first.wanted()} == {"sway", "swing", "hiss"}
     assert first.reference == (7, "none")
-    (vectors,) = plan(["oscillatory"], ["2.0"], [0], (), None, tmp_path)
-    assert vectors.reference == (5, "quadratic")
+    vectors = plan(["oscillatory"], ["2.0", "progress"], [0], (), None, tmp_path)
+    assert [t.reference for t in vectors] == [(5, "quadratic"), (16, "quadratic")]
     assert configured("1.0", ["learner.tau=20"], images=True).tau == 20
 
 
@@ -232,18 +233,26 @@ def test_what_does_not_exist_is_refused_before_anything_runs(
 
 
 def test_a_small_arena_from_trials_to_page(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = ("arena", "tiny", "oscillatory", "--learners", "2.0", "--seeds", "0:2")
+    words = ("arena", "tiny", "oscillatory", "--learners", "progress,2.0", "--seeds", "0:2")
     out = ("-o", tmp_path / "out", "--streams", tmp_path / "streams")
     page = tmp_path / "docs" / "arena.md"
     first = cdmisfa(*words, *out, "--page", page)
     assert first.code == 0, first.err
-    assert "4 trials: 4 computed, 0 finished before, 0 failed" in first.err
+    assert "8 trials: 8 computed, 0 finished before, 0 failed" in first.err
     again = cdmisfa(*words, *out, "--json")
-    assert "4 trials: 0 computed, 4 finished before, 0 failed" in again.err
-    waves, tiny = again.json["entries"]
-    assert [e["point"] for e in (waves, tiny)] == [
-        {"set": name, "learner": "2.0"} for name in ("oscillatory", "tiny")
+    assert "8 trials: 0 computed, 8 finished before, 0 failed" in again.err
+    entries = again.json["entries"]
+    assert [e["point"] for e in entries] == [
+        {"set": name, "learner": learner}
+        for name in ("oscillatory", "tiny")
+        for learner in ("progress", "2.0")
     ]
+    for entry in entries[::2]:
+        measured = entry["measures"]
+        assert [measured[k]["mean"] for k in ("learned", "wrong", "doubles")] == [1, 0, 0]
+        assert measured["ended"]["mean"] == 1
+        assert measured["blocks"]["mean"] < 300
+    waves, tiny = entries[1::2]
     measured = waves["measures"]
     assert measured["learned"] == {"mean": 1.0, "sd": 0.0, "n": 2, "low": 1.0, "high": 1.0}
     assert (measured["wrong"]["mean"], measured["doubles"]["mean"]) == (0, 0)
@@ -259,11 +268,16 @@ def test_a_small_arena_from_trials_to_page(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     text = page.read_text("utf-8")
     assert "**2.0**, tiny: `sway` not learned with 2 of 2 seeds" in text
     assert "| 2.0 | 2 | 1.00 | 0.0 | 0.0 | 1.00" in text
-    assert "oscillatory: " not in text.partition("## What did not work")[2].partition("## tiny")[0]
+    failures = text.partition("## What did not work")[2].partition("## oscillatory")[0]
+    assert "oscillatory: " not in failures
+    assert "**progress**" not in failures
+    assert "| progress | 2 of 2 | 1.00 | 0.00 | 0.00 | 1.00" in text
     assert (page.with_suffix("") / "arena.png").stat().st_size > 0
     head, _, *rows = first.out.splitlines()
     assert head.split()[:3] == ["set", "learner", "seeds"]
-    assert [row.split()[:3] for row in rows] == [["oscillatory", "2.0", "2"], ["tiny", "2.0", "2"]]
+    assert [row.split()[:3] for row in rows] == [
+        [name, learner, "2"] for name in ("oscillatory", "tiny") for learner in ("progress", "2.0")
+    ]
 
 
 def test_a_trial_that_breaks_is_a_failure_and_the_others_go_on(

@@ -1,15 +1,17 @@
-"""The learners that are compared, each a name for a configuration."""
+"""The learners that are compared, each a name for a configuration.
+
+Beside the progress learner and the paper's own there is the progress learner with every other
+rule for choosing the stream to watch.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+from cdmisfa.agents.progress.config import ATTENTIONS
 from cdmisfa.core.registry import Registry
 from cdmisfa.experiments.sources import configure
-
-ATTENTIONS = ("random", "robin", "novel", "sticky", "gamma", "ucb")
-"""Choosing rules other than the learner's own; see `learner.attention`."""
 
 CONTESTANTS: Registry[tuple[str, ...]] = Registry(
     "learner of the arena",
@@ -18,7 +20,9 @@ CONTESTANTS: Registry[tuple[str, ...]] = Registry(
         "2.0": ("learner.algorithm=2.0",),
         "1.0": ("learner.algorithm=1.0",),
         **{
-            name: ("learner.algorithm=progress", f"learner.attention={name}") for name in ATTENTIONS
+            name: ("learner.algorithm=progress", f"learner.attention={name}")
+            for name in ATTENTIONS
+            if name != "progress"
         },
     },
 )

@@ -101,7 +101,7 @@ def follow(learner: Learner, source: ArenaSource, frames: int, *, goes_on: bool)
     watched: list[tuple[int, int]] = []
     ended = ""
     while source.t < frames:
-        if not goes_on and (ended := ending(learner, len(source.phases), None)):
+        if not goes_on and (ended := ending(learner, learner.max_modules, None)):
             break
         block = source.take(learner.stream, learner.tau)
         learner.step(block)
