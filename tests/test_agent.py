@@ -117,6 +117,27 @@ def test_a_known_block_teaches_nothing_but_time_goes_on(verdict: int) -> None:
     assert bench.memory["iteration"] == memory["iteration"] + 1
 
 
+def test_only_novel_blocks_of_the_stream_of_the_block_before_count_as_staying() -> None:
+    bench = Bench()
+    start = (0.0, 0.9, 0.0)  # to the other stream after the block
+    shares = [bench.step(draws=draws)["share"] for draws in (STAY, start, STAY, STAY)]
+    kept = 1 - 2 / 41
+    assert shares[0] == pytest.approx(kept)  # nothing came before
+    assert shares[1] == pytest.approx(1 - (1 - shares[0]) * kept)
+    assert shares[2] == pytest.approx(shares[1] * kept)
+    assert shares[3] == pytest.approx(1 - (1 - shares[2]) * kept)
+
+
+def test_an_abstraction_that_is_fed_from_changing_streams_is_not_saved() -> None:
+    calm, restless = Bench(delta=1.0), Bench(delta=1.0)
+    for _ in range(80):
+        calm.step(draws=STAY)
+        restless.step(draws=(0.0, 0.9, 0.0))
+    assert ready_to_save(calm.agent, calm.rules)
+    assert not ready_to_save(restless.agent, restless.rules)
+    assert restless.memory["novel_blocks"] == 80
+
+
 def test_the_weight_change_is_compared_with_the_last_novel_block() -> None:
     bench = Bench(warm_up=0)
     bench.step(0.5)

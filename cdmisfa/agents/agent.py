@@ -30,7 +30,7 @@ MEMORY = np.dtype(
         ("scale", "f8"),  # what the sums are divided by to give R; 0 before the first reward
         ("roc_error", "f8"),  # CD-MISFA 1.0: running mean of the clustering error
         ("xi", "f8"),  # mean weight change of the last novel block
-        ("share", "f8"),  # running share of novel blocks
+        ("share", "f8"),  # running share of novel blocks of the stream of the block before
         ("epsilon", "f8"),
         ("idle", "i8"),  # iterations with epsilon practically 0
     ]

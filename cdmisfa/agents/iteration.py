@@ -179,7 +179,8 @@ def think(
     o["curiosity"] = math.nan
     o["expert"] = math.nan
     o["reward"] = math.nan
-    m["share"] += ((1.0 if novel else 0.0) - m["share"]) * 2.0 / (rules.eta_dot_window + 1.0)
+    stayed = novel and m["last_stream"] == stream
+    m["share"] += ((1.0 if stayed else 0.0) - m["share"]) * 2.0 / (rules.eta_dot_window + 1.0)
     if novel:
         m["novel_blocks"] += 1
         o["xi"] = xi

@@ -80,7 +80,7 @@ def track_clusters(agent: Agent, rules: Rules, label: int, y: Float) -> float:
 
 @compiled
 def ready_to_save(agent: Agent, rules: Rules) -> bool:
-    """Whether the abstraction has converged on something alive that it is really fed with."""
+    """Whether the abstraction has converged on something alive, while the agent stays with it."""
     m = agent.memory[0]
     if m["novel_blocks"] <= rules.eta_dot_window or m["share"] < rules.novel_share:
         return False
