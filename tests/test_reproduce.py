@@ -172,13 +172,18 @@ def test_the_page_holds_every_table_and_figure_and_nothing_is_run(
     assert cdmisfa(["reproduce", "-o", str(tmp_path / "none"), "--page", str(page)]) == 2
 
 
-def trials_with(midpoints: dict[float, float]) -> list[Trial]:
+def trials_with(midpoints: dict[float, float], rewarded: int = 100) -> list[Trial]:
+    """Ten trials a sigma and epsilon^c, with blocks rewarded before a change at .86 and later."""
     return [
         Trial(
-            {"key": "sigma", "value": sigma, "epsilon_c": e, "seed": 0},
-            {"policy": nonstationary.NEW if e > midpoint else nonstationary.OLD},
+            {"key": "sigma", "value": sigma, "start": start, "epsilon_c": e, "seed": 0},
+            {
+                "policy": nonstationary.NEW if e > midpoint else nonstationary.OLD,
+                "rewarded": rewarded if e <= 0.86 else 0,
+            },
             {},
         )
+        for start in nonstationary.STARTS
         for sigma, midpoint in midpoints.items()
         for e in nonstationary.CHANGES
         for _ in range(10)
@@ -189,7 +194,32 @@ def test_the_order_of_table_1_is_judged() -> None:
     falling = nonstationary.evaluate(trials_with({0.008: 2.0, 0.0009: 0.85, 0.0: 0.7}))
     assert all(claim.holds for claim in falling.claims)
     rising = nonstationary.evaluate(trials_with({0.008: 0.7, 0.0009: 0.85, 0.0: 0.9}))
-    assert [claim.holds for claim in rising.claims] == [True, True, False]
+    assert [claim.holds for claim in rising.claims] == [False, True, False]
+
+
+def test_a_change_is_judged_only_after_enough_rewarded_blocks() -> None:
+    followed = nonstationary.evaluate(trials_with({0.008: 0.9, 0.0: 0.7})).claims[0]
+    assert followed.holds
+    assert followed.detail == "10 of 10 trials with epsilon^c = 0.86"  # not 1, where 0 came before
+    unfollowed = nonstationary.evaluate(trials_with({0.008: 0.95, 0.0: 0.88})).claims[0]
+    assert not unfollowed.holds
+    notes = nonstationary.evaluate(trials_with({0.008: 0.95, 0.0: 0.7})).notes
+    assert "Above 0.86 they are fewer than 30" in notes[1]
+    assert notes[1].endswith("Epsilon^d lies there at sigma = 0.008.")
+
+
+def test_the_other_start_of_epsilon_has_a_column_of_its_own() -> None:
+    trials = trials_with({0.008: 0.9, 0.0: 0.7})
+    early = [t for t in trials if t.settings["start"] == nonstationary.STARTS[0]]
+    late = trials_with({0.008: 0.8, 0.0: 0.5})
+    late = [t for t in late if t.settings["start"] == nonstationary.STARTS[1]]
+    lines = [line.as_json() for line in nonstationary.evaluate([*early, *late]).lines]
+    head, _, first, share, *_ = reproduce.markdown_table(lines).splitlines()
+    assert head.endswith("| n | epsilon from 1.0 |")
+    ours, other = (float(first.split(" | ")[k].split()[0]) for k in (2, 6))
+    assert ours == pytest.approx(0.915, abs=0.02)
+    assert other == pytest.approx(0.815, abs=0.02)
+    assert share.endswith("| - |")
 
 
 def test_the_icub_trial_watches_learns_and_keeps_what_its_figures_show() -> None:

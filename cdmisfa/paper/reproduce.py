@@ -90,6 +90,7 @@ class Line:
         ours: mean over trials, standard deviation and number of trials.
         interval: 95 % confidence interval, where one was computed.
         digits: decimals to print.
+        others: means and intervals of other readings, by the headings of their columns.
     """
 
     quantity: str
@@ -97,6 +98,7 @@ class Line:
     ours: Summary
     interval: tuple[float, float] | None = None
     digits: int = 3
+    others: Mapping[str, tuple[float, tuple[float, float]]] = field(default_factory=dict)
 
     @classmethod
     def measured(
@@ -128,7 +130,10 @@ class Line:
     def as_json(self) -> dict[str, Any]:
         """The line as results.json has it."""
         known = {"quantity": self.quantity, "paper": self.paper, **asdict(self.ours)}
-        return {**known, "interval": self.interval, "digits": self.digits}
+        others = {
+            name: {"mean": m, "interval": bounds} for name, (m, bounds) in self.others.items()
+        }
+        return {**known, "interval": self.interval, "digits": self.digits, "others": others}
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,11 +328,22 @@ HEAD = ("quantity", "paper", "ours", "SD", "95 % interval", "n")
 
 
 def markdown_table(lines: Sequence[Mapping[str, Any]]) -> str:
-    """The table of results.json as Markdown."""
+    """The table of results.json as Markdown, with a column for every other reading."""
+    others = list(dict.fromkeys(name for line in lines for name in line.get("others", ())))
     rows = []
     for line in lines:
-        values = (line["mean"], line["sd"], *(line["interval"] or ()))
-        mean, sd, *bounds = ("-" if v is None else f"{v:.{line['digits']}f}" for v in values)
+        mean, sd, *bounds = _numbers(line, "mean", "sd")
         interval = " .. ".join(bounds) or "-"
-        rows.append((line["quantity"], line["paper"], mean, sd, interval, line["n"]))
-    return markdown(HEAD, rows) + "\n"
+        row = [line["quantity"], line["paper"], mean, sd, interval, line["n"]]
+        for name in others:
+            other = line.get("others", {}).get(name)
+            value, *bounds = _numbers({**line, **other}, "mean") if other else ("-",)
+            row.append(f"{value} ({' .. '.join(bounds)})" if bounds else value)
+        rows.append(row)
+    return markdown((*HEAD, *others), rows) + "\n"
+
+
+def _numbers(line: Mapping[str, Any], *names: str) -> list[str]:
+    """Values of a line, then the bounds of its interval, as they are printed."""
+    values = (*(line[name] for name in names), *(line["interval"] or ()))
+    return ["-" if v is None else f"{v:.{line['digits']}f}" for v in values]
