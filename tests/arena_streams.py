@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -14,13 +14,17 @@ from cdmisfa.arena.streams import STREAMS, Kind
 SHAPE = (6, 8)
 
 
-def sway(rng: Rng, n: int) -> Shown:
-    """Two patterns that fade slowly, and at once, and one that flickers."""
-    slow = np.sin(2 * np.pi * np.arange(n) / 400 + rng.uniform(0, 6))
-    fast = rng.standard_normal(n)
-    first, second = rng.uniform(-1, 1, (2, *SHAPE))
-    frames = 127 + 60 * slow[:, None, None] * first + 20 * fast[:, None, None] * second
-    return Shown(pixels(frames), slow[:, None], ("slow",))
+def fading(patterns: int) -> Callable[[Rng, int], Shown]:
+    """A pattern that comes and goes slowly, and one that flickers."""
+    slow_one, fast_one = np.random.default_rng(patterns).uniform(-1, 1, (2, *SHAPE))
+
+    def make(rng: Rng, n: int) -> Shown:
+        slow = np.sin(2 * np.pi * np.arange(n) / 400 + rng.uniform(0, 6))
+        fast = rng.standard_normal(n)
+        frames = 127 + 60 * slow[:, None, None] * slow_one + 20 * fast[:, None, None] * fast_one
+        return Shown(pixels(frames), slow[:, None], ("slow",))
+
+    return make
 
 
 def hiss(rng: Rng, n: int) -> Shown:
@@ -34,11 +38,12 @@ def blank(rng: Rng, n: int) -> Shown:
 
 
 KINDS = {
-    "sway": Kind(sway),
-    "swing": Kind(sway),
+    "sway": Kind(fading(0)),
+    "echo": Kind(fading(0)),
+    "swing": Kind(fading(1)),
     "hiss": Kind(hiss, learnable=False),
     "blank": Kind(blank, learnable=False),
-    "short": Kind(lambda rng, n: sway(rng, 400), loops=True),
+    "short": Kind(lambda rng, n: fading(2)(rng, 400), loops=True),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -81,25 +81,36 @@ def allowed(stream: Stream, reference: Reference) -> float:
     return reference.slowness * (SLOW_ENOUGH_LOOPED if stream.loops else SLOW_ENOUGH)
 
 
-def learned_by(
-    saved: Sequence[Saved], outputs: Sequence[Output], stream: Stream, reference: Reference
-) -> list[int]:
-    """Which modules are of a stream: slow enough on it, and learned on it or on its like.
+def learned(
+    saved: Sequence[Saved],
+    output: Callable[[int, str], Output],
+    streams: Mapping[str, Stream],
+    references: Mapping[str, Reference],
+) -> dict[str, list[int]]:
+    """The modules of each learnable signal: those that were learned on it and are slow enough.
 
-    Where there is none, those count that were learned on another stream and whose output on this
-    one is that of batch SFA.
+    Where there is none, those count that are slow enough where they were learned and on this
+    signal, too, and whose output on it is that of batch SFA.
 
     Args:
-        saved: the modules.
-        outputs: the slowest of each on the stream's held-out frames.
-        stream: the stream.
-        reference: what batch SFA found in it.
+        saved: the modules, in order.
+        output: the slowest output of a module, by its place, on a signal's held-out frames.
+        streams: by signal.
+        references: by signal, of the learnable ones.
     """
-    answer = reference.slowest.transform(stream.held_out)[:, 0]
-    limit = allowed(stream, reference)
-    slow = [k for k, output in enumerate(outputs) if output.slowness <= limit]
-    own = [k for k in slow if saved[k].signal == stream.name]
-    return own or [k for k in slow if correlation(outputs[k].values, answer) > KNOWS]
+
+    def slow(k: int, name: str) -> bool:
+        return output(k, name).slowness <= allowed(streams[name], references[name])
+
+    def knows(k: int, name: str) -> bool:
+        answer = references[name].slowest.transform(streams[name].held_out)[:, 0]
+        return slow(k, name) and correlation(output(k, name).values, answer) > KNOWS
+
+    sound = [k for k, one in enumerate(saved) if one.learnable and slow(k, one.signal)]
+    return {
+        name: [k for k in sound if saved[k].signal == name] or [k for k in sound if knows(k, name)]
+        for name in references
+    }
 
 
 def doubles(saved: Sequence[Saved], output: Callable[[int, str], Output]) -> list[int]:

@@ -28,7 +28,8 @@ COLUMNS: Final = 4
 """Panels beside each other."""
 
 HEAD: Final = (
-    "learner", "seeds", "learned", "not learnable", "twice", "ends", "blocks", "all learned", "R²"
+    "learner", "seeds", "learned", "modules", "not learnable", "twice", "ends", "blocks",
+    "all learned", "R²",
 )  # fmt: skip
 
 TOLD: Final = ("learner", "stream", "outputs", "R²", "of components")
@@ -43,9 +44,10 @@ DEFINITIONS: Final = f"""\
   many components, fitted on all {LEARNED_FROM:,} frames that the stream consists of
   ({SLOW_ENOUGH_LOOPED} times for clips and recordings that loop, which are judged on themselves;
   their cut is shown to batch SFA, too). The {HELD_OUT:,} frames that follow are held out. Where no
-  module was learned on a stream, one learned on another counts if its output there is that of
-  batch SFA (correlation above {KNOWS:g}).
-- *Not learnable*: modules a run saved on streams that have nothing slow. There should be none.
+  module was learned on a stream, one that was learned on another, and slow enough there, counts
+  if it is so here and its output is that of batch SFA (correlation above {KNOWS:g}).
+- *Modules*: how many a run saved; *not learnable*: how many of them on streams that have nothing
+  slow. There should be none.
 - *Twice*: modules a run saved on a stream that had one already and still shows the same, or on
   the same stream shown once more, if the outputs are the same (correlation above {THE_SAME:g}).
 - *Ends*: the share of runs that ended by themselves; *blocks*: after how many, of those that did.
@@ -78,6 +80,7 @@ def _cells(entry: Entry) -> list[str]:
         entry["point"]["learner"],
         f"{trials}{failed}",
         _within(m["learned"], 2, highest=1.0),
+        _within(m["modules"], 1),
         _within(m["wrong"], 1),
         _within(m["doubles"], 1),
         _within(m["ended"], 2),

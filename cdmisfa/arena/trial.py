@@ -18,7 +18,7 @@ from cdmisfa.arena.measures import (
     Saved,
     allowed,
     doubles,
-    learned_by,
+    learned,
     probe,
     slowest,
 )
@@ -143,13 +143,7 @@ def judge(
     def output(k: int, signal: str) -> Output:
         return slowest(history.saved[k].module, source.streams[signal].held_out)
 
-    modules = range(len(history.saved))
-    of_signal = {
-        name: learned_by(
-            history.saved, [output(k, name) for k in modules], source.streams[name], reference
-        )
-        for name, reference in references.items()
-    }
+    of_signal = learned(history.saved, output, source.streams, references)
     return {
         "frames": history.frames,
         "blocks": len(history.watched),
