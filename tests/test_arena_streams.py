@@ -128,7 +128,7 @@ def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
     stamp = (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns
     library(tmp_path, "sway")
     assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns == stamp
-    monkeypatch.setattr("cdmisfa.arena.library.RECIPE", 2)
+    monkeypatch.setattr("cdmisfa.arena.library.RECIPE", 0)
     again = library(tmp_path, "sway").stream("sway", 0).frames
     assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns > stamp
     np.testing.assert_array_equal(again, frames)

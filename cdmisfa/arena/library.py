@@ -23,7 +23,7 @@ from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from recorder.log.whole import whole
 
-RECIPE: Final = 1
+RECIPE: Final = 2
 """Rises when streams are made in another way, so that those on disk are made anew."""
 
 Float = NDArray[np.float64]

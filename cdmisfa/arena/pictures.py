@@ -111,7 +111,10 @@ def light(rng: Rng, n: int) -> Shown:
 
 def waves(rng: Rng, n: int) -> Shown:
     """A grating that drifts to and fro, under the flicker of another that jumps about."""
-    phase = np.cumsum(rng.normal(0, 0.06, n))
+    speed = np.zeros(n)
+    for t in range(1, n):
+        speed[t] = 0.98 * speed[t - 1] + 0.2 * rng.normal(0, 0.1)
+    phase = np.cumsum(speed)
     jumps = rng.uniform(0, 2 * np.pi, n)
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     slow, fast = 2 * np.pi * x / 32, 2 * np.pi * y / 16
