@@ -26,6 +26,13 @@ GREY: Rgb = (136, 136, 136)
 CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
 """Colours of things that are counted: streams, modules."""
 
+SAND: Rgb = (190, 180, 130)
+WHITE: Rgb = (240, 240, 240)
+MIST: Rgb = (165, 180, 195)
+DARK: Rgb = (85, 85, 85)
+
+STATES: tuple[Rgb, ...] = (SAND, WHITE, MIST, DARK)
+"""Colours of what became of a stream: learning, learned, known, given up; none is a stream's."""
 
 STEPS = 255
 """Shades between white and a full colour: as many as eight bits can tell apart."""

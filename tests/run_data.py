@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -132,15 +132,21 @@ def write_run(
     tau: int = 40,
     seed: int = 0,
     saves: bool = False,
+    learner: Mapping[str, Any] | None = None,
+    edit: Callable[[BlockSignals], BlockSignals] = lambda signals: signals,
     **options: Any,
 ) -> list[BlockSignals]:
-    """Write such a run to a file and return its records."""
-    config = {"learner": {"tau": tau, "delta": DELTA}}
+    """Write such a run to a file and return its records.
+
+    Its manifest has the keys `learner.*` of `learner`; `edit` is done to each record before.
+    """
+    config = {"learner": {"tau": tau, "delta": DELTA, **(learner or {})}}
     manifest = {"config": config, "seed": seed, "source": {"kind": "test"}}
     writer = RunWriter(path, spec, manifest, **options)
     phi_size = int(np.prod(spec.frame_shape))
     records = []
-    for signals, block in run_of(spec, iterations, tau=tau, seed=seed, saves=saves):
+    for made, block in run_of(spec, iterations, tau=tau, seed=seed, saves=saves):
+        signals = edit(made)
         phi = np.full((1, phi_size), float(signals.iteration))
         writer.block(block, signals, having(phi))
         records.append(signals)

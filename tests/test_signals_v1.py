@@ -24,7 +24,8 @@ from replay.runs.log import read_header
 from replay.runs.messages import decode_signals, encode_signals
 from replay.runs.outline import read_outline
 from replay.runs.writer import RunWriter
-from replay.view import layout
+from replay.view.layouts import panels
+from replay.view.layouts.of_run import run_layout
 
 OLD = Path(__file__).parent / "data" / "signals_v1"
 SIGNALS_SHA256 = "b86ab92af6b8ba255cb239dd54c187a1adbdccc9b43f096a348ad4f83bd85a2f"
@@ -161,15 +162,18 @@ def test_sizes_without_values_allocate_nothing() -> None:
 def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Titles in the gate's tab of a run's layout."""
     tabs: list[Any] = []
-    monkeypatch.setattr(layout, "blueprint", lambda *found, **_: tabs.extend(found))
-    layout.RunLayout(read_outline(run)).blueprint()
+    monkeypatch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
+    run_layout(read_outline(run))
     (gate,) = [tab for tab in tabs if tab.name == "Gate"]
     return [view.name for view in gate.contents]
 
 
-def test_the_gate_of_1_0_shows_its_clusters(monkeypatch) -> None:
-    assert gate_of(OLD, monkeypatch)[1:] == [
+def test_the_gate_of_1_0_shows_its_clusters_where_the_log_has_them(monkeypatch, tmp_path) -> None:
+    assert gate_of(OLD, monkeypatch)[1:] == ["Share of novel blocks"]
+    write_run(tmp_path / "run.mcap", VECTOR, 3, learner={"algorithm": "1.0", "roc_error": 3.0})
+    assert gate_of(tmp_path, monkeypatch)[1:] == [
         "Clustering error by module 1: known below 3",
+        "Clustering error by module 2: known below 3",
         "Clustering error of the block, and its mean: saved below 3",
         "Share of novel blocks",
     ]

@@ -21,10 +21,11 @@ from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
-from replay.view import layout
 from replay.view import run as run_view
 from replay.view.build import build_view
 from replay.view.columns import TensorBatch
+from replay.view.layouts.panels import Panels
+from replay.view.layouts.paper import feels
 from replay.view.summary import summary_text
 
 REPLAY = Path(__file__).parents[1] / "replay"
@@ -207,7 +208,7 @@ def test_the_share_of_the_recent_blocks_is_there(shown, monkeypatch):
 
 def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
     written = write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS)
-    text = summary_text(read_outline(tmp_path), "run", "It ended: nothing was left.")
+    text = summary_text(read_outline(tmp_path), "run", ["ended: nothing was left"])
     last = [s for s in written if s.module == written[-1].module]
     assert f"Module {last[0].module} was not saved: " in text
     assert f"of its {len(last)} blocks" in text
@@ -223,13 +224,13 @@ def test_the_file_has_a_layout_and_properties(shown):
 
 
 def test_the_overview_of_the_first_version_shows_its_clustering_error(tmp_path):
-    write_run(tmp_path / "run.mcap", VECTOR, 3)
-    outline = read_outline(tmp_path)
     names = {}
     for algorithm in ("1.0", "2.0"):
+        run = tmp_path / algorithm
+        run.mkdir()
         table = {"algorithm": algorithm, "roc_error": 0.25}
-        header = dataclasses.replace(outline.header, manifest={"config": {"learner": table}})
-        view = layout.RunLayout(dataclasses.replace(outline, header=header))._feels()
+        write_run(run / "run.mcap", VECTOR, 3, learner=table)
+        (view,) = feels(Panels(read_outline(run)))
         names[algorithm] = view.name
     assert "clustering error's mean is below 0.25" in names["1.0"]
     assert "below δ" in names["2.0"]

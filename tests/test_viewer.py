@@ -16,9 +16,9 @@ from PIL import Image
 from run_data import IMAGE, VECTOR, read_signals, run_of, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from replay.view import layout
 from replay.view.bindings import viewer_program
 from replay.view.build import build_view
+from replay.view.layouts import panels
 from replay.viewer import display, headless, window
 from replay.viewer.program import check_limit, environment, run_program
 
@@ -63,7 +63,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(tmp_path
         tabs.extend(views)
         return rrb.Blueprint(rrb.Grid(*views), auto_views=False, auto_layout=False)
 
-    monkeypatch.setattr(layout, "blueprint", side_by_side)
+    monkeypatch.setattr(panels, "blueprint", side_by_side)
     build_view(tmp_path, tmp_path / "run.rrd")
     assert len(tabs) == 6
     with headless.headless_viewer("2400x1600") as opened:

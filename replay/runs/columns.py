@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.signals import SIGNALS, BlockSignals, Signal
+from cdmisfa.core.signals import NO_STATE, SIGNALS, BlockSignals, Signal
 from replay.mcap.records import MalformedRecord
 from replay.runs.messages import NUMBERS, alike, column, spans
 
@@ -59,6 +59,13 @@ class SignalColumns:
             return self.frames, self.iterations
         every = (self.frames[:, None] + np.arange(self.tau)).reshape(-1)
         return every, np.repeat(self.iterations, self.tau)
+
+
+def told(name: str, values: NDArray[Any]) -> bool:
+    """Whether a signal's values are not all missing."""
+    if values.dtype.kind == "f":
+        return not bool(np.isnan(values).all())
+    return values.size > 0 and (SIGNALS[name].since == 1 or bool((values != NO_STATE).any()))
 
 
 def joined(pieces: Iterable[SignalColumns], names: Sequence[str]) -> dict[str, NDArray[Any]]:

@@ -49,6 +49,11 @@ class RunHeader:
         value = self.setting("learner", "delta")
         return float(value) if isinstance(value, int | float) else None
 
+    @property
+    def by_progress(self) -> bool:
+        """Whether it is a run of the progress learner."""
+        return bool(self.setting("learner", "algorithm") == "progress")
+
     def setting(self, section: str, key: str) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`, or None."""
         config = self.manifest.get("config")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.runs.columns import SignalColumns
+from cdmisfa.core.signals import NO_STATE, SIGNALS
+from replay.runs.columns import SignalColumns, told
 from replay.runs.log import RunHeader, read_header
 from replay.runs.stretches import read_columns
 
 Float = NDArray[np.float64]
 
-LINES = ("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon")
+LINES = (
+    *("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon"),
+    *("change", "tested", "fitted", "learning_error", "interest"),
+)
 """Signals whose values are kept for every iteration, to choose ranges from."""
 
 
@@ -59,7 +64,9 @@ class Outline:
         visits: (S,) frames each stream was watched.
         saved: the saves, in order.
         last: the time since the last save.
-        lines: for each name of `LINES` its values, (n,) or (n J,).
+        lines: for each name of `LINES` its values, (n,) or flattened.
+        told: names of the signals that have a value anywhere in the run.
+        states: (S,) what became of each stream, by codes as in the signal `state`.
     """
 
     header: RunHeader
@@ -72,6 +79,8 @@ class Outline:
     saved: tuple[Saved, ...]
     last: Phase | None
     lines: dict[str, Float]
+    told: frozenset[str]
+    states: tuple[int, ...]
 
     def streams(self, most: int) -> list[int]:
         """The most watched streams, at most so many, in their own order."""
@@ -82,10 +91,18 @@ class Outline:
         """Names of the streams."""
         return self.header.spec.streams
 
-    def span(self, *names: str, low: float | None = None) -> tuple[float, float] | None:
-        """A range, beginning at `low`, that shows these lines without their wildest values."""
+    def span(
+        self, *names: str, low: float | None = None, below: float = math.inf
+    ) -> tuple[float, float] | None:
+        """A range that shows these lines without their wildest values.
+
+        Args:
+            names: of the lines.
+            low: where it begins, whatever they are.
+            below: values from here on are left out.
+        """
         values = np.concatenate([self.lines[name] for name in names])
-        values = values[np.isfinite(values)]
+        values = values[np.isfinite(values) & (values < below)]
         if not len(values):
             return None
         lower, upper = (float(v) for v in np.percentile(values, (1.0, 98.0)))
@@ -104,6 +121,8 @@ class Tally:
         self._saved: list[Saved] = []
         self._iterations = self._modules = self._tau = self._outputs = 0
         self._last: Phase | None = None
+        self._told: set[str] = set()
+        self._states: tuple[int, ...] = (NO_STATE,) * len(self._visits)
 
     def add(self, columns: SignalColumns) -> None:
         """Take the next records in."""
@@ -115,6 +134,8 @@ class Tally:
         self._saved += [_save_of(columns, i) for i in np.flatnonzero(columns["saved"]).tolist()]
         self._iterations += len(columns)
         self._last = self._phase(columns)
+        self._told |= {name for name in SIGNALS.keys() - self._told if told(name, columns[name])}
+        self._states = tuple(columns["state"][-1].tolist())
 
     def _phase(self, columns: SignalColumns) -> Phase:
         """The last abstraction's phase, as far as it has come."""
@@ -144,6 +165,8 @@ class Tally:
             lines={
                 name: np.concatenate([np.empty(0), *parts]) for name, parts in self._lines.items()
             },
+            told=frozenset(self._told),
+            states=self._states,
         )
 
 

@@ -19,7 +19,14 @@ from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
 from replay.mcap.reader import LogReader
 from replay.runs.columns import columns_of_messages
 from replay.runs.folders import RUN_METADATA
-from replay.runs.log import EVENT_TOPIC, PHI_TOPIC, SIGNALS_TOPIC, TRUTH_TOPIC, WATCHED_TOPIC
+from replay.runs.log import (
+    EVENT_TOPIC,
+    PHI_TOPIC,
+    SIGNALS_TOPIC,
+    TRUTH_TOPIC,
+    WATCHED_TOPIC,
+    RunHeader,
+)
 from replay.runs.messages import (
     MATRIX_SCHEMA,
     SCHEMAS,
@@ -50,7 +57,8 @@ class RunWriter(Sink):
         manifest: what the run was started with, see `RunHeader`, as JSON values.
         force: overwrite what is there.
         watched_every: keep every this many frames of images; vectors are all kept.
-        phi_every: keep the weights every this many iterations, and on each save.
+        phi_every: keep the weights every this many iterations, on each save, and where a learner
+            that has weights of each stream goes on to another one.
 
     Raises:
         UsageError: the file exists and `force` is not set.
@@ -70,6 +78,7 @@ class RunWriter(Sink):
         self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
         self._phi_every = max(phi_every, 1)
+        self._by_progress = RunHeader(SCHEMA_VERSION, spec, manifest).by_progress
         # Learning runs faster than log time: flushing every second of log time would be too
         # often, so the wall clock decides. Of images zstd leaves a tenth less than lz4, and
         # takes twice as long.
@@ -114,7 +123,8 @@ class RunWriter(Sink):
         else:
             frames = block.frames.reshape(len(block), -1)
             self._write(WATCHED_TOPIC, at, k, encode_matrix(block.t, frames))
-        if k % self._phi_every == 0 or signals.saved:
+        other = self._by_progress and signals.action == 1
+        if k % self._phi_every == 0 or signals.saved or other:
             phi = weights_after(signals, learner)
             self._write(PHI_TOPIC, at, k, encode_matrix(block.t, phi))
         if time.monotonic() >= self._next_flush:

@@ -21,14 +21,12 @@ from replay.runs.modules import load_modules
 from replay.runs.outline import Tally, read_outline
 from replay.runs.stretches import read_stretches
 from replay.view.labels import label
-from replay.view.layout import MOST_STREAMS, RunLayout
+from replay.view.layouts.of_run import run_layout
+from replay.view.layouts.panels import MOST_STREAMS
 from replay.view.properties import APPLICATION, identity, properties_of, property_chunks
 from replay.view.recording import write_recording, write_unwatched
 from replay.view.run import RunView
 from replay.view.summary import summary_text
-
-ENDED = "ended:"
-"""How the event begins that says why a run ended."""
 
 FLUSH_SECONDS = 60.0
 
@@ -127,26 +125,21 @@ def _write_run(
     streams = list(range(len(header.spec.streams)))
     if len(streams) > MOST_STREAMS:  # which are watched most is known at the end only
         streams = read_outline(log).streams(MOST_STREAMS)
-    tally, view, ended = Tally(header), RunView(recording, header, streams, every), ""
+    tally, view = Tally(header), RunView(recording, header, streams, every)
+    events: list[str] = []
     for stretch in read_stretches(log, header, every=every):
         for columns in stretch.signals:
             tally.add(columns)
         view.take(stretch)
-        ended = next((e.text for e in stretch.events if e.text.startswith(ENDED)), ended)
+        events += [event.text for event in stretch.events]
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
     # Not as `AnyValues`, which lose a value of another type than the process's first of its name.
     recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
-    text = label(summary_text(outline, _name(log), _sentence(ended)))
+    text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, every)
-    layout = RunLayout(outline, all_views=all_views is not None, head=head)
-    recording.send_blueprint(layout.blueprint())
-
-
-def _sentence(ended: str) -> str:
-    reason = ended.removeprefix(ENDED).strip()
-    return f"It ended: {reason}." if reason else ""
+    recording.send_blueprint(run_layout(outline, all_views=all_views is not None, head=head))
 
 
 def _name(log: Path) -> str:

@@ -57,14 +57,21 @@ def time_columns(
 class Column:
     """One entity's rows of numbers, waiting to be handed over.
 
+    Until there is a number that is not NaN, rows do not wait longer than others, and are then
+    dropped: of what a run does not tell there is no entity.
+
     Args:
         recording: where they go.
         spec: of the source, for the log time of a frame.
         path: the entity.
+        style: what is said of it once.
     """
 
-    def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, path: str) -> None:
+    def __init__(
+        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, style: Any = None
+    ) -> None:
         self.path = path
+        self._style, self._begun = style, False
         self._recording = recording
         self._spec = spec
         self._frames: list[Frames] = []
@@ -88,10 +95,14 @@ class Column:
 
     def flush(self) -> None:
         """Hand over what waits."""
-        if self._waiting:
+        values = _joined(self._values) if self._waiting else np.empty(0)
+        if self._waiting and (self._begun or not _missing(values)):
+            if self._style is not None and not self._begun:
+                self._recording.log(self.path, self._style, static=True)
+            self._begun = True
             iterations = _joined(self._iterations) if self._iterations else None
             times = time_columns(self._spec, _joined(self._frames), iterations)
-            self.send(times, _joined(self._values))
+            self.send(times, values)
         self._frames, self._iterations, self._values = [], [], []
         self._waiting = self._bytes = 0
 
@@ -99,6 +110,10 @@ class Column:
         """Hand (n, ...) values over as rows of scalars."""
         table = np.array(values, dtype=np.float64).reshape(len(values), -1)
         self._recording.send_columns(self.path, times, rr.Scalars.columns(scalars=table))
+
+
+def _missing(values: NDArray[Any]) -> bool:
+    return values.dtype.kind == "f" and bool(np.isnan(values).all())
 
 
 def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
@@ -119,8 +134,7 @@ def line_column(
         colors=packed_all(rgbs or [colour(i) for i in range(len(names))]),
         widths=None if width is None else [width] * len(names),
     )
-    recording.log(path, style, static=True)
-    return Column(recording, spec, path)
+    return Column(recording, spec, path, style)
 
 
 def frames_column(
@@ -137,12 +151,11 @@ class ImageColumn(Column):
     """Images of a source, (n, height, width) grey."""
 
     def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, path: str) -> None:
-        super().__init__(recording, spec, path)
         height, width = spec.frame_shape
         form = rr.components.ImageFormat(
             width=width, height=height, color_model="L", channel_datatype="U8"
         )
-        recording.log(path, rr.Image.from_fields(format=form), static=True)
+        super().__init__(recording, spec, path, rr.Image.from_fields(format=form))
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand n images over."""

@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.signals import ACTIONS
+from cdmisfa.core.signals import ACTIONS, STATES
 from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
@@ -20,9 +20,12 @@ from replay.view.labels import label, part
 NameOf = Callable[[int], tuple[str, Rgb]]
 """The state that a code stands for, and its colour."""
 
+Codes = NDArray[np.int64]
+
 STAY, SWITCH = ACTIONS
 
 _NOVEL = -1
+_KNOWN = STATES.index("known")
 
 
 class Lanes:
@@ -31,38 +34,62 @@ class Lanes:
     Args:
         recording: where they go.
         spec: of the source.
-        shown: the streams whose policy gets a lane.
+        shown: the streams that get a lane of their own: of the policy, or of the stream's state.
+        by_progress: the run is one of the progress learner, which has no gate.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, spec: SourceSpec, shown: Sequence[int]
+        self,
+        recording: rr.RecordingStream,
+        spec: SourceSpec,
+        shown: Sequence[int],
+        *,
+        by_progress: bool = False,
     ) -> None:
         names: dict[str, NameOf] = {
             "lanes/1_stream": lambda stream: (label(spec.streams[stream]), colour(stream)),
-            "lanes/2_learning": lambda module: (f"module {module}", colour(module - 1)),
-            "lanes/3_gate": _verdict,
-            "lanes/4_action": _action,
-            "lanes/5_chosen_by": _chosen,
         }
-        self._policies = {s: f"policy/{part(spec.streams, s)}" for s in shown}
-        names |= {path: partial(_planned, stream=s) for s, path in self._policies.items()}
+        self._known_by = np.zeros(len(spec.streams), dtype=np.int64)
+        kind = "streams/state" if by_progress else "policy"
+        self._of_stream = {s: f"{kind}/{part(spec.streams, s)}" for s in shown}
+        if by_progress:
+            self._codes = self._became
+            names |= dict.fromkeys(self._of_stream.values(), _became)
+        else:
+            self._codes = self._decided
+            names |= _GATED
+            names |= {path: partial(_planned, stream=s) for s, path in self._of_stream.items()}
         self._lanes = {p: Lane(recording, spec, p, name) for p, name in names.items()}
         self._iteration = 0
 
     def add(self, columns: SignalColumns) -> None:
         """Take the states of consecutive iterations in."""
         self._iteration = int(columns.iterations[-1])
-        verdicts = np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0))
+        codes = {"lanes/1_stream": columns["stream"]} | self._codes(columns)
+        for path, lane in self._lanes.items():
+            lane.add(columns, codes[path])
+
+    def _decided(self, columns: SignalColumns) -> dict[str, Codes]:
+        """What CD-MISFA does and decides."""
         codes = {
-            "lanes/1_stream": columns["stream"],
             "lanes/2_learning": columns["module"],
-            "lanes/3_gate": verdicts,
+            "lanes/3_gate": np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0)),
             "lanes/4_action": columns["action"],
             "lanes/5_chosen_by": columns["explored"],
         }
-        codes |= {path: columns["policy"][:, s] for s, path in self._policies.items()}
-        for path, lane in self._lanes.items():
-            lane.add(columns, codes[path])
+        return codes | {path: columns["policy"][:, s] for s, path in self._of_stream.items()}
+
+    def _became(self, columns: SignalColumns) -> dict[str, Codes]:
+        """What became of each stream; where it is known, by which module."""
+        codes: dict[str, Codes] = {}
+        for s, path in self._of_stream.items():
+            known = columns["state"][:, s] == _KNOWN
+            told = known & (columns["stream"] == s) & (columns["known_by"] > 0)
+            last = np.maximum.accumulate(np.where(told, np.arange(len(told)), -1))
+            module = np.where(last < 0, self._known_by[s], columns["known_by"][last])
+            self._known_by[s] = module[-1]
+            codes[path] = np.where(known, len(STATES) + module, columns["state"][:, s])
+        return codes
 
     def end(self, frames: int) -> None:
         """Write what is left; all lanes end with the run.
@@ -150,3 +177,20 @@ def _chosen(explored: int) -> tuple[str, Rgb]:
 
 def _planned(action: int, stream: int) -> tuple[str, Rgb]:
     return (SWITCH, palette.GREY) if action else (STAY, colour(stream))
+
+
+def _became(code: int) -> tuple[str, Rgb]:
+    """A stream's state by its code in `STATES`; beyond them stand the modules that know it."""
+    if code >= len(STATES):
+        module = code - len(STATES)
+        return f"known by {module}" if module else "known", palette.STATES[_KNOWN]
+    return STATES[code].replace("_", " "), palette.STATES[code]
+
+
+_GATED: dict[str, NameOf] = {
+    "lanes/2_learning": lambda module: (f"module {module}", colour(module - 1)),
+    "lanes/3_gate": _verdict,
+    "lanes/4_action": _action,
+    "lanes/5_chosen_by": _chosen,
+}
+"""Lanes of CD-MISFA."""

@@ -19,7 +19,7 @@ from replay.runs.outline import Outline
 from replay.view.columns import FRAME, frames_column, line_column
 from replay.view.heads import gaze, write_gaze, write_heads
 from replay.view.labels import label, part
-from replay.view.layout import blueprint, lines, time_axis
+from replay.view.layouts.panels import blueprint, lines, time_axis
 
 BLOCK = 500
 """Frames that are read at once."""

@@ -1,8 +1,8 @@
 """A run as rows of a Rerun recording: every signal as it is, and what eyes need besides.
 
 `/signals/<name>` holds each signal's values for every iteration, read back they are
-those of run.mcap. `/world`, `/lanes`, `/decision`, `/gate`, `/abstraction` and
-`/modules` show the same for a person.
+those of run.mcap; of a signal that the run never tells there is nothing. `/world`, `/lanes`,
+`/decision`, `/gate`, `/abstraction`, `/streams` and `/modules` show the same for a person.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, Signal
 from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, shade
-from replay.runs.columns import SignalColumns
+from replay.runs.columns import SignalColumns, told
 from replay.runs.log import RunHeader
 from replay.runs.outline import Outline
 from replay.runs.stretches import Stretch
@@ -34,6 +34,7 @@ from replay.view.columns import (
 )
 from replay.view.labels import label, part
 from replay.view.lanes import Lanes
+from replay.view.streams import add_streams, thresholds
 
 AXES = {"S": "stream", "A": "action", "J": "output"}
 """Names of tensors' dimensions; the second S of a tensor is the next stream."""
@@ -70,14 +71,17 @@ class RunView:
         self, recording: rr.RecordingStream, header: RunHeader, streams: Sequence[int], every: int
     ) -> None:
         self._recording = recording
-        self._delta = header.delta
+        self._by_progress = header.by_progress
+        self._thresholds = thresholds(header) if header.by_progress else {}
+        if header.delta is not None:
+            self._thresholds["abstraction/delta"] = "δ threshold", header.delta
         self._every = every
         self._spec = header.spec
         self._columns: dict[str, Column] = {}
         self._streams = streams
         self._tau = 1
         self._recent = np.zeros((0, len(streams)), dtype=bool)
-        self._lanes = Lanes(recording, self._spec, streams)
+        self._lanes = Lanes(recording, self._spec, streams, by_progress=header.by_progress)
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
@@ -116,6 +120,8 @@ class RunView:
         self._decision(columns)
         self._gate(columns)
         self._saved(columns)
+        if self._by_progress:
+            add_streams(columns, self._spec.streams, self._streams, self._line)
         self._lanes.add(columns)
 
     def _watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
@@ -145,10 +151,10 @@ class RunView:
         self._recording.log("events", rr.TextLog(label(text), level=level))
 
     def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
-        """Draw the line that eta-dot must fall below, through these frames."""
-        if self._delta is not None:
-            line = self._line("abstraction/delta", ["δ threshold"], rgbs=[GREY])
-            line.add(frames, iterations, np.full((len(frames), 1), self._delta))
+        """Draw the lines below which something is learned, through these frames."""
+        for path, (name, value) in self._thresholds.items():
+            line = self._line(path, [name], rgbs=[GREY])
+            line.add(frames, iterations, np.full((len(frames), 1), value))
 
     def flush(self) -> None:
         """Hand over everything that waits."""
@@ -163,6 +169,8 @@ class RunView:
             if signal.name in TIMELINE_SIGNALS:
                 continue
             value, path = columns[signal.name], f"signals/{signal.name}"
+            if value.dtype.kind == "i" and not told(signal.name, value):
+                continue
             frames, iterations = columns.times("T" in signal.dims)
             if signal.show == "heat":
                 self._tensor(signal, path, columns, value)
@@ -227,12 +235,14 @@ class RunView:
             )
 
     def _saved(self, columns: SignalColumns) -> None:
-        """Where eta-dot stood when a module was saved."""
-        saved = columns["saved"]
+        """Where that which must come down stood when a module was saved."""
+        saved, told_by = columns["saved"], ("abstraction/saved", "eta_dot")
+        if self._by_progress:
+            told_by = ("streams/saved", "learning_error")
         if saved.any():
-            marks = self._column("abstraction/saved", _marks)
-            eta_dot = columns["eta_dot"][saved, :1]
-            marks.add(columns.frames[saved], columns.iterations[saved], eta_dot)
+            path, name = told_by
+            stood = columns[name][saved].reshape(int(saved.sum()), -1)[:, :1]
+            self._column(path, _marks).add(columns.frames[saved], columns.iterations[saved], stood)
 
     def _picture(self, phi: NDArray[np.float64]) -> Any:
         """(J, I) weights as images below one another, as bars, or as a tensor."""
@@ -277,8 +287,7 @@ def _marks(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column
     style = rr.SeriesPoints(
         colors=[packed(VERMILLION)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
     )
-    recording.log(path, style, static=True)
-    return Column(recording, spec, path)
+    return Column(recording, spec, path, style)
 
 
 def _labels(signal: Signal, module: int, outputs: int) -> list[str]:

@@ -2,24 +2,55 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
+from cdmisfa.core.signals import STATES
 from replay.runs.outline import Outline
-from replay.view.layout import MOST_STREAMS
+from replay.view.layouts.panels import MOST_STREAMS
+
+ENDED = "ended:"
+"""How the event begins that says why a run ended."""
+
+TOLD = ("nu", "tau", "sigma", "components", "window", "attention")
+"""Settings of the learner that are told, where it has them."""
 
 NAMED = 4
 """Most streams whose names are given together."""
 
 
-def summary_text(outline: Outline, name: str, ended: str = "") -> str:
-    """What was learned, when, and where the robot stayed for it, as Markdown.
+def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str:
+    """What was learned, when, and where the learner stayed for it, as Markdown.
 
     Args:
         outline: the run in short.
         name: of the run.
-        ended: why it ended, where that is known.
+        events: what happened in it, in words.
     """
     header = outline.header
-    spec = header.spec
     lines = [f"## {name}", _opening(outline), ""]
+    lines += _of_streams(outline, events) if header.by_progress else _of_modules(outline)
+    reasons = [text.removeprefix(ENDED).strip() for text in events if text.startswith(ENDED)]
+    lines += [f"It ended: {reason}.\n" for reason in reasons[-1:] if reason]
+    if not header.by_progress:
+        lines += ["| stream | watched |", "|---|---|"]
+        for s in outline.streams(MOST_STREAMS):
+            share = outline.visits[s] / max(outline.frames, 1)
+            lines.append(f"| {outline.names()[s]} | {outline.visits[s]} frames, {share:.0%} |")
+        lines.append("")
+    settings = [("seed", header.manifest.get("seed"))]
+    settings += [(key, header.setting("learner", key)) for key in TOLD]
+    settings += [("delta", header.delta)]
+    said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
+    lines += [said, ""]
+    if header.missing:
+        lines.append(f"Signals of version {header.schema}, without {', '.join(header.missing)}.")
+    return "\n".join(lines)
+
+
+def _of_modules(outline: Outline) -> list[str]:
+    """The modules of a run of CD-MISFA, and the one that was not saved."""
+    spec, lines = outline.header.spec, []
     if outline.saved:
         lines += [
             "| module | stream | iteration | η [1/frame] | policy |",
@@ -32,20 +63,27 @@ def summary_text(outline: Outline, name: str, ended: str = "") -> str:
                 f"| {policy_text(save.policy, spec.streams)} |"
             )
         lines.append("")
-    for text in (_unfinished(outline), ended):
-        lines += [text, ""] if text else []
-    lines += ["| stream | watched |", "|---|---|"]
+    unfinished = _unfinished(outline)
+    return [*lines, unfinished, ""] if unfinished else lines
+
+
+def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
+    """What became of each stream in a run of the progress learner, as the run itself said it."""
+    names = outline.names()
+    said: dict[str, str] = {}
+    for text in events:
+        about = [name for name in names if text.startswith(f"stream {name} ")]
+        if about:
+            name = max(about, key=len)
+            said[name] = text.removeprefix(f"stream {name} ")
+    counts = Counter(outline.states)
+    found = [(counts[code], state.replace("_", " ")) for code, state in enumerate(STATES)]
+    lines = [", ".join(f"{count} {state}" for count, state in found if count), ""]
     for s in outline.streams(MOST_STREAMS):
-        share = outline.visits[s] / max(outline.frames, 1)
-        lines.append(f"| {spec.streams[s]} | {outline.visits[s]} frames, {share:.0%} |")
-    settings = [("seed", header.manifest.get("seed"))]
-    settings += [(key, header.setting("learner", key)) for key in ("nu", "tau", "sigma")]
-    settings += [("delta", header.delta)]
-    said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
-    lines += ["", said, ""]
-    if header.missing:
-        lines.append(f"Signals of version {header.schema}, without {', '.join(header.missing)}.")
-    return "\n".join(lines)
+        learning = outline.states[s] == STATES.index("learning")
+        became = "being learned" if learning else said.get(names[s], "").removeprefix("is ")
+        lines.append(f"- **{names[s]}**: {became}")
+    return [*lines, ""]
 
 
 def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:

@@ -166,7 +166,9 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
         LogDamagedError: that run cannot be read.
     """
     from replay.runs.outline import read_outline
-    from replay.view.layout import RunLayout  # takes half a second: only once the table is there
+    from replay.view.layouts.of_run import (
+        run_layout,  # takes half a second: only once the table is there
+    )
 
     results = [read_properties(run)["result"] for run in runs]
     most = max(range(len(runs)), key=lambda i: int(results[i]["modules"]))
@@ -178,7 +180,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
         lines={name: values[:0] for name, values in outline.lines.items()},
     )
     file = place / "layout.rbl"
-    RunLayout(outline).blueprint().save(APPLICATION, str(file))
+    run_layout(outline).save(APPLICATION, str(file))
     layouts = dataset.blueprint_dataset()
     (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
     dataset.set_default_blueprint_segment_id(segment)

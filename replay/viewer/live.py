@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Learner, Sink, weights_after
-from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
+from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
 from replay.runs.columns import columns_of_records
 from replay.runs.log import RunHeader
 from replay.runs.outline import LINES, Outline
 from replay.runs.stretches import Stretch, read_stretches
-from replay.view.layout import MOST_MODULES, MOST_STREAMS, RunLayout
+from replay.view.layouts.of_run import run_layout
+from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
 from replay.viewer.program import free_port
@@ -81,7 +82,7 @@ class LiveView(Sink):
             raise CdmisfaError(f"no live view at port {port}: {error}") from error
         self.address = str(server.uri)
         self._recording.send_recording_name("live")
-        self._recording.send_blueprint(RunLayout(outline).blueprint())
+        self._recording.send_blueprint(run_layout(outline))
         # No image is left out here: of each block only the first is taken.
         self._view = RunView(
             self._recording, outline.header, outline.streams(MOST_STREAMS), every=1
@@ -188,4 +189,6 @@ def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
         saved=(),
         last=None,
         lines={name: np.empty(0) for name in LINES},
+        told=frozenset(SIGNALS),
+        states=(NO_STATE,) * streams,
     )

@@ -1,0 +1,10 @@
+"""What the viewer lays out of a run: for each kind of learner its own story, in tabs."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "replay.view.layouts.of_run": "run_layout",
+    },
+)

@@ -1,0 +1,22 @@
+"""Which layout a run gets: the story of the learner that it is of."""
+
+from __future__ import annotations
+
+import rerun.blueprint as rrb
+
+from replay.runs.outline import Outline
+from replay.view.layouts.panels import Panels
+from replay.view.layouts.paper import paper_layout
+from replay.view.layouts.progress import progress_layout
+
+
+def run_layout(outline: Outline, *, all_views: bool = False, head: bool = False) -> rrb.Blueprint:
+    """The layout of a run, ready to be sent.
+
+    Args:
+        outline: the run in short.
+        all_views: what was not watched is there too.
+        head: where the head was turned is there too.
+    """
+    layout = progress_layout if outline.header.by_progress else paper_layout
+    return layout(Panels(outline, all_views=all_views, head=head))

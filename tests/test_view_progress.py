@@ -1,0 +1,244 @@
+"""The view of the progress learner tells what became of each stream, and no view has a gap."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+from conftest import Cdmisfa
+from rerun.chunk import RrdReader
+from run_data import IMAGE, VECTOR, write_run
+
+from cdmisfa.core.signals import NO_STATE, SIGNALS
+from replay.runs.outline import read_outline
+from replay.view.build import build_view
+from replay.view.layouts import panels
+from replay.view.layouts.of_run import run_layout
+from replay.view.summary import summary_text
+
+ITERATIONS = 30
+TAU = 40
+LEARNER = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25, "delta": None}
+LEARNING, LEARNED, KNOWN, GIVEN_UP = range(4)
+UNTOLD = ("share", "eta_dot", "gate_mean", "gate_sd", "band_sd", "xi", "xi_dot", "expert", "Q")
+UNTOLD += ("roc_error", "roc_error_inst", "roc_error_frozen")
+
+
+@pytest.fixture(autouse=True)
+def _strict(monkeypatch):
+    """Rerun drops data that it does not understand, with a warning only, unless told so."""
+    monkeypatch.setenv("RERUN_STRICT", "1")
+
+
+def by_progress(signals):
+    """The record as a progress learner would have it.
+
+    From the tenth iteration on the first stream is learned; from then on, module 1 knows the
+    second, module 2 from the twentieth on. The third is given up and looked at again.
+    """
+    k = signals.iteration
+    states = [LEARNED, KNOWN, GIVEN_UP if k < 25 else LEARNING] if k >= 10 else [LEARNING] * 3
+    blank = {
+        name: np.full(np.shape(getattr(signals, name)), np.nan)
+        if SIGNALS[name].dims
+        else float("nan")
+        for name in UNTOLD
+    }
+    known_by = (1 + k // 20 if k >= 10 else 0) if k % 3 == 1 else 0
+    untested = {"tested": float("nan"), "change": float("nan")} if k % 11 == 0 else {}
+    return dataclasses.replace(
+        signals,
+        **blank,
+        **untested,
+        R=np.empty((0, 2, 0)),
+        known_by=known_by,
+        stream=k % 3,
+        state=np.array(states),
+    )
+
+
+def entities_of(path):
+    """Of each entity the batches of its rows, and the names of all entities."""
+    rows, names = defaultdict(list), set()
+    for chunk in RrdReader(str(path)).stream():
+        names.add(chunk.entity_path)
+        if not chunk.is_static:
+            rows[chunk.entity_path].append(chunk.to_record_batch())
+    return rows, names
+
+
+def column(rows, entity, name):
+    """A component of an entity in the order of frames, with the frames."""
+    frames = np.concatenate([batch.column("frame").to_numpy() for batch in rows[entity]])
+    values = [v for batch in rows[entity] for v in batch.column(name).to_pylist()]
+    order = np.argsort(frames, kind="stable")
+    return frames[order], [values[i][0] if values[i] else None for i in order]
+
+
+@pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
+def shown(request, tmp_path_factory):
+    """The records of a run of the progress learner, its folder, and what its view holds."""
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("replay.runs.stretches.ITERATIONS", 7)  # lanes go on over pieces
+        patch.setenv("RERUN_STRICT", "1")
+        records = write_run(
+            folder / "run.mcap",
+            request.param,
+            ITERATIONS,
+            saves=True,
+            learner=LEARNER,
+            edit=by_progress,
+        )
+        build_view(folder, folder / "run.rrd")
+    return records, folder, *entities_of(folder / "run.rrd")
+
+
+def test_each_stream_has_a_lane_that_says_what_became_of_it(shown):
+    _, _, rows, _ = shown
+    expected = {
+        1: [(0, "learning"), (10, "learned")],
+        2: [(0, "learning"), (10, "known by 1"), (22, "known by 2")],
+        3: [(0, "learning"), (10, "given up"), (25, "learning")],
+    }
+    for place, changes in expected.items():
+        (entity,) = [e for e in rows if e.startswith(f"/streams/state/{place}_")]
+        frames, states = column(rows, entity, "StateChange:state")
+        assert frames.tolist() == [*(k * TAU for k, _ in changes), ITERATIONS * TAU]
+        assert states == [*(state for _, state in changes), ""]
+
+
+def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
+    records, folder, rows, _ = shown
+    names = read_outline(folder).names()
+    for s, name in enumerate(names):
+        own = [r for r in records if r.stream == s]
+        tested = np.array([np.isfinite(r.tested) for r in own])
+        assert 0 < tested.sum() < len(own) or s == 2
+        for signal in ("learning_error", "tested", "fitted"):
+            frames, found = column(rows, f"/streams/{signal}/{s + 1}_{name}", "Scalars:scalars")
+            assert frames.tolist() == [r.t for r in own]
+            expected = np.where(tested, [getattr(r, signal) for r in own], np.nan)
+            np.testing.assert_array_equal(np.array(found, dtype=float), expected)
+        _, found = column(rows, f"/streams/interest/{s + 1}_{name}", "Scalars:scalars")
+        np.testing.assert_array_equal(found, [r.interest[s] for r in records])
+
+
+def test_saves_and_thresholds_are_marked(shown):
+    records, _, rows, _ = shown
+    saved = [r for r in records if r.saved]
+    frames, stood = column(rows, "/streams/saved", "Scalars:scalars")
+    assert (frames.tolist(), stood) == ([r.t for r in saved], [r.learning_error for r in saved])
+    assert set(column(rows, "/streams/threshold", "Scalars:scalars")[1]) == {0.05 + 0.25}
+    assert set(column(rows, "/streams/settled", "Scalars:scalars")[1]) == {0.05}
+
+
+def test_nothing_is_there_that_the_run_does_not_tell(shown):
+    _, _, _, names = shown
+    of_2_0 = ("/policy/", "/gate/", "/decision/R", "/decision/Q", "/decision/adv", "/abstraction/d")
+    of_2_0 += tuple(f"/signals/{name}" for name in (*UNTOLD, "R"))
+    of_2_0 += ("/lanes/2", "/lanes/3", "/lanes/4", "/lanes/5", "/abstraction/saved")
+    assert [n for n in names if n.startswith(of_2_0)] == []
+    assert {"/signals/learning_error", "/signals/state", "/signals/band_mean/1"} <= names
+
+
+def test_what_2_0_tells_has_nothing_of_streams(tmp_path):
+    missing = {"change": np.nan, "tested": np.nan, "fitted": np.nan, "learning_error": np.nan}
+
+    def plain(signals):
+        none = np.full(3, np.nan), np.full(3, NO_STATE)
+        return dataclasses.replace(signals, **missing, interest=none[0], state=none[1])
+
+    write_run(tmp_path / "run.mcap", VECTOR, 12, edit=plain, learner={"algorithm": "2.0"})
+    build_view(tmp_path, tmp_path / "run.rrd")
+    names = entities_of(tmp_path / "run.rrd")[1]
+    new = tuple(f"/signals/{name}" for name in (*missing, "interest", "state"))
+    assert [n for n in names if n.startswith(("/streams", *new))] == []
+    assert {"/signals/Q", "/signals/xi", "/lanes/3_gate"} <= names
+
+
+def views_of(part):
+    """All views in a container, tabs too."""
+    if isinstance(part, rrb.View):
+        return [part]
+    return [view for inner in part.contents for view in views_of(inner)]
+
+
+def tabs_of(run, patch):
+    """Each tab of a run's layout."""
+    tabs = []
+    patch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
+    run_layout(read_outline(run))
+    return {tab.name: tab for tab in tabs}
+
+
+def told(rows, statics, entity):
+    """Whether an entity has anything to show."""
+    if entity not in rows:
+        return entity in statics and not entity.startswith(("/signals", "/streams"))
+    for batch in rows[entity]:
+        if "Scalars:scalars" not in batch.schema.names:
+            return True
+        values = np.array(batch.column("Scalars:scalars").flatten(), dtype=float)
+        if np.isfinite(values).any():
+            return True
+    return False
+
+
+def check_no_view_is_empty(run, patch):
+    """Every view names entities that are there, each of them with something to show."""
+    rows, names = entities_of(run / "run.rrd")
+    checked = 0
+    for tab in tabs_of(run, patch).values():
+        for view in views_of(tab):
+            if isinstance(view, rrb.DataframeView):
+                query = view.properties["DataframeQuery"]
+                (wanted,) = query.entity_order.as_arrow_array().to_pylist()
+            elif isinstance(view.contents, list):
+                wanted = view.contents
+            else:
+                wanted = [view.origin]
+            for entity in wanted:
+                found = [n for n in names if fnmatch.fnmatchcase(n, entity.replace("**", "*"))]
+                assert found, (tab.name, view.name, entity)
+                assert any(told(rows, names, n) for n in found), (tab.name, view.name, entity)
+                checked += 1
+    return checked
+
+
+def test_the_gate_and_the_decision_have_no_tab(shown, monkeypatch):
+    _, folder, _, _ = shown
+    assert sorted(tabs_of(folder, monkeypatch)) == ["Candidate", "Modules", "Overview", "Table"]
+
+
+@pytest.mark.parametrize("algorithm", ["2.0", "1.0", "progress"])
+def test_no_view_of_any_learner_is_empty(
+    algorithm, cdmisfa: Cdmisfa, tmp_path, monkeypatch, oscillatory_recording
+):
+    run = tmp_path / "run"
+    words = ["learn", oscillatory_recording, "--loop", "--algorithm", algorithm, "-o", run]
+    assert cdmisfa(*words, "--max-iterations", 60).code == 0
+    assert check_no_view_is_empty(run, monkeypatch) > 25
+
+
+def test_the_summary_says_what_became_of_each_stream(shown):
+    _, folder, _, _ = shown
+    first, second, third = read_outline(folder).names()
+    events = [
+        f"stream {first} is learned by module 1 after 9 blocks, slowness 0.0500",
+        f"stream {second} is known by module 1 (of {first}) after 4 blocks, slowness 0.0600",
+        f"stream {third} is given up after 3 blocks: it is constant",
+        f"looking once more at what was given up: {third}",
+        f"stream {second} is known by module 2 (of {first}) after 8 blocks, slowness 0.0400",
+        "ended: nothing was left",
+    ]
+    text = summary_text(read_outline(folder), "run", events)
+    assert "1 learning, 1 learned, 1 known" in text
+    assert f"- **{first}**: learned by module 1 after 9 blocks, slowness 0.0500" in text
+    assert f"- **{second}**: known by module 2 (of {first}) after 8 blocks" in text
+    assert f"- **{third}**: being learned" in text
+    assert "It ended: nothing was left." in text
