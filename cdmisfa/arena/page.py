@@ -199,6 +199,8 @@ def _text(document: Mapping[str, Any], figure: str) -> str:
         *_together(document, sets),
         "## What did not work",
         "",
+        "With how many of the seeds a stream was not learned, and modules over all seeds.",
+        "",
         *_failures(document),
     ]
     for name, entries in sets.items():
@@ -214,8 +216,8 @@ def _text(document: Mapping[str, Any], figure: str) -> str:
             parts += ["", markdown(CHANGED, changes)]
     versions = sorted(document["versions"].items())
     parts += ["", f"Versions: {', '.join(map(' '.join, versions))}.", ""]
-    if len(document["code"]) > 1:
-        parts += [f"Computed by {len(document['code'])} versions of the code.", ""]
+    if document["outdated"]:
+        parts += [f"{document['outdated']} trials are of an earlier version of the code.", ""]
     return "\n".join(parts)
 
 
@@ -285,20 +287,21 @@ def _failures(document: Mapping[str, Any]) -> list[str]:
     """A line for each learner and set that fell short."""
     lines = []
     for entry in document["entries"]:
-        said = [
+        missed = [
             f"`{t['stream']}`"
             + (f" as `{t['signal']}`" if ">" in t["stream"] else "")
-            + f" not learned with {t['trials'] - t['learned']} of {t['trials']} seeds"
+            + f" {t['trials'] - t['learned']}/{t['trials']}"
             for t in entry["targets"]
             if t["learned"] < t["trials"]
         ]
+        said = [f"not learned {', '.join(missed)}"] if missed else []
         said += [
             f"{count} module{'s' if count > 1 else ''} of `{name}`"
             for name, count in entry["wrong"].items()
         ]
         doubles = entry["measures"]["doubles"]
         if doubles["mean"]:
-            said.append(f"{round(doubles['mean'] * doubles['n'])} modules twice")
+            said.append(f"{round(doubles['mean'] * doubles['n'])} too many of what it had")
         ended = entry["measures"]["ended"]
         if still := round((1 - ended["mean"]) * ended["n"]) if ended["n"] else 0:
             said.append(f"{still} of {ended['n']} runs did not end")

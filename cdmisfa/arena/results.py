@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cdmisfa.arena.arena import COMPUTED
+from cdmisfa.arena.arena import plan
 from cdmisfa.arena.contestants import CONTESTANTS
 from cdmisfa.arena.sets import SETS
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import plain, versions, write_json
 from cdmisfa.experiments.statistics import mean_interval, summary, wilson
-from cdmisfa.experiments.store import DONE, code, read_rows
+from cdmisfa.experiments.store import DONE, read_rows
 
 RESULTS: Final = "results.json"
 
@@ -26,33 +26,39 @@ FIRST, POINTS = 400, 60
 
 Row = Mapping[str, Any]
 
+Point = tuple[tuple[str, str], ...]
+"""What a trial is of, as `ArenaTrial.point` has it."""
+
 
 def results(folder: Path) -> dict[str, Any]:
     """What every learner came to on every set, of all trials in a folder.
 
-    Of a trial that was computed by several versions of the code, that of this one counts, or
-    the last.
+    Where a trial was computed by several versions of code, set or learner, that of now counts, or
+    else the last; how many are not of now is said.
 
     Raises:
         UsageError: there are no trials.
         LogDamagedError: a row is damaged.
     """
-    chosen: dict[tuple[tuple[tuple[str, str], ...], int], Row] = {}
-    row: Row
+    found: dict[Point, dict[int, list[Row]]] = {}
     for row in read_rows(folder):
-        key = (tuple(row["point"].items()), row["seed"])
-        if key not in chosen or chosen[key]["code"] != code(*COMPUTED):
-            chosen[key] = row
-    if not chosen:
+        point = tuple(row["point"].items())
+        found.setdefault(point, {}).setdefault(row["seed"], []).append(row)
+    if not found:
         raise UsageError(f"{folder} holds no trials: run cdmisfa arena -o {folder} first")
-    groups: dict[tuple[tuple[str, str], ...], list[Row]] = {}
-    for (point, _), row in sorted(chosen.items(), key=lambda item: item[0][1]):
-        groups.setdefault(point, []).append(row)
-    entries = [_entry(dict(point), rows) for point, rows in sorted(groups.items(), key=_place)]
+    entries, outdated = [], 0
+    for point, of_seeds in sorted(found.items(), key=_place):
+        names = _names_now(dict(point), of_seeds)
+        rows = [
+            next((row for row in of_seeds[seed] if row["id"] in names), of_seeds[seed][-1])
+            for seed in sorted(of_seeds)
+        ]
+        entries.append(_entry(dict(point), rows))
+        outdated += sum(row["id"] not in names for row in rows)
     return {
         "schema": 1,
         "entries": entries,
-        "code": sorted({row["code"] for row in chosen.values()}),
+        "outdated": outdated,
         "versions": {**versions(), **_versions_of_streams()},
     }
 
@@ -64,7 +70,19 @@ def write_results(folder: Path) -> dict[str, Any]:
     return document
 
 
-def _place(item: tuple[tuple[tuple[str, str], ...], Any]) -> tuple[int, str, tuple[Any, ...]]:
+def _names_now(point: Mapping[str, str], seeds: Iterable[int]) -> set[str]:
+    """What the trials of a point would be called if they were planned now."""
+    more = dict(point)
+    name, learner, frames = more.pop("set"), more.pop("learner"), more.pop("frames", None)
+    limit = None if frames is None else int(frames)
+    settings = [f"{key}={value}" for key, value in more.items()]
+    try:
+        return {t.id for t in plan([name], [learner], seeds, settings, limit, Path())}
+    except UsageError:  # what there was then is no more
+        return set()
+
+
+def _place(item: tuple[Point, Any]) -> tuple[int, str, tuple[Any, ...]]:
     """Where a point stands in a table: by set, by what else was set, by learner."""
     point = dict(item[0])
     name, learner = point.pop("set"), point.pop("learner")

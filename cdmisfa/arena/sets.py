@@ -67,7 +67,7 @@ SETS: Registry[ArenaSet] = Registry(
         ),
         "twice": ArenaSet(("pendulum", "pendulum#1", "pong"), "the same stream twice"),
         "change": ArenaSet(
-            ("pendulum>acrobot", "mountaincar", "noise"),
+            ("pendulum>freeway", "mountaincar", "noise"),
             f"the first stream changes at frame {CHANGE}",
             goes_on=True,
         ),
