@@ -6,14 +6,21 @@ from cdmisfa.agents.progress.candidate import Candidate, log_ratio
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.modules import Module
 
-FULL = 3.0
+FULL = 4.0
 """Windows of tests after which an output counts as settled at `learner.settled`."""
 
-STEEPNESS = 4
+STEEPNESS = 2
 """Power with which that threshold grows until then."""
 
 STILL_GAINING = 0.1
 """Regret above which nothing is settled, however little the output changes with a block."""
+
+HOPELESS = (CONSTANT, NOTHING_SLOW, NO_PROGRESS) = (
+    "it is constant",
+    "nothing in it is slow",
+    "it made no progress",
+)
+"""Why a candidate is given up."""
 
 EARLY = 0.6
 """Windows of tests before a candidate may be given up."""
@@ -45,8 +52,14 @@ SAME = 0.8
 AS_SLOW = 1.15
 """Slowness of a module over the candidate's, up to which it is as slow."""
 
-STILL_SAME, STILL_SLOW, STILL_ITSELF = 0.6, 1.35, 0.3
+STILL_SAME = 0.6
 """The same for the stream's own module, which a candidate of few frames must not put in doubt."""
+
+STILL_ITSELF = 0.4
+"""|ln| of its slowness over that when it was learned, up to which it is still what it was."""
+
+STRANGE = 0.8
+"""|ln| of the rms difference of its output over that of then, from which it is learned again."""
 
 
 def gain(candidate: Candidate) -> float:
@@ -97,17 +110,17 @@ def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
 def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
     """Why a candidate is given up, or "" where it is not."""
     if not candidate.alive:
-        return "it is constant" if candidate.blocks >= EARLY * candidate.test_window else ""
+        return CONSTANT if candidate.blocks >= EARLY * candidate.test_window else ""
     if (
         candidate.tests >= EARLY * candidate.test_window
         and gain(candidate) > config.even
         and flatness(candidate) > TOO_EVEN
     ):
-        return "nothing in it is slow"
+        return NOTHING_SLOW
     if candidate.blocks >= PATIENCE * candidate.test_window:
         errors = candidate.errors
         if errors[-30:].mean() > 0.95 * errors[:-30].mean():
-            return "it made no progress"
+            return NO_PROGRESS
     return ""
 
 
@@ -137,9 +150,26 @@ def known_by(candidate: Candidate, modules: list[Module], own: int) -> int | Non
             continue
         if rho > SAME and eta <= AS_SLOW * candidate.fitted:
             return index
-        if index == own:
-            before = float(module.eta[0])
-            itself = abs(log_ratio(eta, before)) < STILL_ITSELF
-            if rho > STILL_SAME or (itself and eta <= STILL_SLOW * candidate.fitted):
-                return index
+        itself = abs(log_ratio(eta, float(module.eta[0]))) < STILL_ITSELF
+        as_slow = eta <= AS_SLOW * candidate.fitted
+        if index == own and (rho > STILL_SAME or itself or as_slow):
+            return index
     return None
+
+
+def strange(steps: float, power: float, blocks: int, window: int) -> bool:
+    """Whether a stream's module gives something else there than when the stream was decided.
+
+    Told soon and roughly: the stream is then learned again, and only that decides whether it
+    shows anything new.
+
+    Args:
+        steps: recent mean square of the differences of its output, over that of then.
+        power: recent mean square of its output, over that of then.
+        blocks: blocks behind both.
+        window: blocks of a window of tests.
+    """
+    low, high = PRESENT
+    if blocks < EARLY * window:
+        return False
+    return not low < power < high or 0.5 * abs(log_ratio(steps, 1.0)) > STRANGE

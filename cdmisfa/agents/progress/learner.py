@@ -18,20 +18,28 @@ from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate
 from cdmisfa.agents.progress.config import ProgressConfig
-from cdmisfa.agents.progress.judging import PATIENCE, hopeless, known_by, mastered, promising
+from cdmisfa.agents.progress.judging import (
+    HOPELESS,
+    NO_PROGRESS,
+    hopeless,
+    known_by,
+    mastered,
+    promising,
+    strange,
+)
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import STATES, BlockSignals
 from cdmisfa.features.projection import mean_output, outputs
-from cdmisfa.features.slowness import instantaneous_slowness
+from cdmisfa.features.slowness import instantaneous_slowness, window_rate
 
 Float = NDArray[np.float64]
 
 LEARNING, LEARNED, KNOWN, GIVEN_UP = range(len(STATES))
 
-REASONS = ("", "it is constant", "nothing in it is slow", "it made no progress")
+REASONS = ("", *HOPELESS)
 """Why a stream was given up, by the code that is kept."""
 
 FEW_VALUES = 32
@@ -46,7 +54,7 @@ HELD = 32
 MEMORY = 2 * 1024**3
 """Bytes that candidates may take together; where frames are large fewer of them are held."""
 
-SHADOW = 4
+SHADOW = 5
 """Windows of tests after which the candidate of a stream that is not being learned begins anew."""
 
 STREAM = np.dtype(
@@ -59,6 +67,11 @@ STREAM = np.dtype(
         ("visits", "i8"),  # blocks it was watched
         ("decided", "i8"),  # blocks it had been watched when its state was decided
         ("looks", "i8"),  # times it was begun anew after it had been given up
+        ("then_power", "f8"),  # mean square of its module's output when its state was decided
+        ("then_steps", "f8"),  # mean square of the differences of that
+        ("power", "f8"),  # the same of late
+        ("steps", "f8"),
+        ("watched", "i8"),  # blocks since then
         ("slowness", "f8"),  # of what it came to, on frames not learned from
     ]
 )
@@ -191,6 +204,8 @@ class ProgressLearner:
         own["next"], own["last"] = block.t + len(block), counts["iteration"]
         own["visits"] += 1
         counts["iteration"] += 1
+        if int(own["module"]) >= 0:
+            self._watch(own, y_frozen[:, int(own["module"]) * self._n_outputs])
         self.events = self._judge(stream, candidate) + self._look_again()
         learning = self._streams["state"] == LEARNING
         counts["idle"] = 0 if learning.any() else counts["idle"] + 1
@@ -289,36 +304,76 @@ class ProgressLearner:
     def _judge(self, stream: int, candidate: Candidate) -> tuple[str, ...]:
         """Decide what the stream has come to; the lines that say so."""
         own = self._streams[stream]
-        name, state = self.spec.streams[stream], int(own["state"])
+        state, module = int(own["state"]), int(own["module"])
         if mastered(candidate, self.config):
             del self._candidates[stream]
-            index = known_by(candidate, self.modules, int(own["module"]))
-            if index is None:
-                self._save(stream, candidate)
-                index = len(self.modules) - 1
-                self._decide(stream, LEARNED, index, float(candidate.tested[0]))
-                what = "has changed: what it shows now" if state in (LEARNED, KNOWN) else "is"
-                what += f" learned by module {index + 1}"
-            elif index != int(own["module"]):
-                eta = float(candidate.sfa.compare(self.modules[index].phi[:1])[1][0])
-                self._decide(stream, KNOWN, index, eta)
-                what = f"is known by module {index + 1} (of {self.modules[index].stream})"
-            else:
-                return ()
-            eta = float(own["slowness"])
-            return (f"stream {name} {what} after {own['decided']} blocks, slowness {eta:.4f}",)
-        if state in (LEARNED, KNOWN):
-            if candidate.blocks >= SHADOW * self._window:
-                del self._candidates[stream]
-        elif state == LEARNING:
+            return self._settle(stream, candidate)
+        if state == LEARNING:
             why = hopeless(candidate, self.config)
+            if why == NO_PROGRESS and module >= 0:  # then that module is the best there is
+                return self._settle(stream, candidate, module)
             if why:
                 self._decide(stream, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
-                return (f"stream {name} is given up after {own['decided']} blocks: {why}",)
-        elif candidate.blocks < PATIENCE * self._window and promising(candidate, self.config):
-            self._decide(stream, LEARNING, -1, math.nan)
-            return (f"stream {name} is learned after all: something in it is slow",)
+                return self._say(stream, f"is given up after {own['decided']} blocks: {why}")
+        elif state == GIVEN_UP:
+            if REASONS[int(own["why"])] != NO_PROGRESS and promising(candidate, self.config):
+                return self._learn_again(
+                    stream, -1, "is learned after all: something in it is slow"
+                )
+        elif self._strange(stream):
+            return self._learn_again(stream, module, f"no longer fits module {module + 1}")
+        if state != LEARNING and candidate.blocks >= SHADOW * self._window:
+            del self._candidates[stream]
         return ()
+
+    def _watch(self, own: Any, y: Float) -> None:
+        """Take the output of a stream's module in, to see whether it is what it was."""
+        own["watched"] += 1
+        rate = window_rate(self._window, int(own["watched"]))
+        own["power"] += rate * (float(np.mean(y * y)) - own["power"])
+        own["steps"] += rate * (float(np.mean(np.diff(y) ** 2)) - own["steps"])
+
+    def _strange(self, stream: int) -> bool:
+        own = self._streams[stream]
+        power, steps = own["power"] / own["then_power"], own["steps"] / own["then_steps"]
+        return strange(float(steps), float(power), int(own["watched"]), self._window)
+
+    def _settle(
+        self, stream: int, candidate: Candidate, index: int | None = None
+    ) -> tuple[str, ...]:
+        """Decide by which module a stream is learned or known; a new one where none gives it."""
+        own = self._streams[stream]
+        state, before = int(own["state"]), int(own["module"])
+        if index is None:
+            index = known_by(candidate, self.modules, before)
+        if index is None:
+            self._save(stream, candidate)
+            index, eta = len(self.modules) - 1, float(candidate.tested[0])
+        else:
+            eta = float(candidate.sfa.compare(self.modules[index].phi[:1])[1][0])
+        power, slow, _ = (float(v[0]) for v in candidate.sfa.compare(self.modules[index].phi[:1]))
+        own["then_power"], own["then_steps"] = power, power * (2.0 * math.pi * slow) ** 2
+        own["watched"] = 0
+        if index == before and state != LEARNING:
+            return ()
+        module = self.modules[index]
+        learned = module.stream_index == stream
+        self._decide(stream, LEARNED if learned else KNOWN, index, eta)
+        if index == before:
+            return self._say(stream, f"still shows what module {index + 1} gives")
+        what = "has changed and is" if before >= 0 else "is"
+        by = "learned by" if learned else f"known by {module.stream}'s"
+        after = f"after {own['decided']} blocks, slowness {eta:.4f}"
+        return self._say(stream, f"{what} {by} module {index + 1} {after}")
+
+    def _learn_again(self, stream: int, module: int, why: str) -> tuple[str, ...]:
+        """Begin a candidate anew for a stream that had been decided."""
+        self._candidates.pop(stream, None)
+        self._decide(stream, LEARNING, module, math.nan)
+        return self._say(stream, why)
+
+    def _say(self, stream: int, what: str) -> tuple[str, ...]:
+        return (f"stream {self.spec.streams[stream]} {what}",)
 
     def _decide(self, stream: int, state: int, module: int, slowness: float, why: int = 0) -> None:
         own = self._streams[stream]
@@ -333,8 +388,7 @@ class ProgressLearner:
         again = (streams["state"] == GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
         for stream in np.flatnonzero(again).tolist():
             streams["looks"][stream] += 1
-            self._candidates.pop(stream, None)
-            self._decide(stream, LEARNING, -1, math.nan)
+            self._learn_again(stream, -1, "")
         names = ", ".join(self.spec.streams[s] for s in np.flatnonzero(again))
         return (f"looking once more at what was given up: {names}",) if names else ()
 
