@@ -52,14 +52,14 @@ SAME = 0.8
 AS_SLOW = 1.15
 """Slowness of a module over the candidate's, up to which it is as slow."""
 
-STILL_SAME = 0.6
-"""The same for the stream's own module, which a candidate of few frames must not put in doubt."""
+FAINT = 0.003
+"""Variance below which a stream does not show what its own module encodes at all."""
 
-STILL_ITSELF = 0.4
-"""|ln| of its slowness over that when it was learned, up to which it is still what it was."""
+WEAK, STILL_SAME = 0.05, 0.6
+"""Variance and correlation from which a stream still shows what its own module encodes."""
 
 STRANGE = 0.8
-"""|ln| of the rms difference of its output over that of then, from which it is learned again."""
+"""|ln| of the slowness of a stream's module over that of then, from which it gives other things."""
 
 
 def gain(candidate: Candidate) -> float:
@@ -143,18 +143,26 @@ def known_by(candidate: Candidate, modules: list[Module], own: int) -> int | Non
         own: index of the stream's own module, -1 where it has none.
     """
     low, high = PRESENT
+    found = [tuple(float(v[0]) for v in candidate.sfa.compare(m.phi[:1])) for m in modules]
     for index in sorted(range(len(modules)), key=lambda index: index != own):
-        module = modules[index]
-        variance, eta, rho = (float(v[0]) for v in candidate.sfa.compare(module.phi[:1]))
-        if not low < variance < high:
-            continue
-        if rho > SAME and eta <= AS_SLOW * candidate.fitted:
+        variance, eta, rho = found[index]
+        if low < variance < high and rho > SAME and eta <= AS_SLOW * candidate.fitted:
             return index
-        itself = abs(log_ratio(eta, float(module.eta[0]))) < STILL_ITSELF
-        as_slow = eta <= AS_SLOW * candidate.fitted
-        if index == own and (rho > STILL_SAME or itself or as_slow):
-            return index
+    if own >= 0 and _still_there(candidate, modules[own], *found[own]):
+        return own
     return None
+
+
+def _still_there(
+    candidate: Candidate, module: Module, variance: float, eta: float, rho: float
+) -> bool:
+    """Whether a stream shows what its own module encodes, at times less and differently."""
+    if rho > SAME:
+        return variance > FAINT
+    itself = abs(log_ratio(eta, float(module.eta[0]))) < STRANGE
+    if not itself and eta > AS_SLOW * candidate.fitted:
+        return False
+    return variance > (FAINT if rho > STILL_SAME else WEAK)
 
 
 def strange(steps: float, power: float, blocks: int, window: int) -> bool:

@@ -1,0 +1,304 @@
+"""The progress learner: what is there is learned, what is not is given up, and it ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_files import write_cameras
+from conftest import Cdmisfa
+from hypothesis import given
+from hypothesis import strategies as st
+from moving_pictures import LENGTH, MovingPictures
+
+from cdmisfa import Run
+from cdmisfa.agents.learners import LEARNERS, open_learner
+from cdmisfa.agents.progress import learner as progress
+from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, relative_progress
+from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_error
+from cdmisfa.agents.progress.config import ATTENTIONS, ProgressConfig
+from cdmisfa.agents.progress.judging import flatness, gain, hopeless, promising
+from cdmisfa.agents.progress.learner import ProgressLearner
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.learning import Learner
+from cdmisfa.core.signals import STATES, canonical_bytes
+from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.sources import configure
+from recorder.recording import record
+from replay.recordings.source import RecordedSource
+
+CONFIG = ProgressConfig(components=8)
+NO_TRUTH = np.zeros((40, 0))
+
+
+def learned_from(source: MovingPictures, seed: int = 0, **settings: Any) -> ProgressLearner:
+    learner = ProgressLearner(ProgressConfig(components=8, **settings), source.spec, seed)
+    learn(source, learner, max_iterations=3000)
+    return learner
+
+
+def outcomes(learner: ProgressLearner) -> dict[str, str]:
+    return {row["stream"]: row["state"] for row in learner.summary()["streams"]}
+
+
+def encodes(learner: ProgressLearner, index: int, source: MovingPictures, stream: int) -> float:
+    source.seek(0)
+    block = source.take(stream, 3000)
+    y = learner.modules[index].transform(block.frames)[:, 0]
+    return float(abs(np.corrcoef(y, block.truth[:, 0])[0, 1]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_learns_what_is_there_gives_up_what_is_not_and_ends(seed: int) -> None:
+    source = MovingPictures("noise", "swing", "constant", "stroll", seed=seed)
+    learner = learned_from(source, seed)
+    assert learner.over == "all_decided"
+    assert outcomes(learner) == {
+        "noise": "given_up",
+        "swing": "learned",
+        "constant": "given_up",
+        "stroll": "learned",
+    }
+    assert sorted(m.stream for m in learner.modules) == ["stroll", "swing"]
+    for place, module in enumerate(learner.modules):
+        assert encodes(learner, place, source, module.stream_index) > 0.95
+    rows = {row["stream"]: row for row in learner.summary()["streams"]}
+    assert rows["noise"]["why"] == "nothing in it is slow"
+    assert rows["constant"]["why"] == "it is constant"
+    assert (rows["constant"]["slowness"], rows["noise"]["module"]) == (None, None)
+    assert rows["swing"]["slowness"] < 0.05 < 0.15 < rows["noise"]["slowness"]
+
+
+def test_the_same_stream_twice_is_learned_once_and_known() -> None:
+    learner = learned_from(MovingPictures("swing", "noise", "swing.2"))
+    assert len(learner.modules) == 1
+    assert sorted(outcomes(learner).values()) == ["given_up", "known", "learned"]
+    rows = learner.summary()["streams"]
+    assert rows[0]["module"] == rows[2]["module"] == 1
+    assert rows[0]["slowness"] == pytest.approx(rows[2]["slowness"], rel=0.1)
+
+
+def test_what_changes_is_learned_anew_or_known() -> None:
+    source = MovingPictures("swing>stroll", "noise", seed=3, changes_at=150 * 40)
+    learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
+    learn(source, learner, max_iterations=450)
+    assert [m.stream for m in learner.modules] == 2 * ["swing>stroll"]
+    assert learner.modules[0].iteration < 150 < learner.modules[1].iteration
+    assert learner.summary()["streams"][0]["module"] == 2
+    block = source.take(0, 3000)
+    y = learner.modules[1].transform(block.frames)[:, 0]
+    assert abs(np.corrcoef(y, block.truth[:, 0])[0, 1]) > 0.95
+    source = MovingPictures("swing>stroll", "stroll", seed=3, changes_at=150 * 40)
+    learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
+    learn(source, learner, max_iterations=400)
+    assert len(learner.modules) == 2
+    (changed, other) = learner.summary()["streams"]
+    assert (changed["state"], changed["module"]) == ("known", other["module"])
+
+
+def test_what_does_not_change_is_not_learned_twice() -> None:
+    source = MovingPictures("swing", "stroll", "noise", seed=3)
+    learner = ProgressLearner(ProgressConfig(components=8, watch=10**6), source.spec, 0)
+    learn(source, learner, max_iterations=1500)
+    assert len(learner.modules) == 2
+    assert sorted(outcomes(learner).values()) == ["given_up", "learned", "learned"]
+
+
+def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> None:
+    names = ("noise", "swing", "constant", "stroll")
+    live = run(MovingPictures(*names), CONFIG, tmp_path / "live", rerun=False)
+    record(MovingPictures(*names), tmp_path / "log", frames=live.frames)
+    recorded = run(RecordedSource([tmp_path / "log"]), CONFIG, tmp_path / "recorded", rerun=False)
+    assert recorded.signals_sha256 == live.signals_sha256
+    stopped = run(
+        MovingPictures(*names), CONFIG, tmp_path / "run", max_iterations=37, checkpoint_every=10
+    )
+    assert stopped.iterations == 37
+    resumed = run(MovingPictures(*names), CONFIG, tmp_path / "run", resume=True)
+    assert (resumed.signals_sha256, resumed.iterations) == (live.signals_sha256, live.iterations)
+    assert resumed.summary == live.summary
+    opened = Run(tmp_path / "run")
+    frames = MovingPictures(*names).take(1, 5).frames
+    for module, row in zip(opened.modules, live.as_json()["modules"], strict=True):
+        assert (module.stream, module.stream_index) == (row["stream"], row["stream_index"])
+        assert module.transform(frames).shape == (5, 1)
+    assert opened.signals["state"].shape == (live.iterations, 4)
+
+
+@given(st.integers(1, 60))
+def test_restored_anywhere_it_goes_on_alike(k: int) -> None:
+    source = MovingPictures("swing", "noise")
+    one = ProgressLearner(CONFIG, source.spec, 5)
+    for _ in range(k):
+        one.step(source.take(one.stream, one.tau))
+    two = ProgressLearner(CONFIG, source.spec, 5)
+    two.restore(one.state)
+    for _ in range(5):
+        block = source.take(one.stream, one.tau)
+        assert canonical_bytes(one.step(block)) == canonical_bytes(two.step(block))
+    broken = one.state
+    with pytest.raises(ValueError, match="streams is missing"):
+        two.restore(type(broken)({}, (), broken.policy_rng))
+
+
+def test_units_do_not_matter() -> None:
+    """Frames in other units, a power of two so that nothing is rounded, give the same signals."""
+    pictures = MovingPictures("swing", "noise")
+    digests = []
+    for unit in (2.0**-20, 1.0, 2.0**30):
+        spec = SourceSpec(("swing", "noise"), (192,), "float64")
+        learner, digest = ProgressLearner(CONFIG, spec, 0), Digest()
+        pictures.seek(0)
+        for _ in range(80):
+            block = pictures.take(learner.stream, learner.tau)
+            frames = freeze(block.frames.reshape(40, -1) * unit)
+            digest.add(learner.step(Block(block.stream, block.t, frames, NO_TRUTH)))
+        digests.append(digest.hexdigest())
+    assert len(set(digests)) == 1
+
+
+def test_candidates_are_held_for_so_many_streams_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "HELD", 3)
+    names = [f"noise.{i}" for i in range(8)] + ["swing", "constant"]
+    source = MovingPictures(*names)
+    learner = ProgressLearner(CONFIG, source.spec, 0)
+    most = 0
+    while not learner.over:
+        learner.step(source.take(learner.stream, learner.tau))
+        state = learner.state
+        most = max(most, len(state.arrays["held"]))
+        assert learner.iteration < 2000
+    assert most == 3
+    assert [m.stream for m in learner.modules] == ["swing"]
+
+
+def test_few_values_are_expanded_and_pictures_are_not() -> None:
+    few = ProgressLearner(ProgressConfig(), SourceSpec(("a",), (4,), "float64"), 0)
+    many = ProgressLearner(ProgressConfig(), SourceSpec(("a",), (48, 64), "uint8"), 0)
+    assert (few.phi.shape, many.phi.shape) == ((1, 14), (1, 3072))
+    with pytest.raises(UsageError, match=r"set learner\.expansion=none or take smaller frames"):
+        ProgressLearner(
+            ProgressConfig(expansion="quadratic"), SourceSpec(("a",), (48, 64), "uint8"), 0
+        )
+
+
+def test_what_cannot_be_learned_from_is_refused() -> None:
+    spec = SourceSpec(("a",), (4,), "float64")
+    learner = ProgressLearner(ProgressConfig(), spec, 0)
+    assert isinstance(learner, Learner)
+    frames = np.zeros((40, 4))
+    with pytest.raises(ValueError, match="asked for 40 frames of stream 0, not 39"):
+        learner.step(Block(0, 0, freeze(frames[:39].copy()), NO_TRUTH))
+    frames[7, 2] = np.nan
+    with pytest.raises(CdmisfaError, match="stream a holds a value that is no finite number"):
+        learner.step(Block(0, 0, freeze(frames), NO_TRUTH))
+    assert learner.iteration == 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("attention=progres", "learner.attention is progres: did you mean progress?"),
+        ("expansion=cubic", "learner.expansion is cubic: there are none, quadratic"),
+        ("outputs=17", "learner.outputs is 17, more than learner.components 16"),
+        ("tau=2", r"learner.tau is 2: it must be in \[3, 100000\]"),
+        ("nu=.1", "unknown key learner.nu"),
+    ],
+)
+def test_wrong_settings_are_named(setting: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        configure("icub", settings=("learner.algorithm=progress", f"learner.{setting}"))
+
+
+def test_the_preset_is_the_defaults() -> None:
+    chosen = configure("icub", settings=("learner.algorithm=progress",))
+    assert chosen.learner == ProgressConfig()
+    assert isinstance(open_learner(chosen.learner, SourceSpec(("a",), (9,), "float64"), 0), Learner)
+    assert LEARNERS["progress"].preset == "cameras"
+
+
+def test_a_candidate_tests_before_it_learns() -> None:
+    rng = np.random.default_rng(0)
+    noise, swing = Candidate(192, 8, 1, 8000, 20), Candidate(192, 8, 1, 8000, 20)
+    source = MovingPictures("swing")
+    for k in range(15):
+        noise.learn(rng.standard_normal((40, 192)), gap=k == 0)
+        swing.learn(source.take(0, 40).frames.reshape(40, -1), gap=k == 0)
+    assert noise.tests == swing.tests == 14
+    assert noise.tested[0] == pytest.approx(WHITE_NOISE, rel=0.05)
+    assert noise.fitted < noise.tested[0]
+    assert gain(noise) > 0.85 > 0.4 > gain(swing)
+    assert flatness(noise) > 0.75 > 0.4 > flatness(swing)
+    assert hopeless(noise, ProgressConfig()) == "nothing in it is slow"
+    assert hopeless(swing, ProgressConfig()) == ""
+    assert promising(swing, ProgressConfig())
+    assert swing.error == learning_error(swing.change, swing.tested[0], swing.fitted)
+    black = Candidate(192, 8, 1, 8000, 20)
+    for _ in range(12):
+        black.learn(np.zeros((40, 192), np.uint8), gap=False)
+    assert (black.alive, hopeless(black, ProgressConfig())) == (False, "it is constant")
+
+
+def test_progress_is_the_relative_fall_of_the_error() -> None:
+    assert relative_progress(np.r_[np.full(8, 2.0), np.full(8, 1.0)]) == pytest.approx(0.501)
+    assert relative_progress(np.full(RECENT, 0.5)) == pytest.approx(0.002)
+    assert relative_progress(np.zeros(0)) > relative_progress(np.ones(3)) > 100
+
+
+@given(
+    st.sampled_from(ATTENTIONS),
+    st.lists(st.booleans(), min_size=1, max_size=6),
+    st.integers(0, 2**32 - 1),
+)
+def test_every_rule_chooses_a_stream(name: str, learning: list[bool], seed: int) -> None:
+    rng, n = np.random.default_rng(seed), len(learning)
+    situation = Situation(
+        stream=int(rng.integers(n)),
+        learning=np.array(learning),
+        errors=tuple(rng.random(int(rng.integers(RECENT + 1))) for _ in range(n)),
+        visits=rng.integers(1, 100, n),
+        draws=rng.random(2),
+        explore=0.1,
+    )
+    stream, drawn = RULES[name](situation)
+    assert 0 <= stream < n
+    if name in ("progress", "gamma", "ucb", "novel") and any(learning) and not drawn:
+        assert learning[stream] or name == "novel"
+
+
+def test_rules_and_settings_agree() -> None:
+    assert tuple(RULES) == ATTENTIONS
+
+
+def test_peoples_own_logs_are_learned_from_with_it(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    write_cameras(tmp_path / "robot.mcap", {"/left": (120, 20), "/right": (120, 20)})
+    topics = ("--topic", "/left", "--topic", "/right")
+    cameras = (tmp_path / "robot.mcap", *topics, "--size", "16x12")
+    words = ("learn", *cameras, "--loop", "--max-iterations", 30)
+    done = cdmisfa(*words, "--json", "-o", tmp_path / "run")
+    assert done.code == 0
+    rows = done.json["streams"]
+    assert [set(row) for row in rows] == 2 * [
+        {"stream", "state", "module", "blocks", "slowness", "why"}
+    ]
+    assert {row["state"] for row in rows} <= set(STATES)
+    assert [row["stream"] for row in rows] == ["/left", "/right"]
+    told = cdmisfa(*words)
+    assert all(f"{name}: " in told.out for name in ("/left", "/right"))
+    paper = cdmisfa(*words, "--algorithm", "2.0", "--json")
+    assert (paper.code, "streams" in paper.json) == (0, False)
+    converted = tmp_path / "recording"
+    assert cdmisfa("convert", *cameras, "-o", converted).code == 0
+    again = cdmisfa("learn", converted, "--loop", "--max-iterations", 30, "--json")
+    assert again.json["signals_sha256"] == done.json["signals_sha256"]
+
+
+def test_a_loop_is_as_long_as_it_says() -> None:
+    source = MovingPictures("swing")
+    first = source.take(0, 5).frames
+    source.seek(LENGTH)
+    assert (source.take(0, 5).frames == first).all()
