@@ -19,28 +19,34 @@ from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.judging import (
-    HOPELESS,
     NO_PROGRESS,
     hopeless,
     known_by,
     mastered,
     promising,
-    strange,
+)
+from cdmisfa.agents.progress.streams import (
+    GIVEN_UP,
+    KNOWN,
+    LEARNED,
+    LEARNING,
+    REASONS,
+    begin_watching,
+    decide,
+    differs,
+    new_streams,
+    outcome,
+    watch,
 )
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import STATES, BlockSignals
+from cdmisfa.core.signals import BlockSignals
 from cdmisfa.features.projection import mean_output, outputs
-from cdmisfa.features.slowness import instantaneous_slowness, window_rate
+from cdmisfa.features.slowness import instantaneous_slowness
 
 Float = NDArray[np.float64]
-
-LEARNING, LEARNED, KNOWN, GIVEN_UP = range(len(STATES))
-
-REASONS = ("", *HOPELESS)
-"""Why a stream was given up, by the code that is kept."""
 
 FEW_VALUES = 32
 """Frames of at most so many values are expanded quadratically where nothing else is said."""
@@ -56,25 +62,6 @@ MEMORY = 2 * 1024**3
 
 SHADOW = 5
 """Windows of tests after which the candidate of a stream that is not being learned begins anew."""
-
-STREAM = np.dtype(
-    [
-        ("state", "i8"),  # code in STATES
-        ("module", "i8"),  # place in the modules of the one that gives its slow feature; -1 none
-        ("why", "i8"),  # code in REASONS
-        ("next", "i8"),  # frame after its last block; -1 where it was never watched
-        ("last", "i8"),  # iteration of its last block
-        ("visits", "i8"),  # blocks it was watched
-        ("decided", "i8"),  # blocks it had been watched when its state was decided
-        ("looks", "i8"),  # times it was begun anew after it had been given up
-        ("then_power", "f8"),  # mean square of its module's output when its state was decided
-        ("then_steps", "f8"),  # mean square of the differences of that
-        ("power", "f8"),  # the same of late
-        ("steps", "f8"),
-        ("watched", "i8"),  # blocks since then
-        ("slowness", "f8"),  # of what it came to, on frames not learned from
-    ]
-)
 
 COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle", "i8")])
 
@@ -108,9 +95,7 @@ class ProgressLearner:
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
-        self._streams = np.zeros(len(spec.streams), STREAM)
-        self._streams["module"] = self._streams["next"] = -1
-        self._streams["slowness"] = np.nan
+        self._streams = new_streams(len(spec.streams))
         self._candidates: dict[int, Candidate] = {}
         self._freeze()
 
@@ -205,7 +190,7 @@ class ProgressLearner:
         own["visits"] += 1
         counts["iteration"] += 1
         if int(own["module"]) >= 0:
-            self._watch(own, y_frozen[:, int(own["module"]) * self._n_outputs])
+            watch(own, y_frozen[:, int(own["module"]) * self._n_outputs], self._window)
         self.events = self._judge(stream, candidate) + self._look_again()
         learning = self._streams["state"] == LEARNING
         counts["idle"] = 0 if learning.any() else counts["idle"] + 1
@@ -265,22 +250,10 @@ class ProgressLearner:
         return {
             "final_policy": policy.tolist(),
             "epsilon": self.config.explore,
-            "streams": [self._outcome(stream) for stream in range(len(self._streams))],
-        }
-
-    def _outcome(self, stream: int) -> dict[str, Any]:
-        own = self._streams[stream]
-        slowness, module = float(own["slowness"]), int(own["module"])
-        learning = int(own["state"]) == LEARNING
-        if learning and stream in self._candidates:
-            slowness = float(self._candidates[stream].tested[0])
-        return {
-            "stream": self.spec.streams[stream],
-            "state": STATES[int(own["state"])],
-            "module": module + 1 if module >= 0 else None,
-            "blocks": int(own["visits" if learning else "decided"]),
-            "slowness": slowness if math.isfinite(slowness) else None,
-            "why": REASONS[int(own["why"])],
+            "streams": [
+                outcome(name, self._streams[stream], self._candidates.get(stream))
+                for stream, name in enumerate(self.spec.streams)
+            ],
         }
 
     @property
@@ -313,30 +286,18 @@ class ProgressLearner:
             if why == NO_PROGRESS and module >= 0:  # then that module is the best there is
                 return self._settle(stream, candidate, module)
             if why:
-                self._decide(stream, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
+                decide(own, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))
                 return self._say(stream, f"is given up after {own['decided']} blocks: {why}")
         elif state == GIVEN_UP:
             if REASONS[int(own["why"])] != NO_PROGRESS and promising(candidate, self.config):
                 return self._learn_again(
                     stream, -1, "is learned after all: something in it is slow"
                 )
-        elif self._strange(stream):
+        elif differs(own, self._window):
             return self._learn_again(stream, module, f"no longer fits module {module + 1}")
         if state != LEARNING and candidate.blocks >= SHADOW * self._window:
             del self._candidates[stream]
         return ()
-
-    def _watch(self, own: Any, y: Float) -> None:
-        """Take the output of a stream's module in, to see whether it is what it was."""
-        own["watched"] += 1
-        rate = window_rate(self._window, int(own["watched"]))
-        own["power"] += rate * (float(np.mean(y * y)) - own["power"])
-        own["steps"] += rate * (float(np.mean(np.diff(y) ** 2)) - own["steps"])
-
-    def _strange(self, stream: int) -> bool:
-        own = self._streams[stream]
-        power, steps = own["power"] / own["then_power"], own["steps"] / own["then_steps"]
-        return strange(float(steps), float(power), int(own["watched"]), self._window)
 
     def _settle(
         self, stream: int, candidate: Candidate, index: int | None = None
@@ -346,19 +307,18 @@ class ProgressLearner:
         state, before = int(own["state"]), int(own["module"])
         if index is None:
             index = known_by(candidate, self.modules, before)
+        new = index is None
         if index is None:
             self._save(stream, candidate)
-            index, eta = len(self.modules) - 1, float(candidate.tested[0])
-        else:
-            eta = float(candidate.sfa.compare(self.modules[index].phi[:1])[1][0])
-        power, slow, _ = (float(v[0]) for v in candidate.sfa.compare(self.modules[index].phi[:1]))
-        own["then_power"], own["then_steps"] = power, power * (2.0 * math.pi * slow) ** 2
-        own["watched"] = 0
+            index = len(self.modules) - 1
+        module = self.modules[index]
+        power, slow, _ = (float(v[0]) for v in candidate.sfa.compare(module.phi[:1]))
+        begin_watching(own, power, slow)
         if index == before and state != LEARNING:
             return ()
-        module = self.modules[index]
+        eta = float(candidate.tested[0]) if new else slow
         learned = module.stream_index == stream
-        self._decide(stream, LEARNED if learned else KNOWN, index, eta)
+        decide(own, LEARNED if learned else KNOWN, index, eta)
         if index == before:
             return self._say(stream, f"still shows what module {index + 1} gives")
         what = "has changed and is" if before >= 0 else "is"
@@ -369,16 +329,11 @@ class ProgressLearner:
     def _learn_again(self, stream: int, module: int, why: str) -> tuple[str, ...]:
         """Begin a candidate anew for a stream that had been decided."""
         self._candidates.pop(stream, None)
-        self._decide(stream, LEARNING, module, math.nan)
+        decide(self._streams[stream], LEARNING, module, math.nan)
         return self._say(stream, why)
 
     def _say(self, stream: int, what: str) -> tuple[str, ...]:
         return (f"stream {self.spec.streams[stream]} {what}",)
-
-    def _decide(self, stream: int, state: int, module: int, slowness: float, why: int = 0) -> None:
-        own = self._streams[stream]
-        own["state"], own["module"], own["why"] = state, module, why
-        own["decided"], own["slowness"] = own["visits"], slowness
 
     def _look_again(self) -> tuple[str, ...]:
         """Begin what was given up once more, before all is over; the lines that say so."""
