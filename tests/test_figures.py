@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -9,7 +11,7 @@ from run_data import IMAGE, VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from replay.export import figures
-from replay.export.figures import decision, draw_figures, polynomial_fit
+from replay.export.figures import decision, draw_figures, modules, polynomial_fit, streams
 from replay.export.history import Output, read_history
 
 
@@ -93,3 +95,69 @@ def test_the_fit_finds_a_cubic_and_survives_two_places():
     places = np.array([0.4, 0.6, 0.4, 0.6])
     fit = polynomial_fit(places, np.array([1.0, 3.0, 1.0, 3.0]))
     np.testing.assert_allclose(fit(np.array([0.4, 0.6])), [1.0, 3.0])
+
+
+def by_progress(signals):
+    """The record as a progress learner would have it: the streams end learned, known, given up."""
+    states = [1, 2, 3] if signals.iteration >= 20 else [0, 0, 0]
+    none = np.full(np.shape(signals.eta_dot), np.nan)
+    known_by = {0: 1, 1: 2}.get(signals.stream, 0) if signals.iteration >= 20 else 0
+    return dataclasses.replace(
+        signals,
+        R=np.empty((0, 2, 0)),
+        eta_dot=none,
+        tested=np.nan if signals.iteration == 0 else signals.tested,
+        known_by=known_by,
+        state=np.array(states),
+    )
+
+
+def test_the_progress_learner_has_one_figure_of_its_streams(tmp_path):
+    learner = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
+    records = write_run(
+        tmp_path / "run.mcap", VECTOR, 30, saves=True, learner=learner, edit=by_progress
+    )
+    files = {file.stem for file in draw_figures(tmp_path)}
+    assert files == {"streams", "modules"}
+    history = read_history(tmp_path)
+    figure = streams(history)
+    lanes, error, slowness, watched = figure.axes
+    (became,) = lanes.child_axes
+    labels = [text.get_text() for text in became.get_yticklabels()]
+    assert labels == ["learned by 1", "known by 2", "given up"]
+    assert len(lanes.patches) == 2 * 3
+    for s, line in enumerate(error.lines[:3]):
+        own = [r for r in records if r.stream == s]
+        np.testing.assert_array_equal(line.get_xdata(), [r.iteration for r in own])
+        expected = [np.nan if np.isnan(r.tested) else r.learning_error for r in own]
+        np.testing.assert_array_equal(line.get_ydata(), expected)
+    for axes in (error, slowness, watched):
+        assert any(np.isfinite(line.get_ydata()).any() for line in axes.lines)
+
+
+def test_what_the_world_does_not_tell_takes_no_room(tmp_path):
+    spec = dataclasses.replace(VECTOR, truth=())
+    write_run(tmp_path / "run.mcap", spec, 30, saves=True)
+    figure = modules(read_history(tmp_path))
+    assert len(figure.axes) == len(read_history(tmp_path).outputs)
+
+
+def test_a_module_of_one_stream_alone_is_shown_with_all_that_its_candidate_said(tmp_path):
+    heard = {}
+    for algorithm in ("progress", "2.0"):
+        run = tmp_path / algorithm
+        run.mkdir()
+        table = {"algorithm": algorithm}
+        written = write_run(
+            run / "run.mcap",
+            VECTOR,
+            30,
+            saves=True,
+            learner=table,
+            edit=lambda r: dataclasses.replace(r, stream=0),
+        )
+        heard[algorithm] = read_history(run).outputs[1].t[0]
+    said = [r for r in written if np.isfinite(r.y).all()]
+    first_save = next(r.t for r in written if r.saved)
+    assert heard["progress"] == said[0].t
+    assert heard["2.0"] == next(r.t for r in said if r.t > first_save)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from replay.runs.compare import side_by_side
+from replay.view import overlay
 from replay.view.overlay import build_overlay
 
 
@@ -41,7 +45,7 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
     found = {}
     reader = RrdReader(str(out))
     for chunk in reader.stream():
-        if not chunk.is_static and chunk.entity_path.endswith(("/epsilon", "/1_x1")):
+        if not chunk.is_static and chunk.entity_path.endswith(("/epsilon", "R_stay/1_x1")):
             batch = chunk.to_record_batch()
             assert batch.column("iteration").to_pylist() == list(range(12))
             found[chunk.entity_path] = batch.column("Scalars:scalars").flatten().to_numpy()
@@ -53,6 +57,50 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         np.testing.assert_array_equal(found[f"/compare/{name}/R_stay/1_x1"], stay)
     with pytest.raises(UsageError, match="--force"):
         build_overlay(runs, side_by_side(runs), out)
+
+
+def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
+    def tell_errors_alone(signals):
+        none = {name: np.full(np.shape(getattr(signals, name)), np.nan) for name in ("eta_dot",)}
+        bare = dict.fromkeys(("xi", "share"), np.nan)
+        return dataclasses.replace(signals, **none, **bare, R=np.empty((0, 2, 0)))
+
+    written = write_run(tmp_path / "run.mcap", VECTOR, 12, edit=tell_errors_alone)
+    tabs = []
+
+    def take(*found, **_):
+        tabs.extend(found)
+        return blueprint(*found, name="Comparison")
+
+    blueprint = overlay.blueprint
+    monkeypatch.setattr(overlay, "blueprint", take)
+    out = tmp_path / "all.rrd"
+    build_overlay([tmp_path], side_by_side([tmp_path]), out)
+    assert [tab.name for tab in tabs] == ["Overview", "Streams", "All curves"]
+    names = [view.name for view in tabs[-1].contents]
+    assert names == [overlay.CURVES[n] for n in CURVES_LEFT]
+    views = [view for tab in tabs for view in views_of(tab)]
+    assert len({id(view) for view in views}) == len(views)  # a view has one place
+    found = {}
+    for chunk in RrdReader(str(out)).stream():
+        if not chunk.is_static:
+            batch = chunk.to_record_batch()
+            found[chunk.entity_path] = batch
+    for view in views:
+        assert all(entity in found for entity in view.contents if isinstance(view.contents, list))
+    name = tmp_path.name
+    own = [s.iteration for s in written if s.stream == 1]
+    batch = found[f"/compare/1_{name}/learning_error_of/2_x2"]
+    assert batch.column("iteration").to_pylist() == own
+
+
+CURVES_LEFT = ("eta", "learning_error", "tested", "epsilon")
+
+
+def views_of(part):
+    """All views in a container."""
+    inner = [] if isinstance(part, rrb.View) else part.contents
+    return [part] if isinstance(part, rrb.View) else [v for one in inner for v in views_of(one)]
 
 
 def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.signals import STATES
 from recorder.log.whole import whole
 from replay.export.history import History, read_history
-from replay.palette import GREY, VERMILLION, Rgb, colour
+from replay.palette import CYCLE, GREY, VERMILLION, Rgb, colour
+from replay.palette import STATES as STATE_COLOURS
 from replay.runs.folders import run_log
 
 INCHES = 7.0
@@ -74,7 +78,7 @@ def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) ->
 def convergence(history: History) -> Figure | None:
     """Slowness, its change against delta, and where modules were saved."""
     outline, delta = history.outline, history.outline.header.delta
-    if not outline.iterations:
+    if not outline.told & {"eta_dot"}:
         return None
     figure, (top, bottom) = _panels(1.0, 1.4)
     k = np.arange(outline.iterations)
@@ -101,18 +105,15 @@ def convergence(history: History) -> Figure | None:
 def decision(history: History) -> Figure | None:
     """What was watched, what staying was worth, the policy, and exploration."""
     outline, names, shown = history.outline, history.outline.names(), history.shown
-    if not outline.iterations:
+    if not outline.iterations or outline.header.by_progress:
         return None
     figure, (watched, reward, policy, epsilon) = _panels(1.0, 1.2, 0.4 + 0.2 * len(shown), 0.6)
     k = np.arange(outline.iterations)
-    window = max(min(50, outline.iterations // 4), 1)
-    for s in shown:
-        share = np.convolve(history.stream == s, np.ones(window) / window, mode="same")
-        watched.plot(k, share, color=_css(colour(s)), label=names[s])
+    _share(watched, history)
     for row, s in enumerate(shown):
-        reward.plot(k, history.stay_reward[:, row], color=_css(colour(s)), label=names[s])
+        reward.plot(k, history.stay_reward[:, row], color=_shade(history, s), label=names[s])
         stays = history.policy[:, row] == 0
-        lane = {"where": stays, "step": "mid", "linewidth": 0, "color": _css(colour(s))}
+        lane = {"where": stays, "step": "mid", "linewidth": 0, "color": _shade(history, s)}
         policy.fill_between(k, row - 0.4, row + 0.4, **lane)
     finite = history.stay_reward[np.isfinite(history.stay_reward)]
     if finite.size:
@@ -120,17 +121,101 @@ def decision(history: History) -> Figure | None:
         reward.set_ylim(low - 0.1 * (high - low) - 1e-12, high + 0.2 * (high - low) + 1e-12)
     epsilon.plot(k, np.minimum(outline.lines["epsilon"], 1.0), color=_css(GREY))
     epsilon.set_ylim(0, 1.05)
-    watched.set_ylabel(f"share of time\n({window} iterations)")
     reward.set_ylabel("R for staying")
     policy.set_yticks(range(len(shown)), [names[s] for s in shown])
     policy.set_ylabel("policy: stay")
     policy.grid(False)
     epsilon.set_ylabel("random ε")
-    for axes in (watched, reward, policy, epsilon):
-        for save in outline.saved:
-            axes.axvline(save.iteration, color=_css(VERMILLION), linewidth=0.8)
+    _mark_saves((watched, reward, policy, epsilon), history)
     _finish(epsilon, watched)
     return figure
+
+
+def streams(history: History) -> Figure | None:
+    """What became of each stream of the progress learner, and how that was learned."""
+    outline, shown = history.outline, history.shown
+    if not outline.iterations or not outline.header.by_progress:
+        return None
+    figure, panels = _panels(0.5 + 0.12 * len(history.lanes), 1.3, 1.1, 0.9)
+    lanes, error, slowness, watched = panels
+    _state_lanes(lanes, history)
+    others = [s for s in history.lanes if s not in shown]
+    for s in (*others, *shown):
+        k = np.flatnonzero(history.stream == s)
+        style = {"color": _shade(history, s), "alpha": 1.0 if s in shown else 0.4}
+        error.plot(k, history.error[k], **style)
+        slowness.plot(k, history.tested[k], **style)
+        slowness.plot(k, history.fitted[k], ":", **style)
+    if outline.header.settled is not None:
+        error.axhline(outline.header.settled[1], color=_css(GREY), linestyle="--", linewidth=0.8)
+    for axes in (error, slowness):
+        axes.set_yscale("log")
+    _share(watched, history)
+    error.set_ylabel("learning error e")
+    slowness.set_ylabel("slowness, tested\n(dotted: fitted)\n[1/frame]")
+    watched.set_ylim(0, 1.4)
+    _mark_saves((error, slowness, watched), history)
+    _finish(watched, watched)
+    return figure
+
+
+def _state_lanes(axes: Axes, history: History) -> None:
+    """A bar for each stream in the colours of its states, with marks where it was watched."""
+    names, n = history.outline.names(), history.outline.iterations
+    for row, s in enumerate(history.lanes):
+        state = history.state[:, row]
+        edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), n]
+        for start, stop in pairwise(edges):
+            face = _css(STATE_COLOURS[int(state[start])])
+            bar = {"left": start, "height": 0.55, "color": face, "edgecolor": "grey"}
+            axes.barh(row - 0.12, stop - start, linewidth=0.4, **bar)
+        watched = np.flatnonzero(history.stream == s)
+        axes.vlines(watched + 0.5, row + 0.19, row + 0.42, color=_shade(history, s), linewidth=0.6)
+    rows = range(len(history.lanes))
+    axes.set_yticks(rows, [names[s] for s in history.lanes])
+    became = axes.secondary_yaxis("right")
+    became.set_yticks(rows, [_became(history, row) for row in rows])
+    for side in (axes, became):
+        side.tick_params(axis="y", length=0)
+    axes.set_ylim(len(history.lanes) - 0.4, -0.6)
+    axes.set_xlim(0, n)
+    axes.grid(False)
+    found = np.unique(history.state).tolist()
+    patches = [Patch(facecolor=_css(STATE_COLOURS[code]), edgecolor="grey") for code in found]
+    words = [STATES[code].replace("_", " ") for code in found]
+    where = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 4}
+    axes.legend(patches, words, title="what became of each stream; marks: it was watched", **where)
+
+
+def _became(history: History, row: int) -> str:
+    """What became of a stream, with the module that gives what it shows."""
+    state, stream = int(history.state[-1, row]), history.lanes[row]
+    text = STATES[state].replace("_", " ")
+    modules = history.known_by[(history.stream == stream) & (history.known_by > 0)]
+    return f"{text} by {modules[-1]}" if text in ("learned", "known") and len(modules) else text
+
+
+def _share(axes: Axes, history: History) -> None:
+    """How much of the iterations around each went to each stream."""
+    n, names = history.outline.iterations, history.outline.names()
+    window = max(min(50, n // 4), 1)
+    for s in history.shown:
+        share = np.convolve(history.stream == s, np.ones(window) / window, mode="same")
+        axes.plot(np.arange(n), share, color=_shade(history, s), label=names[s])
+    axes.set_ylabel(f"share of time\n({window} iterations)")
+
+
+def _shade(history: History, stream: int) -> tuple[float, float, float]:
+    """Colour of a stream; of many streams those shown have the colours to themselves."""
+    if len(history.outline.names()) <= len(CYCLE):
+        return _css(colour(stream))
+    return _css(colour(history.shown.index(stream)) if stream in history.shown else GREY)
+
+
+def _mark_saves(panels: Sequence[Axes], history: History) -> None:
+    for axes in panels:
+        for save in history.outline.saved:
+            axes.axvline(save.iteration, color=_css(VERMILLION), linewidth=0.8)
 
 
 def modules(history: History) -> Figure | None:
@@ -138,18 +223,20 @@ def modules(history: History) -> Figure | None:
     if not history.outputs:
         return None
     spec = history.outline.header.spec
+    best = [output.best_truth() for output in history.outputs]
+    ratios = (2, 1) if any(best) else (1,)  # one column where the world tells nothing
     figure = Figure(figsize=(INCHES, 1.7 * len(history.outputs)), layout="constrained")
-    grid = figure.subplots(len(history.outputs), 2, squeeze=False, width_ratios=(2, 1))
-    for (over_time, against), output in zip(grid, history.outputs, strict=True):
-        shade = _css(colour(output.stream))
+    grid = figure.subplots(len(best), len(ratios), squeeze=False, width_ratios=ratios)
+    for row, output, found in zip(grid, history.outputs, best, strict=True):
+        shade = _shade(history, output.stream)
         shown = slice(-1000, None)
-        over_time.plot(output.t[shown], output.y[shown], ".", color=shade, markersize=2)
-        over_time.set_ylabel(f"module {output.module}\n{spec.streams[output.stream]}")
-        best = output.best_truth()
-        if best is None:
-            against.set_axis_off()
+        row[0].plot(output.t[shown], output.y[shown], ".", color=shade, markersize=2)
+        row[0].set_ylabel(f"module {output.module}\n{spec.streams[output.stream]}")
+        if found is None:
+            for against in row[1:]:
+                against.set_axis_off()
             continue
-        column, correlation = best
+        (column, correlation), against = found, row[1]
         truth = output.truth[:, column]
         step = max(len(truth) // MOST_POINTS, 1)
         against.plot(truth[::step], output.y[::step], ".", color=shade, markersize=2, alpha=0.4)
@@ -181,7 +268,7 @@ def contact_sheet(history: History) -> Figure | None:
         step = width + gap.shape[1]
         centres = width / 2 + step * np.arange(len(images))
         heard = [y for *_, y in strip.frames]
-        below.bar(centres, heard, width / 2, color=_css(colour(strip.stream)))
+        below.bar(centres, heard, width / 2, color=_shade(history, strip.stream))
         below.axhline(0, color="black", linewidth=0.5)
         below.set_xlim(0, step * len(images))
         below.set_xticks(centres, [f"t = {t}" for t, *_ in strip.frames], fontsize=6)
@@ -192,6 +279,7 @@ def contact_sheet(history: History) -> Figure | None:
 FIGURES: dict[str, Callable[[History], Figure | None]] = {
     "convergence": convergence,
     "decision": decision,
+    "streams": streams,
     "modules": modules,
     "contact_sheet": contact_sheet,
 }
@@ -214,8 +302,9 @@ def _finish(last: Axes, explained: Axes) -> None:
     explained.legend(loc="upper right", ncols=4, fontsize=7)
 
 
-def _css(rgb: Rgb) -> tuple[float, ...]:
-    return tuple(part / 255 for part in rgb)
+def _css(rgb: Rgb) -> tuple[float, float, float]:
+    red, green, blue = rgb
+    return red / 255, green / 255, blue / 255
 
 
 def _write(figure: Figure, target: Path) -> None:

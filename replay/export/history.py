@@ -30,6 +30,10 @@ SHOWN = 6
 """Streams and modules that are drawn: the most watched, the first learned."""
 
 
+LANES = 40
+"""Streams whose states are drawn: the most watched."""
+
+
 @dataclass(frozen=True, slots=True)
 class Output:
     """What a frozen module says about its own stream.
@@ -76,6 +80,10 @@ class History:
         eta: (n, J), as eta_dot.
         stay_reward: (n, shown) R(s, stay, s).
         policy: (n, shown) 0 stay, 1 switch.
+        lanes: the streams whose states are drawn; state: (n, lanes) what became of each.
+        known_by: (n,) module that gives what the watched stream shows, from 1.
+        error: (n,) learning error of the candidate, NaN where it was not tested yet; so are
+            tested and fitted, its slowness on new frames and on those it learned from.
     """
 
     outline: Outline
@@ -85,6 +93,12 @@ class History:
     eta_dot: Float
     stay_reward: Float
     policy: NDArray[np.int64]
+    lanes: tuple[int, ...]
+    state: NDArray[np.int64]
+    known_by: NDArray[np.int64]
+    error: Float
+    tested: Float
+    fitted: Float
     outputs: tuple[Output, ...]
     pictures: tuple[Strip, ...]
 
@@ -96,36 +110,56 @@ def read_history(path: Path) -> History:
     stream = np.empty(n, dtype=np.int64)
     policy = np.empty((n, len(shown)), dtype=np.int64)
     stay = np.full((n, len(shown)), np.nan)
-    heard = [_OutputCollector(save.module, save.stream) for save in outline.saved[:SHOWN]]
+    lanes, known_by = outline.streams(LANES), np.empty(n, dtype=np.int64)
+    state = np.empty((n, len(lanes)), dtype=np.int64)
+    heard = [
+        _OutputCollector(save.module, save.stream, alone=header.by_progress)
+        for save in outline.saved[:SHOWN]
+    ]
     at = 0
     for columns in read_columns(path, header):
         rows = slice(at, at := at + len(columns))
         stream[rows] = columns["stream"]
         policy[rows] = columns["policy"][:, shown]
+        state[rows], known_by[rows] = columns["state"][:, lanes], columns["known_by"]
         if columns["R"].size:
             stay[rows] = columns["R"][:, shown, 0, shown]
         for module in heard:
             module.add(columns)
     truth = _truth(path, header) if header.spec.truth else None
     outputs = tuple(module.output(truth) for module in heard if module.blocks)
+    lines = outline.lines
+    untested = np.isnan(lines["tested"])
     return History(
         outline=outline,
         shown=tuple(shown),
         stream=stream,
-        eta=outline.lines["eta"].reshape(n, outline.outputs),
-        eta_dot=outline.lines["eta_dot"].reshape(n, outline.outputs),
+        eta=lines["eta"].reshape(n, outline.outputs),
+        eta_dot=lines["eta_dot"].reshape(n, outline.outputs),
         stay_reward=stay,
         policy=policy,
+        lanes=tuple(lanes),
+        state=state,
+        known_by=known_by,
+        error=np.where(untested, np.nan, lines["learning_error"]),
+        tested=lines["tested"],
+        fitted=np.where(untested, np.nan, lines["fitted"]),
         outputs=outputs,
         pictures=_pictures(path, header, outputs) if header.spec.images else (),
     )
 
 
 class _OutputCollector:
-    """What a module says whenever its own stream is watched; at its save, what it last said."""
+    """What a module says whenever its own stream is watched; at its save, what it last said.
 
-    def __init__(self, module: int, stream: int) -> None:
-        self._module, self._stream = module, stream
+    Args:
+        module: its number.
+        stream: its own.
+        alone: it was learned from its own stream alone, while others were learned from theirs.
+    """
+
+    def __init__(self, module: int, stream: int, *, alone: bool) -> None:
+        self._module, self._stream, self._alone = module, stream, alone
         self.blocks: list[tuple[int, Float]] = []
 
     def add(self, columns: SignalColumns) -> None:
@@ -135,7 +169,8 @@ class _OutputCollector:
             self.blocks += zip(columns.frames[own].tolist(), said, strict=True)
             return
         # Before it is frozen the abstraction still changes: only its last blocks count.
-        own &= (columns["module"] == self._module) & np.isfinite(columns["y"]).all(axis=(1, 2))
+        own &= self._alone | (columns["module"] == self._module)
+        own &= np.isfinite(columns["y"]).all(axis=(1, 2))
         self.blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
         del self.blocks[: -LAST_BLOCKS - int(columns["saved"][own].any())]
 

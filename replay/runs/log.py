@@ -54,6 +54,15 @@ class RunHeader:
         """Whether it is a run of the progress learner."""
         return bool(self.setting("learner", "algorithm") == "progress")
 
+    @property
+    def settled(self) -> tuple[float, float] | None:
+        """Change and learning error below which a stream is learned, of the progress learner."""
+        change = self.setting("learner", "settled")
+        agreement = self.setting("learner", "agreement")
+        if not isinstance(change, int | float) or not isinstance(agreement, int | float):
+            return None
+        return float(change), float(change + agreement)
+
     def setting(self, section: str, key: str) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`, or None."""
         config = self.manifest.get("config")

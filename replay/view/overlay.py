@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +25,21 @@ CURVES = {
     "xi": "Change of weights ξ",
     "reward": "Reward",
     "share": "Share of novel blocks",
+    "learning_error": "Learning error of the stream that is watched",
+    "tested": "Slowness on new frames, of the stream that is watched [1/frame]",
     "epsilon": "Exploration ε",
 }
-"""Signals that are overlaid, with the titles of their panels."""
+"""Signals that are overlaid where a run tells them, with the titles of their panels."""
 
 FIRST_TAB = ("eta_dot", "epsilon")
+"""Those of the first tab; of the progress learner the errors of its streams stand there."""
 
 R_STAY = "R_stay"
+
+OF_STREAM, ERROR_OF = "learning_error_of", "Learning error of"
+
+FIRST = 3
+"""Streams of the first tab."""
 
 
 def build_overlay(
@@ -82,26 +90,32 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
     shown = row.outline.streams(MOST_STREAMS)
     lines: dict[str, Column] = {}
     for columns in read_columns(run, header):
-        for entity, values in _curves(columns, header.spec.streams, shown):
-            path, rows = f"{root}/{entity}", values.reshape(len(columns), -1)
+        for entity, kept, values in _curves(columns, header.spec.streams, shown):
+            path, rows = f"{root}/{entity}", values.reshape(int(kept.sum()), -1)
             if path not in lines:
                 width = rows.shape[1]
                 names, rgbs = [row.name] * width, [colour(number)] * width
                 lines[path] = line_column(recording, header.spec, path, names, rgbs)
-            lines[path].add(*columns.times(), rows)
+            lines[path].add(columns.frames[kept], columns.iterations[kept], rows)
     for line in lines.values():
         line.flush()
 
 
 def _curves(
     columns: SignalColumns, names: Sequence[str], shown: Sequence[int]
-) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    """Entity and values of every curve in some iterations."""
+) -> Iterator[tuple[str, NDArray[np.bool_], NDArray[np.float64]]]:
+    """Entity of every curve in some iterations, in which of them it has values, and these."""
+    every = np.ones(len(columns), dtype=bool)
     for name in CURVES:
-        yield name, columns[name].astype(np.float64)
-    if columns["R"].size:
-        for s in shown:
-            yield f"{R_STAY}/{part(names, s)}", columns["R"][:, s, 0, s]
+        yield name, every, columns[name].astype(np.float64)
+    for s in shown:
+        if columns["R"].size:
+            yield f"{R_STAY}/{part(names, s)}", every, columns["R"][:, s, 0, s]
+        own = columns["stream"] == s
+        if own.any():
+            untested = np.isnan(columns["tested"][own])
+            error = np.where(untested, np.nan, columns["learning_error"][own])
+            yield f"{OF_STREAM}/{part(names, s)}", own, error
 
 
 def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
@@ -112,17 +126,28 @@ def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
     def panel(title: str, entity: str) -> rrb.View:
         return lines(title, [f"{root}/{entity}" for root in roots], axis)
 
+    told = frozenset[str]().union(*(row.outline.told for row in rows))
     streams = outline.names()
-    rewards = [
-        panel(f"R for staying on {label(streams[s])}", f"{R_STAY}/{part(streams, s)}")
-        for s in outline.streams(MOST_STREAMS)
+
+    def by_stream(title: str, entity: str, most: int = MOST_STREAMS) -> list[rrb.View]:
+        shown = [(label(streams[s]), part(streams, s)) for s in outline.streams(most)]
+        return [panel(f"{title} {stream}", f"{entity}/{place}") for stream, place in shown]
+
+    def curves(names: Iterable[str]) -> list[rrb.View]:
+        return [panel(CURVES[name], name) for name in names if name in told]
+
+    first = curves(FIRST_TAB) if "eta_dot" in told else by_stream(ERROR_OF, OF_STREAM, FIRST)
+    rewards = by_stream("R for staying on", R_STAY) if "R" in told else []
+    errors = by_stream(ERROR_OF, OF_STREAM) if "learning_error" in told else []
+    tabs = [
+        *([rrb.Vertical(*rewards, name="Rewards")] if rewards else []),
+        *([rrb.Vertical(*errors, name="Streams")] if errors else []),
     ]
-    first = [panel(CURVES[name], name) for name in FIRST_TAB]
     table = rrb.TextDocumentView(origin="/summary", name="Runs")
     return blueprint(
         rrb.Horizontal(table, rrb.Vertical(*first), column_shares=[2, 4], name="Overview"),
-        rrb.Vertical(*rewards, name="Rewards"),
-        rrb.Grid(*(panel(title, name) for name, title in CURVES.items()), name="All curves"),
+        *tabs,
+        rrb.Grid(*curves(CURVES), name="All curves"),
         name="Comparison",
         timeline=ITERATION,
     )

@@ -49,13 +49,12 @@ def add_streams(
 
 def thresholds(header: RunHeader) -> dict[str, tuple[str, float]]:
     """Label and value of the lines below which a stream is learned, by entity."""
-    settled = header.setting("learner", "settled")
-    agreement = header.setting("learner", "agreement")
-    if not all(isinstance(value, int | float) for value in (settled, agreement)):
+    if header.settled is None:
         return {}
+    change, error = header.settled
     return {
-        "streams/settled": ("settled", float(settled)),
-        "streams/threshold": ("settled + agreement", float(settled + agreement)),
+        "streams/settled": ("settled", change),
+        "streams/threshold": ("settled + agreement", error),
     }
 
 

@@ -83,7 +83,8 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
         learning = outline.states[s] == STATES.index("learning")
         became = "being learned" if learning else said.get(names[s], "").removeprefix("is ")
         lines.append(f"- **{names[s]}**: {became}")
-    return [*lines, ""]
+    more = len(names) - MOST_STREAMS
+    return [*lines, "", *([f"And {more} streams that were watched less.", ""] if more > 0 else [])]
 
 
 def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:
