@@ -17,7 +17,8 @@ import pytest
 from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.core.errors import NotReproducedError, UsageError
 from cdmisfa.experiments.documents import versions
-from cdmisfa.paper import difficulty, icub, nonstationary, reproduce
+from cdmisfa.experiments.trial import run_trial
+from cdmisfa.paper import costs, difficulty, icub, nonstationary, oscillatory, reproduce
 from cdmisfa.paper.reproduce import Request, Trial
 from recorder.world.oscillatory import OscillatorySource
 
@@ -28,7 +29,7 @@ def request(folder: Path, trials: int | None = None, **keys: Any) -> Request:
     return Request(trials, True, None, folder, **keys)
 
 
-@pytest.mark.parametrize("name", ["oscillatory", "stability", "difficulty"])
+@pytest.mark.parametrize("name", ["oscillatory", "five", "stability", "costs", "difficulty"])
 def test_quick_runs_reproduce_the_claim_and_write_everything(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -39,7 +40,8 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
     assert json.loads((folder / "results.json").read_text()) == document
     assert document["versions"] == versions()
     assert (folder / "table.md").read_text().startswith("| quantity | paper | ours |")
-    assert {Path(f).suffix for f in document["figures"]} == {".png", ".svg"}
+    drawn = set() if name in ("five", "costs") else {".png", ".svg"}
+    assert {Path(f).suffix for f in document["figures"]} == drawn
     assert all((folder / figure).stat().st_size > 1000 for figure in document["figures"])
     parquet = pytest.importorskip("pyarrow.parquet")
     assert parquet.read_table(folder / "rows.parquet").num_rows == document["trials"]
@@ -133,6 +135,22 @@ def test_a_claim_that_fails_exits_4(
 def _unstable(settings: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     row = {"exploration_ends": 1, "changes": 1, "before": "011", "after": "101"}
     return row, {"R": np.zeros((9, 3)), "policy": np.eye(9, 3, dtype=np.int8)}
+
+
+@pytest.mark.parametrize("algorithm", ["1.0", "2.0"])
+def test_a_key_that_is_not_counted_for_an_algorithm_changes_nothing(algorithm: str) -> None:
+    def learned(**keys: Any) -> Any:
+        config = oscillatory.learner_config(algorithm=algorithm, warm_up=2, **keys)
+        result = run_trial(config, seed=1, max_iterations=1200, max_modules=2)
+        return [(m.iteration, m.phi.tolist()) for m in result.modules], result.iterations
+
+    uncounted = {*costs.OWN["1.0"], *costs.OWN["2.0"]} - set(costs.parameters(algorithm))
+    other = {"delta": 1e-5, "gate_window": 5, "alpha": 0.5, "roc_centres": 3, "roc_radius": 1.0}
+    other |= {"roc_memory": 10, "roc_error": 0.01}
+    unchanged = learned()
+    assert unchanged[0]
+    assert learned(**{key: other[key] for key in uncounted}) == unchanged
+    assert learned(**{key: other[key] for key in costs.OWN[algorithm]}) != unchanged
 
 
 def test_check_names_every_failed_claim() -> None:
@@ -249,10 +267,18 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
         "iterations": 1400,
     }
     wrong = good | {"streams": [0, 2, 1], "policies": ["011", "110", "101"]}
-    trials = [Trial({}, good, arrays), Trial({}, good, arrays)]
+    new, old, loose = ({"algorithm": a, "roc_error": error} for a, error in icub.LEARNERS)
+    one = good | {"streams": [0], "policies": ["011"]}
+    trials = [Trial(new, good, arrays), Trial(new, good, arrays)]
+    trials += [Trial(old, one, arrays), Trial(loose, good, arrays)]
     assert all(claim.holds for claim in icub.evaluate(trials).claims)
-    claims = icub.evaluate([*trials, Trial({}, wrong, arrays)]).claims
-    assert [claim.holds for claim in claims] == [True, False]
+    claims = icub.evaluate([*trials, Trial(new, wrong, arrays)]).claims
+    assert [claim.holds for claim in claims] == [True, False, True]
+    claims = icub.evaluate([*trials, Trial(old, good, arrays)]).claims
+    assert [claim.holds for claim in claims] == [True, True, False]
+    of_the_old = [line for line in icub.evaluate(trials).lines if line.quantity.startswith("1.0")]
+    learned = [line.ours.mean for line in of_the_old if "correlation" not in line.quantity]
+    assert learned == [1.0, 0.0, 2.0, 1.0]  # modules and both in order, of each threshold
     assert len(icub.draw(trials, tmp_path)) == 4
 
 

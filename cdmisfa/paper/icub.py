@@ -22,7 +22,17 @@ from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import learn
 from cdmisfa.experiments.statistics import correlation
 from cdmisfa.paper import panels
-from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, learned
+from cdmisfa.paper.reproduce import (
+    Claim,
+    Findings,
+    Line,
+    Output,
+    Request,
+    Settings,
+    Trial,
+    groups,
+    learned,
+)
 from replay.recordings.source import RecordedSource
 
 TITLE = "Curiosity-driven, vision-enabled iCub"
@@ -43,18 +53,28 @@ LIVE = "live"
 """In place of a recording: render what each trial looks at."""
 
 
-def learner_config() -> LearnerConfig:
-    """The iCub preset."""
-    return build(LearnerConfig, "learner", load_preset("icub")["learner"])
+LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))
+"""Algorithm and 1.0's threshold of the clustering error: that of decision 0014, and a looser one.
+
+As 1.0's labels serve the head's positions.
+"""
+
+
+def learner_config(**keys: Any) -> LearnerConfig:
+    """The iCub preset with some keys set."""
+    return build(LearnerConfig, "learner", load_preset("icub")["learner"], keys)
 
 
 def plan(request: Request) -> list[dict[str, Any]]:
-    """10 trials that differ in their seed, on one recording; it is made where none is given."""
-    seeds = range(request.count(10, 2))
-    if str(request.recording) == LIVE:
-        return [{"recording": LIVE, "identity": None, "seed": seed} for seed in seeds]
-    path = str(recording_of(request))
-    return [{"recording": path, "identity": identity(path), "seed": seed} for seed in seeds]
+    """10 seeds of each learner, on one recording; it is made where none is given."""
+    live = str(request.recording) == LIVE
+    path = LIVE if live else str(recording_of(request))
+    source = {"recording": path, "identity": None if live else identity(path)}
+    return [
+        {**source, "algorithm": algorithm, "roc_error": roc_error, "seed": seed}
+        for algorithm, roc_error in LEARNERS
+        for seed in range(request.count(10, 2))
+    ]
 
 
 def recording_of(request: Request) -> Path:
@@ -95,8 +115,9 @@ def open_world(settings: Settings) -> FrameSource:
 
 def run(settings: Settings) -> Output:
     """One trial: 1400 iterations, or as many as the recording has."""
+    config = learner_config(algorithm=settings["algorithm"], roc_error=settings["roc_error"])
     with contextlib.closing(open_world(settings)) as source:
-        return watch(source, learner_config(), settings["seed"], ITERATIONS)
+        return watch(source, config, settings["seed"], ITERATIONS)
 
 
 class Curves(Sink):
@@ -150,32 +171,54 @@ def watch(source: FrameSource, config: LearnerConfig, seed: int, iterations: int
 
 
 def evaluate(trials: Sequence[Trial]) -> Findings:
-    """Object 1, then object 3, with the optimal policies, and no third module."""
-    n = len(trials)
-    found = [tuple(zip(t.row["streams"], t.row["policies"], strict=True)) for t in trials]
-    good = sum(f[:2] == OPTIMAL for f in found)
-    ended = sum(len(f) == 2 for f in found)
+    """Object 1, then object 3, with the optimal policies, and no third module; by 2.0 only."""
+    new, old, loose = (groups(trials, "algorithm", "roc_error")[which] for which in LEARNERS)
+    n, good = len(new), _in_order(new)
+    ended = sum(len(t.row["streams"]) == 2 for t in new)
     lines = [
         Line.share("trials with both modules and policies optimal", "10 of 10", good, n),
         Line.share("trials without a third module", "10 of 10", ended, n),
-        Line.measured("iterations in all", [t.row["iterations"] for t in trials], digits=0),
+        Line.measured("iterations in all", [t.row["iterations"] for t in new], digits=0),
     ]
     for i, name in enumerate(OBJECTS):
         module = f"module {i + 1}"
         follows = f"correlation of {module} with {name}"
         lines += [
-            Line.of_module(f"{module} saved at iteration", trials, "saved_at", i, digits=0),
-            Line.of_module(follows, trials, "correlation", i, "encodes it"),
+            Line.of_module(f"{module} saved at iteration", new, "saved_at", i, digits=0),
+            Line.of_module(follows, new, "correlation", i, "encodes it (figure)"),
         ]
+    for (_, threshold), group in zip(LEARNERS[1:], (old, loose), strict=True):
+        at = f"1.0, threshold {threshold:g}"
+        modules = [len(t.row["streams"]) for t in group]
+        both = f"{at}: trials with both modules and policies optimal"
+        lines += [
+            Line.measured(f"{at}: modules learned", modules, digits=1),
+            Line.share(both, "not applicable (text)", _in_order(group), len(group)),
+        ]
+        for i, name in enumerate(OBJECTS):
+            follows = f"{at}: correlation of module {i + 1} with {name}"
+            lines.append(Line.of_module(follows, group, "correlation", i))
     claims = [
         Claim.of_all("object 1 with [0,1,1], then object 3 with [1,1,0]", good, n),
         Claim.of_all("no third module is learned", ended, n),
+        Claim.of_all("1.0 does not learn both", len(old) - _in_order(old), len(old)),
     ]
-    return Findings(lines, claims)
+    note = (
+        "1.0 is given the head's positions as labels. Correlations are over the last "
+        f"{SHOWN} frames before a module was saved."
+    )
+    return Findings(lines, claims, [note])
+
+
+def _in_order(trials: Sequence[Trial]) -> int:
+    """How many trials began with both modules as they should be."""
+    found = [tuple(zip(t.row["streams"], t.row["policies"], strict=True)) for t in trials]
+    return sum(f[:2] == OPTIMAL for f in found)
 
 
 def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
     """Value function, policy, eta-dot; the modules' outputs over time and against the objects."""
+    trials = [t for t in trials if t.settings["algorithm"] == "2.0"]
     drawn, axes = panels.figure(1, 3)
     panels.values(axes[0, 0], trials, "c")
     panels.policies(axes[0, 1], trials, "d", "policy, mean and SD")

@@ -30,8 +30,8 @@ from cdmisfa.experiments.statistics import Summary, summary, wilson
 from cdmisfa.experiments.store import DONE, TrialStore, code, identity
 from recorder.log.whole import whole
 
-NAMES = ("oscillatory", "stability", "nonstationary", "icub", "difficulty")
-"""The experiments, each a module of this package, in the order of the paper."""
+NAMES = ("oscillatory", "five", "stability", "costs", "nonstationary", "icub", "difficulty")
+"""The experiments, each a module of this package, in the order of their page."""
 
 SETTING = "set_"
 """How the columns of rows.parquet begin that hold a trial's settings."""

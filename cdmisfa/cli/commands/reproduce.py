@@ -42,10 +42,10 @@ def reproduce_command(
 ) -> None:
     """Reproduce an experiment of the paper: numbers, tables and figures.
 
-    NAME is oscillatory, stability, nonstationary, icub, difficulty or all. Finished trials
-    are kept and not run again; results of more or other trials than are asked for now are
-    not replaced without --force. Exit code 4 says that a claim of the paper did not come out.
-    Without NAME, --page makes the page from the results that are there.
+    NAME is oscillatory, five, stability, costs, nonstationary, icub, difficulty or all.
+    Finished trials are kept and not run again; results of more or other trials than are asked
+    for now are not replaced without --force. Exit code 4 says that a claim of the paper did
+    not come out. Without NAME, --page makes the page from the results that are there.
     """
     from cdmisfa.core.errors import UsageError
     from cdmisfa.paper.page import write_page
