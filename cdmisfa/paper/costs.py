@@ -187,7 +187,9 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     papers = len(PAPERS)
     instead = len(PAPERS) - len(set(PAPERS) & set(OWN["2.0"])) + len(OWN["1.0"])
     lines += [
-        Line.measured("hyper-parameters of 2.0, of those the paper lists", papers, "6", digits=0),
+        Line.measured(
+            "hyper-parameters of 2.0, of those the paper lists", papers, "6 (text)", digits=0
+        ),
         Line.measured("the same for 1.0", instead, "more (text)", digits=0),
         Line.measured("keys of the configuration that 2.0 uses", counts["2.0"], digits=0),
         Line.measured("keys of the configuration that 1.0 uses", counts["1.0"], digits=0),

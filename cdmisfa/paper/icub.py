@@ -176,8 +176,8 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     n, good = len(new), _in_order(new)
     ended = sum(len(t.row["streams"]) == 2 for t in new)
     lines = [
-        Line.share("trials with both modules and policies optimal", "10 of 10", good, n),
-        Line.share("trials without a third module", "10 of 10", ended, n),
+        Line.share("trials with both modules and policies optimal", "10 of 10 (text)", good, n),
+        Line.share("trials without a third module", "10 of 10 (text)", ended, n),
         Line.measured("iterations in all", [t.row["iterations"] for t in new], digits=0),
     ]
     for i, name in enumerate(OBJECTS):

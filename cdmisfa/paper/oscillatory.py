@@ -71,11 +71,11 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     good, n = sum(bool(t.row["optimal"]) for t in trials), len(trials)
     iterations = [t.row["iterations"] for t in trials]
     lines = [
-        Line.share("trials with order and policies optimal", "20 of 20", good, n),
+        Line.share("trials with order and policies optimal", "20 of 20 (text)", good, n),
         Line.measured("iterations until the third module", iterations, digits=0),
     ]
     for i, frequency in enumerate((4, 3, 2)):
-        module, paper = f"module {i + 1}", f"{frequency / 500:.4f}"
+        module, paper = f"module {i + 1}", f"{frequency / 500:.4f} (equation)"
         slowness = f"slowness of {module} on its stream (paper: its frequency)"
         lines += [
             Line.of_module(f"{module} saved at iteration", trials, "saved_at", i, digits=0),

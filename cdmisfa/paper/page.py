@@ -28,8 +28,9 @@ def write_page(root: Path, page: Path) -> None:
         "",
         "Made by `cdmisfa reproduce --page`; do not edit. Numbers are means over trials; SD is the",
         "standard deviation, n the number of trials. The paper's values are those that its tables",
-        "print; (text) marks what its text says, (figure) what was read from a figure. Where the",
-        "paper leaves something open, the readings are in [decisions](decisions/).",
+        "print; (text) marks what its text says, (equation) what follows from its equations,",
+        "(figure) what was read from a figure. Where the paper leaves something open, the readings",
+        "are in [decisions](decisions/).",
     ]
     for document in documents:
         name = document["experiment"]

@@ -59,10 +59,12 @@ def evaluate(trials: Sequence[Trial]) -> Findings:
     stable = sum(t.row["changes"] == 0 for t in new)
     optimal, n = sum(t.row["after"] == "011" for t in new), len(new)
     lines = [
-        Line.share("2.0: trials without a change of policy", "all", stable, n),
-        Line.share("1.0: trials with a change of policy", "all", unstable, n),
-        Line.measured("1.0: changes of policy after epsilon = 0", changes, ">= 1", digits=1),
-        Line.share("2.0: trials that end with [0,1,1]", "all", optimal, n),
+        Line.share("2.0: trials without a change of policy", "all (figure)", stable, n),
+        Line.share("1.0: trials with a change of policy", "all (figure)", unstable, n),
+        Line.measured(
+            "1.0: changes of policy after epsilon = 0", changes, ">= 1 (figure)", digits=1
+        ),
+        Line.share("2.0: trials that end with [0,1,1]", "all (figure)", optimal, n),
     ]
     claims = [
         Claim.of_all("2.0 keeps its policy after epsilon = 0", stable, n),
