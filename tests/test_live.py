@@ -55,6 +55,24 @@ def test_every_record_is_handed_over(spec, monkeypatch):
     assert len(sent["signals/epsilon"]) == 5
 
 
+def test_the_progress_learner_is_shown_by_its_streams(monkeypatch):
+    sent = {}
+
+    def keep(self, times, values):
+        sent.setdefault(self.path, []).append(np.array(values).reshape(-1))
+
+    monkeypatch.setattr("replay.view.columns.Column.send", keep)
+    monkeypatch.setattr(live, "MOST_BLOCKS", 7)
+    table = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
+    with LiveView(VECTOR, {"config": {"learner": table}}, 40, 1) as view:
+        feed(view, VECTOR)
+    records = [signals for signals, _ in run_of(VECTOR, 30, saves=True)]
+    for s, name in enumerate(VECTOR.streams):
+        found = np.concatenate(sent[f"streams/learning_error/{s + 1}_{name}"])
+        np.testing.assert_array_equal(found, [r.learning_error for r in records if r.stream == s])
+    assert not any(path.startswith("policy/") for path in sent)
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_it_listens_on_this_machine_only():
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:

@@ -119,7 +119,7 @@ def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
         own = [r for r in records if r.stream == s]
         tested = np.array([np.isfinite(r.tested) for r in own])
         assert 0 < tested.sum() < len(own) or s == 2
-        for signal in ("learning_error", "tested", "fitted"):
+        for signal in ("learning_error", "tested", "fitted", "change"):
             frames, found = column(rows, f"/streams/{signal}/{s + 1}_{name}", "Scalars:scalars")
             assert frames.tolist() == [r.t for r in own]
             expected = np.where(tested, [getattr(r, signal) for r in own], np.nan)

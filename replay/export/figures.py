@@ -147,7 +147,9 @@ def streams(history: History) -> Figure | None:
         slowness.plot(k, history.tested[k], **style)
         slowness.plot(k, history.fitted[k], ":", **style)
     if outline.header.settled is not None:
-        error.axhline(outline.header.settled[1], color=_css(GREY), linestyle="--", linewidth=0.8)
+        threshold = {"color": _css(GREY), "linestyle": "--", "linewidth": 0.8}
+        error.axhline(outline.header.settled[1], label="settled + agreement", **threshold)
+        error.legend(loc="lower left", fontsize=7)
     for axes in (error, slowness):
         axes.set_yscale("log")
     _share(watched, history)

@@ -13,7 +13,7 @@ from replay.runs.log import RunHeader
 from replay.view.columns import Column
 from replay.view.labels import part
 
-WATCHED = ("learning_error", "tested", "fitted")
+WATCHED = ("learning_error", "tested", "fitted", "change")
 """Signals of the stream that is watched; each stream has its line through its own blocks."""
 
 DIM = ("fitted",)

@@ -175,11 +175,11 @@ class Panels:
             row_shares=[3, 6, 3],
         )
 
-    def now(self) -> rrb.Container:
+    def now(self, weights: str = "Weights φ") -> rrb.Container:
         """Input and weights."""
         return rrb.Vertical(
             self.watched("Input x"),
-            self.weights("/abstraction/phi", "Weights φ"),
+            self.weights("/abstraction/phi", weights),
             row_shares=[2, 3],
         )
 

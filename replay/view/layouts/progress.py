@@ -13,6 +13,9 @@ MOST_WEIGHTS = 3
 HARDLY_WATCHED = 1000.0
 """Interest from which on a stream promises most because it was hardly watched."""
 
+FALL = 10
+"""Times the threshold of a change that its panel shows."""
+
 UNTESTED = 3.0
 """Learning error that stands for none, before anything was tested."""
 
@@ -32,11 +35,6 @@ def _overview(panels: Panels) -> rrb.Container:
         ["/streams/learning_error/**", "/streams/threshold", "/streams/saved"],
         panels.outline.span("learning_error", low=0.0, below=UNTESTED),
     )
-    slowness = panels.lines(
-        "Slowness on new frames (bright) and on those it learned from (dim) [1/frame]",
-        ["/streams/fitted/**", "/streams/tested/**"],
-        panels.outline.span("tested", "fitted", low=0.0),
-    )
     looks = panels.lines(
         "Where it looks: share of the last 50 blocks",
         ["/decision/attention"],
@@ -50,7 +48,7 @@ def _overview(panels: Panels) -> rrb.Container:
     story = stacked(
         ([lanes], heights(1 + streams)),
         (error, 190),
-        (slowness, 150),
+        (_slowness(panels), 150),
         (looks, 110),
         (interest, 110),
     )
@@ -70,29 +68,39 @@ def _looks_for(panels: Panels) -> rrb.Container | None:
     return rrb.Horizontal(*views) if views else None
 
 
+def _slowness(panels: Panels) -> list[rrb.View]:
+    return panels.lines(
+        "Slowness on new frames (bright) and on those it learned from (dim) [1/frame]",
+        ["/streams/fitted/**", "/streams/tested/**"],
+        panels.outline.span("tested", "fitted", low=0.0),
+    )
+
+
 def _candidate(panels: Panels) -> rrb.Container:
-    """What is being learned of the stream that is watched, as it comes."""
-    span, outline = panels.outline.span, panels.outline
-    slowness = ["eta", "fitted"] if outline.outputs > 1 else ["tested", "fitted"]
+    """What is being learned of the streams."""
+    outline = panels.outline
+    change, settled = outline.span("change", low=0.0), outline.header.settled
+    if change is not None and settled is not None:
+        change = 0.0, min(max(change[1], 2.5 * settled[0]), FALL * settled[0])
+    others = panels.lines("Slowness of each output on new frames [1/frame]", ["/signals/eta"])
     curves = stacked(
         ([panels.lanes("What it watches", "/lanes/1_stream")], heights(1)),
         (panels.lines("Output y on new frames", ["/signals/y"]), 130),
+        (_slowness(panels), 130),
+        (others if outline.outputs > 1 else [], 130),
         (
             panels.lines(
-                "Slowness on new frames, and on those it learned from [1/frame]",
-                [f"/signals/{name}" for name in slowness],
-                span(*slowness, low=0.0),
-            ),
-            130,
-        ),
-        (
-            panels.lines(
-                "Change of the output with a block: settled below learner.settled",
-                ["/signals/change", "/streams/settled"],
-                span("change", low=0.0),
+                "Change of the output with a block: settled below the line",
+                ["/streams/change/**", "/streams/settled"],
+                change,
             ),
             130,
         ),
         (panels.lines("Variance of the output on new frames", ["/signals/variance"]), 130),
     )
-    return rrb.Horizontal(panels.now(), curves, column_shares=[2, 5], name="Candidate")
+    return rrb.Horizontal(
+        panels.now("Weights φ of its candidate; white: it has none"),
+        curves,
+        column_shares=[2, 5],
+        name="Candidate",
+    )
