@@ -52,11 +52,28 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
             opened.ask(lambda client, v=view, g=grey: shows(client, v, g))
 
 
+BY_PROGRESS = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
+NAMED = {
+    "2.0": (6, 25, ("Rewards", "Change of weights ξ", "Output of module 1 on what was watched")),
+    "progress": (4, 18, ("φ 3: right", "Output y on new frames", "Events")),
+}
+
+
 @needs_driver
-def test_every_tab_shows_without_a_complaint_whatever_things_are_called(tmp_path, monkeypatch):
+@pytest.mark.parametrize("algorithm", NAMED)
+def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
+    algorithm, tmp_path, monkeypatch
+):
     """All tabs at once; a name in letters that the viewer's font lacks would end it."""
+    n_tabs, n_views, some = NAMED[algorithm]
+    learner = BY_PROGRESS if algorithm == "progress" else None
     spec = dataclasses.replace(IMAGE, streams=("左", "⟨b⟩/ c", "right"), truth=("x→", "y"))
-    write_run(tmp_path / "run.mcap", spec, ITERATIONS, saves=True)
+    write_run(
+        *(tmp_path / "run.mcap", spec, ITERATIONS),
+        saves=True,
+        learner=learner,
+        edit=lambda record: dataclasses.replace(record, stream=record.iteration % 3),
+    )
     tabs = []
 
     def side_by_side(*views, name, timeline="frame"):
@@ -65,12 +82,12 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(tmp_path
 
     monkeypatch.setattr(panels, "blueprint", side_by_side)
     build_view(tmp_path, tmp_path / "run.rrd")
-    assert len(tabs) == 6
+    assert len(tabs) == n_tabs
     with headless.headless_viewer("2400x1600") as opened:
         opened.ask(lambda client: client.open(str(tmp_path / "run.rrd")))
         views = opened.ask(all_views)
-        assert len(views) > 25
-        for name in ("Rewards", "Change of weights ξ", "Output of module 1 on what was watched"):
+        assert len(views) > n_views
+        for name in some:
             (view,) = [v for v in views if v.name == name]
             opened.ask(lambda client, v=view: client.take_screenshot(v.view_id))
         state = opened.ask(lambda client: client.get_state())

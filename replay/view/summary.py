@@ -12,8 +12,11 @@ from replay.view.layouts.panels import MOST_STREAMS
 ENDED = "ended:"
 """How the event begins that says why a run ended."""
 
-TOLD = ("nu", "tau", "sigma", "components", "window", "attention")
-"""Settings of the learner that are told, where it has them."""
+TOLD = ("nu", "tau", "sigma", "delta")
+"""Settings of CD-MISFA that are told."""
+
+TOLD_OF_PROGRESS = ("tau", "components", "window", "attention")
+"""Settings of the progress learner that are told."""
 
 NAMED = 4
 """Most streams whose names are given together."""
@@ -39,8 +42,8 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
             lines.append(f"| {outline.names()[s]} | {outline.visits[s]} frames, {share:.0%} |")
         lines.append("")
     settings = [("seed", header.manifest.get("seed"))]
-    settings += [(key, header.setting("learner", key)) for key in TOLD]
-    settings += [("delta", header.delta)]
+    keys = TOLD_OF_PROGRESS if header.by_progress else TOLD
+    settings += [(key, header.setting("learner", key)) for key in keys]
     said = ", ".join(f"{key} {value}" for key, value in settings if value is not None)
     lines += [said, ""]
     if header.missing:
