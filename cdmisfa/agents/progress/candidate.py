@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.features.recursive.recursive import RecursiveSFA, State
-from cdmisfa.features.slowness import block_moments, slowness, window_rate
+from cdmisfa.features.slowness import slowness, window_rate
 
 Float = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class Candidate:
         changes = self.sfa.update(frames, gap)
         self.blocks += 1
         if begun:
-            self._test(self.sfa.tested)
+            self._test(gap)
         changes = changes[np.isfinite(changes)]
         if len(changes):
             change = min(float(changes.sum()), math.sqrt(2.0))
@@ -105,11 +105,14 @@ class Candidate:
         if self._reference_age >= self.test_window:
             self._look_back()
 
-    def _test(self, y: Float) -> None:
+    def _test(self, gap: bool) -> None:
+        """Take the outputs on a block in, and the difference to the frame before it."""
         self.tests += 1
         rate = window_rate(self.test_window, self.tests)
-        for j in range(y.shape[1]):
-            self._moments[:, j] += rate * (block_moments(y[:, j].copy()) - self._moments[:, j])
+        y = np.concatenate([self.sfa.before[None], self.sfa.tested])
+        steps = np.diff(y[1:] if gap else y, axis=0)
+        now = np.stack([y[1:].mean(axis=0), (y[1:] ** 2).mean(axis=0), (steps**2).mean(axis=0)])
+        self._moments += rate * (now - self._moments)
 
     def _look_back(self) -> None:
         if self._reference.any():

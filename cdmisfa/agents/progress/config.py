@@ -35,7 +35,7 @@ class ProgressConfig:
     visit: int = 5
     explore: float = 0.1
     test_frames: int = 800
-    settled: float = 0.05
+    settled: float = 0.03
     agreement: float = 0.25
     slow: float = 0.75
     even: float = 0.85

@@ -28,7 +28,7 @@ EARLY = 0.6
 PATIENCE = 20
 """Windows of tests after which a candidate that has made no progress of late is given up."""
 
-LIVELY = (0.3, 3.0)
+LIVELY = (0.5, 2.0)
 """Variance of an output on frames not yet learned from, where its mean and scale hold."""
 
 PASSED_ON = 0.03
@@ -122,6 +122,15 @@ def hopeless(candidate: Candidate, config: ProgressConfig) -> str:
         if errors[-30:].mean() > 0.95 * errors[:-30].mean():
             return NO_PROGRESS
     return ""
+
+
+def stale(candidate: Candidate, config: ProgressConfig) -> bool:
+    """Whether what a candidate found stands firm and is seen no more: it was a single event."""
+    return (
+        candidate.tests >= FULL * candidate.test_window
+        and candidate.change < config.settled
+        and float(candidate.variance[0]) < PRESENT[0]
+    )
 
 
 def promising(candidate: Candidate, config: ProgressConfig) -> bool:

@@ -24,6 +24,7 @@ from cdmisfa.agents.progress.judging import (
     known_by,
     mastered,
     promising,
+    stale,
 )
 from cdmisfa.agents.progress.streams import (
     GIVEN_UP,
@@ -88,6 +89,7 @@ class ProgressLearner:
         few = math.prod(spec.frame_shape) <= FEW_VALUES
         self._expansion = config.expansion or ("quadratic" if few else "none")
         self._n_inputs = count_inputs(self._expansion, spec)
+        self._n_outputs = min(config.outputs, self._n_inputs)
         self._scale = PIXEL if spec.dtype == "uint8" else 1.0
         size = 8 * self._n_inputs * (2 * config.components + 4)
         self._held = max(2, min(HELD, MEMORY // size))
@@ -256,10 +258,6 @@ class ProgressLearner:
             ],
         }
 
-    @property
-    def _n_outputs(self) -> int:
-        return min(self.config.outputs, self._n_inputs)
-
     def _new_candidate(self) -> Candidate:
         c = self.config
         return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._window)
@@ -283,6 +281,9 @@ class ProgressLearner:
             return self._settle(stream, candidate)
         if state == LEARNING:
             why = hopeless(candidate, self.config)
+            if not why and stale(candidate, self.config):
+                del self._candidates[stream]
+                return self._say(stream, "is begun anew: what was slow in it is gone")
             if why == NO_PROGRESS and module >= 0:  # then that module is the best there is
                 return self._settle(stream, candidate, module)
             if why:

@@ -75,7 +75,7 @@ def advance(
         scale: 1 for values, 1/255 for pixels.
         gap: they do not follow the frames before.
         window: frames of the exponential window.
-        y: (m, J) receives the outputs before learning.
+        y: (m + 1, J) receives the outputs before learning, of the frame before the piece first.
 
     Returns:
         Change of the outputs, see `RecursiveSFA.update`.
@@ -135,12 +135,12 @@ def advance(
 
 @compiled
 def _outputs(weights: Float, e: Float, y: Float) -> None:
-    """Outputs on a piece, from its inner products with the basis."""
+    """Outputs on the frame before a piece and on its own, from inner products with the basis."""
     y[:] = 0.0
     for t in range(len(y)):
         for o in range(weights.shape[0]):
             for j in range(weights.shape[1]):
-                y[t, o] += weights[o, j] * e[j, t + 1]
+                y[t, o] += weights[o, j] * e[j, t]
 
 
 @compiled
@@ -217,6 +217,7 @@ class RecursiveSFA:
     Attributes:
         state: every array it consists of.
         tested: (n, J) outputs on the last call's frames, each before it was learned from.
+        before: (J,) output on the frame before these, with the weights of then.
 
     Example:
         >>> t = np.arange(2000.0)
@@ -238,6 +239,7 @@ class RecursiveSFA:
         components = min(components, n_inputs)
         self.window = window
         self.tested = np.zeros((0, min(outputs, components)))
+        self.before = np.zeros(min(outputs, components))
         self.state = State(
             mean=np.zeros(n_inputs),
             basis=np.zeros((size, n_inputs)),
@@ -267,12 +269,16 @@ class RecursiveSFA:
         rows = as_frames(frames, len(self.state.mean))
         scale = PIXEL if rows.dtype == UINT8 else 1.0
         change = np.full(len(rows), np.nan)
-        self.tested = np.zeros((len(rows), len(self.state.weights)))
+        outputs = len(self.state.weights)
+        self.tested = np.zeros((len(rows), outputs))
         for start in range(0, len(rows), PIECE):
             piece = slice(start, min(start + PIECE, len(rows)))
             first = gap and start == 0
-            y = self.tested[piece]
+            y = np.zeros((piece.stop - start + 1, outputs))
             change[piece.stop - 1] = advance(self.state, rows[piece], scale, first, self.window, y)
+            self.tested[piece] = y[1:]
+            if start == 0:
+                self.before = y[0]
         return change
 
     @property
