@@ -128,7 +128,9 @@ class BlockSignals:
     saved: bool = _signal(
         "", "The abstraction was saved at the end of the block.", dtype="bool", show="lane"
     )
-    share: float = _signal("", "Running share of blocks novel and of the stream of the block before.")
+    share: float = _signal(
+        "", "Running share of blocks both novel and of the same stream as before."
+    )
     novel_blocks: int = _signal(
         "", "Novel blocks since the abstraction was created.", unit="blocks", dtype="int64"
     )

@@ -22,7 +22,7 @@ def feels(panels: Panels) -> list[rrb.View]:
     threshold = _clusters_below(panels.outline)
     if threshold is None:
         return _convergence(
-            panels, "What it feels: η̇ below δ, nearly all blocks novel, on one stream: a module is saved"
+            panels, "What it feels: η̇ below δ, blocks novel and of one stream: a module is saved"
         )
     return panels.lines(
         f"What it feels: a module is saved when the clustering error's mean is below {threshold:g}",
