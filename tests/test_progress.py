@@ -206,7 +206,8 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
         ("expansion=cubic", "learner.expansion is cubic: there are none, quadratic"),
         ("outputs=17", "learner.outputs is 17, more than learner.components 16"),
         ("tau=2", r"learner.tau is 2: it must be in \[3, 100000\]"),
-        ("nu=.1", "unknown key learner.nu"),
+        ("nu=.1", "learner.nu is of the learner 2.0, and this is progress: leave it out"),
+        ("nuu=.1", "unknown key learner.nuu"),
     ],
 )
 def test_wrong_settings_are_named(setting: str, message: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,12 +117,25 @@ def configure(
     if algorithm is None:
         algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
     layers["learner"] = (*layers["learner"], {"algorithm": algorithm})
+    _refuse_keys_of_others(algorithm, {**tables.get("learner", {}), **words.get("learner", {})})
     scene = build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind})
     return Configuration(
         learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"]),
         scene=scene if scene.seed is not None else replace(scene, seed=seed),
         record=build(RecordConfig, "record", *layers["record"]),
     )
+
+
+def _refuse_keys_of_others(algorithm: str, keys: Iterable[str]) -> None:
+    """Say so where a key is not this learner's but another's."""
+    own = {field.name for field in fields(LEARNERS[algorithm].configuration)}
+    for key in sorted(set(keys) - own):
+        for name, entry in LEARNERS.items():
+            if key in {field.name for field in fields(entry.configuration)}:
+                raise UsageError(
+                    f"learner.{key} is of the learner {name}, and this is {algorithm}: leave it "
+                    f"out, or choose the other with --algorithm {name}"
+                )
 
 
 def scene_kind_for(

@@ -35,13 +35,14 @@ TICK = 0.1
 @click.option(
     "--algorithm",
     metavar="NAME",
-    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}.",
+    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}. "
+    "By default 2.0 for scenes and their recordings, progress for all other streams.",
 )
 @click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
 @click.option(
     "--max-modules",
     type=click.IntRange(1),
-    help="End after so many modules; by default as many as there are streams.",
+    help="End after so many modules; by default, the paper's learners, as many as streams.",
 )
 @click.option("--loop", is_flag=True, help="Start a recording again at its end.")
 @click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
