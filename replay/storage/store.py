@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import os
+import stat
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.log.whole import PARTIAL
 from replay.storage.checksum import crc32
 from replay.storage.location import Location
+
+OPEN_FILES = 24
+"""Files of recordings that are open at once; a recording in parts has thousands."""
 
 _PEEK: Final = 4096
 
@@ -80,7 +87,7 @@ class Store(ABC):
 
 
 class FileStore(Store):
-    """A file of this machine."""
+    """A file of this machine, closed and opened again where many others are open."""
 
     def __init__(self, path: Path) -> None:
         """Open the file.
@@ -89,38 +96,93 @@ class FileStore(Store):
             UsageError: it cannot be opened.
         """
         super().__init__(path)
+        self._closed = False
         try:
-            self._fd: int | None = os.open(path, os.O_RDONLY)
-            self.size = os.fstat(self._fd).st_size
+            self._seen = _regular(path)
+            self._keep(_Descriptor(path))
         except OSError as error:
             raise UsageError(f"{path}: {error.strerror}") from None
-        if not path.is_file():
-            self.close()
-            raise UsageError(f"{path}: not a file")
+        self.size = self._seen.st_size
 
     def read_at(self, offset: int, count: int) -> bytes:
+        file = self._open()
         try:
-            return os.pread(self._descriptor(), min(count, 1 << 30), offset)
+            return os.pread(file.number, min(count, 1 << 30), offset)
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror}") from None
 
     def is_at(self, path: Path) -> bool:
         try:
-            return os.path.samestat(os.stat(path), os.fstat(self._descriptor()))
+            return os.path.samestat(os.stat(path), self._seen)
         except OSError:
             return False
 
     def grow(self) -> bool:
-        before, self.size = self.size, os.fstat(self._descriptor()).st_size
+        self._seen = os.fstat(self._open().number)
+        before, self.size = self.size, self._seen.st_size
         self._window = b""
         return self.size > before
 
     def close(self) -> None:
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
+        self._closed = True
+        with _LOCK:
+            _OPEN.pop(self, None)
 
-    def _descriptor(self) -> int:
-        if self._fd is None:
+    def _open(self) -> _Descriptor:
+        if self._closed:
             raise ValueError(f"{self.path} is closed")
-        return self._fd
+        with _LOCK:
+            file = _OPEN.get(self)
+            if file is not None:
+                _OPEN.move_to_end(self)
+                return file
+        return self._opened_again()
+
+    def _opened_again(self) -> _Descriptor:
+        """Open the very file that was opened before; a recorder may have given it its name."""
+        path = Path(str(self.path))
+        reason = "it was removed or replaced"
+        for name in (path, path.with_suffix("") if path.suffix == PARTIAL else path):
+            try:
+                file = _Descriptor(name)
+                now = os.fstat(file.number)
+            except OSError as error:
+                reason = error.strerror or reason
+                continue
+            unchanged = (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
+            grown = path.suffix == PARTIAL and now.st_size > self.size
+            if os.path.samestat(now, self._seen) and (unchanged or grown):
+                self._keep(file)
+                return file
+            reason = "it was replaced"
+        raise LogDamagedError(f"{path}: {reason} while it was read")
+
+    def _keep(self, file: _Descriptor) -> None:
+        with _LOCK:
+            _OPEN[self] = file
+            while len(_OPEN) > OPEN_FILES:
+                _OPEN.popitem(last=False)
+
+
+class _Descriptor:
+    """An open file; closed once nobody reads from it."""
+
+    number = -1
+
+    def __init__(self, path: Path) -> None:
+        self.number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+
+    def __del__(self, close: Callable[[int], None] = os.close) -> None:
+        if self.number >= 0:
+            close(self.number)
+
+
+def _regular(path: Path) -> os.stat_result:
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise UsageError(f"{path}: not a file")
+    return found
+
+
+_LOCK: Final = threading.RLock()
+_OPEN: Final[OrderedDict[FileStore, _Descriptor]] = OrderedDict()
