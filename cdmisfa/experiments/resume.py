@@ -12,9 +12,11 @@ import dataclasses
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -56,6 +58,11 @@ SCHEMA = 2
 
 KEPT = 2
 """Checkpoints that a run's folder keeps: the newest, and one in case its log was lost."""
+
+_UNREADABLE = (
+    *(OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, OverflowError),
+    *(MemoryError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile, zlib.error),
+)  # what numpy, zipfile and json raise for damaged files
 
 _HEAD = "checkpoint"
 _MODULES = "modules."
@@ -162,8 +169,9 @@ def load_checkpoint(path: Path) -> Checkpoint:
         }
         state = LearnerState(arrays, _modules(columns), head["policy_rng"])
         return Checkpoint(int(head["iteration"]), int(head["t"]), state, head["versions"])
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise LogDamagedError(f"{path}: not a whole checkpoint ({error}); remove it") from error
+    except _UNREADABLE as error:
+        text = " ".join(str(error).split())[:200]
+        raise LogDamagedError(f"{path}: not a whole checkpoint ({text}); remove it") from error
 
 
 def _plain_arrays(path: Path) -> dict[str, NDArray[Any]]:

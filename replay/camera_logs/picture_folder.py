@@ -8,12 +8,16 @@ from typing import Final
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import UsageError
 from replay.camera_logs.pixels import compressed_gray
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
+from replay.storage.regular import check_regular, read_regular
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
+
+MAX_BYTES: Final = 128 * 1024 * 1024
+"""Largest file that is read as a picture."""
 
 
 class FolderImages(ImageStream):
@@ -27,6 +31,8 @@ class FolderImages(ImageStream):
         self._files = sorted(
             (p for p in path.iterdir() if p.suffix.lower() in PICTURES), key=by_number
         )
+        for file in self._files:
+            check_regular(file, MAX_BYTES)
         self.times = np.empty(0, np.uint64)
 
     @property
@@ -34,10 +40,7 @@ class FolderImages(ImageStream):
         return len(self._files)
 
     def image(self, row: int) -> Bytes:
-        try:
-            return compressed_gray(self._files[row].read_bytes())
-        except OSError as error:
-            raise CdmisfaError(f"{self._files[row]}: {error.strerror}") from None
+        return compressed_gray(read_regular(self._files[row], MAX_BYTES))
 
     def where(self, row: int) -> str:
         return str(self._files[row])

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -17,10 +20,7 @@ from cdmisfa.core.modules import Module
 from recorder.log.whole import whole
 from replay.runs.folders import MODULES_FILE
 
-MAX_BYTES = 4 * 1024**3
-"""Largest array that is read; asked for before anything is decompressed."""
-
-_FIRST = re.compile(r"module\d+_index")
+_NAME = re.compile(r"module([1-9]\d{0,8})_([a-z_]+)")
 _NUMBERS = ("index", "stream_index", "iteration")
 _OPTIONAL = ("centres", "counts", "expansion", "scale")  # not in every version's files
 _PLAIN = (("stream", "U", str), ("expansion", "U", str), ("scale", "f", float))
@@ -29,6 +29,9 @@ _ARRAYS = tuple(
     for f in dataclasses.fields(Module)
     if f.name not in (*_NUMBERS, *(name for name, _, _ in _PLAIN))
 )
+
+_END = struct.Struct("<4s4H2LH")
+_FIELDS = {field.name for field in dataclasses.fields(Module)}
 
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:
@@ -56,16 +59,16 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     path = path / MODULES_FILE if path.is_dir() else path
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            _refuse_large(stored.zip)
-            first = (name for name in stored.files if _FIRST.fullmatch(name))
-            indices = sorted(int(stored[name]) for name in first)
-            return tuple(_module(stored, index) for index in indices)
+            _refuse_compressed(stored.zip)
+            return tuple(_module(stored, index) for index in _indices(stored))
     except FileNotFoundError as error:
         raise UsageError(f"{path} does not exist: name a run's folder") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
-        raise LogDamagedError(f"{path} holds no modules ({error})") from error
+        raise LogDamagedError(f"{path} holds no modules ({_line(error)})") from error
+    except (MemoryError, OverflowError, RecursionError, SyntaxError, TokenError) as error:
+        raise LogDamagedError(f"{path} holds no modules (an impossible array)") from error
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
-        raise LogDamagedError(f"{path} is damaged ({error})") from error
+        raise LogDamagedError(f"{path} is damaged ({_line(error)})") from error
 
 
 def _module(stored: Any, index: int) -> Module:
@@ -99,10 +102,54 @@ def _module(stored: Any, index: int) -> Module:
     return Module(**values)
 
 
-def _refuse_large(archive: zipfile.ZipFile) -> None:
-    size = sum(item.file_size for item in archive.infolist())
-    if size > MAX_BYTES:
-        raise ValueError(f"{size} bytes unpacked")
+def _indices(stored: Any) -> list[int]:
+    """The modules' indices, of a file in which every name is that of a module's field.
+
+    A checksum protects what the arrays hold, but nothing their names and number.
+    """
+    fields: dict[int, set[str]] = {}
+    for name in stored.files:
+        found = _NAME.fullmatch(name)
+        if found is None or found[2] not in _FIELDS:
+            raise ValueError(f"{name[:40]!r} is nothing of a module")
+        fields.setdefault(int(found[1]), set()).add(found[2])
+    indices = sorted(fields)
+    if indices != list(range(1, len(indices) + 1)):
+        raise ValueError(f"there are modules {indices}, one is missing")
+    if any(fields[index] != fields[1] for index in indices):
+        raise ValueError("a module lacks what another has")
+    if any(int(stored[_key(index, "index")]) != index for index in indices):
+        raise ValueError("the numbers of modules are mixed up")
+    return indices
+
+
+def _refuse_compressed(archive: zipfile.ZipFile) -> None:
+    """Refuse what was not stored as it is: only then nothing unpacks to more than the file."""
+    members = archive.infolist()
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise ValueError("it is compressed")
+    if len(members) != _stated_members(archive):
+        raise ValueError("its directory is cut")
+    if len({member.filename for member in members}) < len(members):
+        raise ValueError("two arrays have one name")
+    end = 0
+    for member in members:
+        if member.header_offset < end:
+            raise ValueError("its arrays overlap")
+        end = member.header_offset + member.file_size
+
+
+def _stated_members(archive: zipfile.ZipFile) -> int:
+    """How many members the last record of a zip file without a comment states."""
+    if archive.fp is None or archive.comment:
+        raise ValueError("it has a comment")
+    archive.fp.seek(-_END.size, os.SEEK_END)
+    return int(_END.unpack(archive.fp.read(_END.size))[4])
+
+
+def _line(error: Exception) -> str:
+    """What an error says, short and in one line."""
+    return " ".join(str(error).split())[:200]
 
 
 def _key(index: int, name: str) -> str:

@@ -1,0 +1,121 @@
+"""What is read beside the logs is never endless, never huge, and refused in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import write_pictures
+from test_modules import learned, with_width
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.experiments.resume import Checkpoint, checkpoints, load_checkpoint, save_checkpoint
+from replay.camera_logs import picture_folder
+from replay.camera_logs.opening import open_images
+from replay.runs.modules import load_modules, save_modules
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: path.symlink_to("/dev/zero"),
+        os.mkfifo,
+        lambda path: path.mkdir(),
+        lambda path: path.symlink_to("nothing"),
+    ],
+    ids=["device", "fifo", "folder", "broken link"],
+)
+def test_only_regular_files_are_pictures(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    write_pictures(tmp_path / "pictures", 3)
+    make(tmp_path / "pictures" / "1a.png")
+    with pytest.raises(UsageError, match=r"1a\.png: no regular file"):
+        open_images(tmp_path / "pictures", None)
+
+
+def test_a_link_to_a_picture_is_a_picture(tmp_path: Path) -> None:
+    values = write_pictures(tmp_path / "pictures", 3)
+    (tmp_path / "pictures" / "3.png").symlink_to("1.png")
+    images = open_images(tmp_path / "pictures", None)
+    assert images.image(3)[0, 0] == values[1]
+
+
+def test_a_picture_that_became_something_else_is_not_waited_for(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "pictures", 3)
+    images = open_images(tmp_path / "pictures", None)
+    (tmp_path / "pictures" / "1.png").unlink()
+    os.mkfifo(tmp_path / "pictures" / "1.png")
+    with pytest.raises(CdmisfaError, match=r"1\.png: no regular file"):
+        images.image(1)
+
+
+def test_a_huge_picture_is_refused_unread(tmp_path: Path) -> None:
+    write_pictures(tmp_path / "pictures", 3)
+    with (tmp_path / "pictures" / "2.png").open("r+b") as file:
+        file.truncate(picture_folder.MAX_BYTES + 1)
+    with pytest.raises(CdmisfaError, match=r"2\.png: \d+ bytes.*limit"):
+        open_images(tmp_path / "pictures", None)
+
+
+def test_compressed_modules_are_refused(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "modules.npz", module1_phi=np.zeros(10**6))
+    with pytest.raises(LogDamagedError, match="compressed"):
+        load_modules(tmp_path)
+
+
+@pytest.mark.parametrize("shape", ["(10**9, 10**9)", "(4000000000000,)", "(-1,)", "(" * 3000])
+def test_an_array_that_says_it_is_larger_than_its_file_is_refused(
+    tmp_path: Path, shape: str
+) -> None:
+    shape = shape.replace("10**9", str(10**9))
+    head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    array = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head
+    with zipfile.ZipFile(tmp_path / "modules.npz", "w") as archive:
+        archive.writestr("module1_index.npy", array)
+    with pytest.raises(LogDamagedError, match=r"modules\.npz"):
+        load_modules(tmp_path)
+
+
+def test_no_flipped_bit_makes_other_modules(tmp_path: Path) -> None:
+    path = tmp_path / "modules.npz"
+    numbers = (1, 2)
+    save_modules(path, [replace(with_width(2), index=index) for index in numbers])
+    whole = path.read_bytes()
+    first = load_modules(path)
+    with zipfile.ZipFile(path) as archive:
+        directory = archive.start_dir
+    rng = np.random.default_rng(0)
+    places = [*range(directory * 8, len(whole) * 8, 29), *rng.integers(0, directory * 8, 60)]
+    for place in places:
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        try:
+            found = load_modules(path)
+        except LogDamagedError:
+            continue
+        assert [m.index for m in found] == list(numbers), place
+        for module, before in zip(found, first, strict=True):
+            assert module.phi.tobytes() == before.phi.tobytes(), place
+            assert (module.expansion, module.scale) == (before.expansion, before.scale), place
+            assert module.counts.tobytes() == before.counts.tobytes(), place
+
+
+def test_no_flipped_flag_of_a_checkpoint_is_unexpected(tmp_path: Path) -> None:
+    learner, _ = learned("uint8", "none")
+    save_checkpoint(tmp_path, Checkpoint(learner.iteration, 0, learner.state, {}))
+    (path,) = checkpoints(tmp_path)
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        directory = archive.start_dir
+    for place in range(directory * 8 + 64, directory * 8 + 112):  # its version, flags and method
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with contextlib.suppress(LogDamagedError):
+            load_checkpoint(path)
