@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
@@ -22,3 +23,21 @@ def trace(task: tuple[str, int, str]) -> int:
 def sleep_for(seconds: float) -> None:
     """A task that takes its time."""
     time.sleep(seconds)
+
+
+def die_while_sending(size: int) -> bytes:
+    """A task whose worker is killed -9 when the first megabyte of its result is on its way."""
+    threading.Thread(target=_kill_when_sent, args=(1 << 20,), daemon=True).start()
+    return bytes(size)
+
+
+def _kill_when_sent(size: int) -> None:
+    before = _received()
+    while _received() < before + size:
+        time.sleep(0.001)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _received() -> int:
+    """Bytes that the parent has read: those of a write count when it is over only."""
+    return int(Path(f"/proc/{os.getppid()}/io").read_text().split()[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from engine_tasks import sleep_for, trace
+from engine_tasks import die_while_sending, sleep_for, trace
 
 from cdmisfa.core.processes import Workers
 
@@ -90,14 +91,42 @@ def test_closing_does_not_wait_for_what_they_are_doing() -> None:
         future.result()
 
 
-def test_what_sends_large_results_finishes_and_is_not_waited_for_without_end() -> None:
+def test_what_sends_large_results_is_not_waited_for() -> None:
     workers = Workers(2)
     futures = [workers.submit(bytes, 1 << 26) for _ in range(8)]
     futures[0].result()  # others are in the midst of being sent
-    closing = threading.Thread(target=workers.close, kwargs={"finish": True}, daemon=True)
+    closing = threading.Thread(target=workers.close, daemon=True)
     closing.start()
-    closing.join(60)
+    closing.join(20)
     assert not closing.is_alive()
+    assert all(future.done() for future in futures)
+
+
+def test_one_that_is_killed_while_it_sends_ends_what_all_were_doing() -> None:
+    """The others live, and must not keep its half message open."""
+    workers = Workers(2)
+    workers.submit(os.getpid).result()
+    sleeping, sending = (
+        workers.submit(sleep_for, 600),
+        workers.submit(die_while_sending, 1 << 30),
+    )
+    waiting = workers.submit(os.getpid)
+    for future in (sending, sleeping, waiting, workers.submit(os.getpid)):
+        with pytest.raises(BrokenProcessPool):
+            future.result(timeout=20)
+    workers.close()
+
+
+def test_errors_come_back_and_what_cannot_be_sent_is_one() -> None:
+    with contextlib.closing(Workers(1)) as workers:
+        for asked, error in (
+            (workers.submit(int, "x"), ValueError),
+            (workers.submit(threading.Lock), TypeError),
+            (workers.submit(len, threading.Lock()), TypeError),
+        ):
+            with pytest.raises(error):
+                asked.result(timeout=60)
+        assert workers.submit(abs, -3).result(timeout=60) == 3
 
 
 def test_they_have_their_environment_before_anything_is_imported(tmp_path: Path) -> None:

@@ -410,6 +410,54 @@ def test_ctrl_c_reaches_the_writer_alone(tmp_path, wait_for_frames):
     assert len(list((tmp_path / "a").glob("*.partial"))) == 3
 
 
+@pytest.fixture
+def recorder(tmp_path):
+    """A recording by two processes that does not end by itself, and they."""
+    folder = tmp_path / "a"
+    words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000", "--jobs", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60
+    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while sum(path.stat().st_size for path in folder.glob("*.partial")) < 1 << 17:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    commands = {int(w): Path(f"/proc/{w}/cmdline").read_text() for w in listed.read_text().split()}
+    with process:
+        yield process, [pid for pid, command in commands.items() if "spawn_main" in command]
+        process.kill()
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, tmp_path, which):
+    process, workers = recorder
+    os.kill(workers[which], signal.SIGKILL)
+    _, complaint = process.communicate(timeout=10)
+    assert process.returncode == 1
+    (line,) = complaint.strip().splitlines()
+    assert line.startswith("cdmisfa: a rendering process ended: go on with --resume")
+    assert not any(running(pid) for pid in workers)
+    for view in STREAMS:
+        assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) > 0
+
+
+def test_a_second_signal_does_not_wait_for_a_process_that_stands_still(recorder):
+    process, workers = recorder
+    for pid in workers:
+        os.kill(pid, signal.SIGSTOP)
+    time.sleep(0.5)
+    process.terminate()
+    time.sleep(0.5)
+    assert process.poll() is None  # it waits for the block that it would write
+    process.terminate()
+    _, complaint = process.communicate(timeout=5)
+    assert process.returncode == 143
+    assert complaint.endswith("is not finished: go on with --resume\n")
+    assert not any(running(pid) for pid in workers)
+
+
 def test_rendering_processes_end_with_their_killed_parent(tmp_path):
     code = RECORD.replace("frames=int", "jobs=2, frames=int")
     script = tmp_path / "run.py"

@@ -245,6 +245,18 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     assert rows_of(tmp_path).items() >= before.items()
 
 
+def test_the_processes_of_a_killed_sweep_end_with_it(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:4000"]
+    with subprocess.Popen([*words, "--jobs", "2", "-o", str(tmp_path)]) as process:
+        try:
+            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2)
+            workers = psutil.Process(process.pid).children()
+        finally:
+            process.kill()
+    assert len(workers) >= 2
+    assert psutil.wait_procs(workers, timeout=10)[1] == []
+
+
 # Engines
 
 

@@ -97,10 +97,11 @@ def render_in_processes(
             yield pending.popleft().result()
     except BrokenProcessPool as error:
         raise CdmisfaError(
-            "a rendering process ended: record with --jobs 1 to see why, or give it more memory"
+            "a rendering process ended: go on with --resume; if it ends again, with --jobs 1 to "
+            "see why, or with more memory"
         ) from error
     finally:
-        workers.close(finish=True)  # blocks are large
+        workers.close()
 
 
 def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
