@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import re
 from dataclasses import dataclass, field
 from importlib import resources
@@ -315,3 +316,39 @@ def test_the_page_of_keys_explains_each() -> None:
     page = (Path(__file__).parents[1] / "docs" / "configuration.md").read_text("utf-8")
     keys = [field.name for field in dataclasses.fields(LearnerConfig)]
     assert [key for key in keys if f"| `{key}` |" not in page] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[learner]\nnu = " + "[\n" * 2000 + "]\n" * 2000, "nested too deep"),
+        ("[learner]\ntau = " + "1" * 900 + "\n", "learner.tau is 1111.*must be a whole number"),
+        ("[learner]\ntau = " + "1" * 5000 + "\n", "line 2 has 5006 characters"),
+        ("[learner]\n" + ".".join("a" * 20_000) + " = 1\n", "line 2 has"),
+        ("[learner]\n" + "nu." * 300 + "a = 1\n", "learner.nu is .*must be a number"),
+        ("[learner]\n" + "a" * 900 + " = 1\n", r"unknown key learner\.aaa"),
+        ("# comment\n" * 100_000, "1000000 bytes"),
+    ],
+    ids=["nested", "number", "digits", "dotted", "dots", "key", "size"],
+)
+def test_a_monstrous_preset_is_one_short_line(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError, match=words) as caught:
+        build(LearnerConfig, "learner", load_preset(str(file))["learner"])
+    said = str(caught.value).replace(str(tmp_path), "")
+    assert len(said) < 700
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("word", ["learner.tau=" + "1" * 5000, "learner." + "x." * 9000 + "y=1"])
+def test_a_monstrous_setting_is_one_short_line(word: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        build(LearnerConfig, "learner", parse_settings([word])["learner"])
+    assert len(str(caught.value)) < 700
+
+
+def test_a_preset_that_is_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "mine.toml")
+    with pytest.raises(UsageError, match="not a file"):
+        load_preset(str(tmp_path / "mine.toml"))

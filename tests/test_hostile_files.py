@@ -15,9 +15,16 @@ from camera_files import write_pictures
 from test_modules import learned, with_width
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.experiments.results import results
 from cdmisfa.experiments.resume import Checkpoint, checkpoints, load_checkpoint, save_checkpoint
+from cdmisfa.experiments.store import ROWS, read_rows
+from recorder.log.logfile import LogFile
 from replay.camera_logs import picture_folder
 from replay.camera_logs.opening import open_images
+from replay.integrity.info import describe
+from replay.runs.folders import REQUEST, RUN_METADATA, runs_in
+from replay.runs.log import read_header
 from replay.runs.modules import load_modules, save_modules
 
 
@@ -119,3 +126,25 @@ def test_no_flipped_flag_of_a_checkpoint_is_unexpected(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with contextlib.suppress(LogDamagedError):
             load_checkpoint(path)
+
+
+DEEP = "[" * 100_000
+
+
+def test_deep_json_is_damage(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    with LogFile(run / "run.mcap") as log:
+        values = {"schema": str(SCHEMA_VERSION), "spec": DEEP, "manifest": DEEP}
+        log.add_metadata(RUN_METADATA, values)
+    with pytest.raises(LogDamagedError, match=r"run\.mcap"):
+        read_header(run)
+    describe(run / "run.mcap")
+    (tmp_path / REQUEST).write_text(DEEP)
+    with pytest.raises(LogDamagedError, match=REQUEST):
+        runs_in(tmp_path)
+    with pytest.raises(LogDamagedError, match=REQUEST):
+        results(tmp_path)
+    (tmp_path / ROWS).write_text(DEEP + "\n")
+    with pytest.raises(LogDamagedError, match=ROWS):
+        list(read_rows(tmp_path))

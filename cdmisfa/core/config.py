@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
+import reprlib
 import tomllib
 import types
 import typing
@@ -30,6 +32,20 @@ LARGEST = 2**63 - 1
 
 MAX_COMPONENTS = 1000
 """More whitening components than this would take minutes a frame."""
+
+MAX_PRESET = 64 * 1024
+"""Largest preset, in bytes."""
+
+MAX_LINE = 1000
+"""Longest line of a preset: keys of many more parts take minutes to parse."""
+
+SHOWN = 120
+"""Most characters of a value or key that an error shows."""
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 3
+_SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 8
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = SHOWN
 
 MAX_TAU = 100_000
 """A block of more frames than this does not fit into memory beside its images."""
@@ -158,8 +174,7 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
     """
     try:
         if name.endswith(".toml"):
-            with open(name, "rb") as file:
-                document = tomllib.load(file)
+            document = tomllib.loads(_preset_text(name))
         else:
             if name not in presets():
                 raise UsageError(f"no preset {name!r}: {did_you_mean(name, presets())}")
@@ -169,10 +184,36 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
         raise UsageError(f"{name}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{name}: not TOML: {error}") from error
+    except RecursionError:
+        raise UsageError(f"{name}: not a preset: it is nested too deep") from None
     for key, value in document.items():
         if not isinstance(value, dict):
-            raise UsageError(f"{name}: {key} stands outside a [section]")
+            raise UsageError(f"{name}: {shown(key)} stands outside a [section]")
     return document
+
+
+def _preset_text(name: str) -> str:
+    """The text of a preset's file, if it is one that is soon parsed."""
+    if os.path.exists(name) and not os.path.isfile(name):
+        raise UsageError(f"{name}: not a file")
+    with open(name, "rb") as file:
+        data = file.read(MAX_PRESET + 1)
+        if len(data) > MAX_PRESET:
+            size = max(os.fstat(file.fileno()).st_size, len(data))
+            raise UsageError(f"{name}: {size} bytes, a preset has up to {MAX_PRESET}")
+    text = data.decode("utf-8")
+    for number, line in enumerate(text.split("\n"), start=1):
+        if len(line) > MAX_LINE:
+            raise UsageError(
+                f"{name}: line {number} has {len(line)} characters, up to {MAX_LINE} are read"
+            )
+    return text.replace("\r\n", "\n")
+
+
+def shown(value: Any) -> str:
+    """A value as an error shows it: a text as it is, others as Python writes them, all short."""
+    text = value if isinstance(value, str) else _SHORT.repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
@@ -186,7 +227,9 @@ def parse_settings(words: Iterable[str]) -> dict[str, dict[str, str]]:
         key, equals, value = word.partition("=")
         section, dot, name = key.strip().partition(".")
         if not (equals and section and dot and name):
-            raise UsageError(f"--set {word}: write it as section.key=value, as learner.nu=0.02")
+            raise UsageError(
+                f"--set {shown(word)}: write it as section.key=value, as learner.nu=0.02"
+            )
         sections.setdefault(section, {})[name] = value.strip()
     return sections
 
@@ -211,14 +254,14 @@ def build(
             name, dot, rest = key.partition(".")
             if name not in fields:
                 hint = did_you_mean(name, fields, f"{prefix}.")
-                raise UsageError(f"unknown key {prefix}.{key}: {hint}")
+                raise UsageError(f"unknown key {prefix}.{shown(key)}: {hint}")
             if dataclasses.is_dataclass(hints[name]):
                 if not dot and not isinstance(value, Mapping):
                     raise UsageError(f"{prefix}.{name} is a table: set one of its keys")
                 nested.setdefault(name, []).append({rest: value} if dot else value)
             elif dot:
                 raise UsageError(
-                    f"unknown key {prefix}.{key}: {prefix}.{name} has no keys of its own"
+                    f"unknown key {prefix}.{shown(key)}: {prefix}.{name} has no keys of its own"
                 )
             else:
                 values[name] = convert(value, hints[name], f"{prefix}.{name}")
@@ -241,7 +284,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
         if value in arguments:
             return value
         choices = ", ".join(str(a) for a in arguments)
-        raise UsageError(f"{key} is {value}: choose one of {choices}")
+        raise UsageError(f"{key} is {shown(value)}: choose one of {choices}")
     if origin is types.UnionType or origin is typing.Union:
         if value is None or value in ("auto", "none"):
             return None
@@ -253,10 +296,10 @@ def convert(value: Any, hint: Any, key: str) -> Any:
             else value
         )
         if not isinstance(parts, list | tuple):
-            raise UsageError(f"{key} is {value}: it must be a list")
+            raise UsageError(f"{key} is {shown(value)}: it must be a list")
         inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
         if len(inner) != len(parts):
-            raise UsageError(f"{key} is {value}: it must have {len(inner)} values")
+            raise UsageError(f"{key} is {shown(value)}: it must have {len(inner)} values")
         return tuple(convert(p, h, key) for p, h in zip(parts, inner, strict=True))
     try:
         if hint is bool:
@@ -284,7 +327,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
                 raise ValueError
             return value
     except (ValueError, TypeError, KeyError, OverflowError):
-        raise UsageError(f"{key} is {value!r}: it must be {_WORDS[hint]}") from None
+        raise UsageError(f"{key} is {_SHORT.repr(value)}: it must be {_WORDS[hint]}") from None
     raise TypeError(f"{key}: fields of type {hint} cannot be configured")
 
 

@@ -59,7 +59,7 @@ def results(folder: Path) -> list[PointResult]:
         trials = [(str(t["id"]), dict(t["point"])) for t in request["trials"]]
     except OSError as error:
         raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise LogDamagedError(f"{path} is damaged: run the sweep again to write it") from error
     rows = {row["id"]: row for row in read_rows(folder)}
     points: dict[tuple[tuple[str, str], ...], list[Any]] = {}

@@ -135,7 +135,7 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
         try:
             row = json.loads(line)
             rows[row["id"]] = {**row, "status": row["status"], "point": dict(row["point"])}
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise LogDamagedError(
                 f"{path} line {number} is no trial's row: remove the line"
             ) from error

@@ -95,5 +95,5 @@ def is_sweep(folder: Path) -> bool:
 def _requested(request: Path) -> set[str]:
     try:
         return {str(trial["id"]) for trial in json.loads(request.read_text("utf-8"))["trials"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise LogDamagedError(f"{request} is damaged: run the sweep again to write it") from error

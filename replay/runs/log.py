@@ -108,7 +108,7 @@ def read_header(path: Path) -> RunHeader:
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
         return RunHeader(schema, SourceSpec(**spec), json.loads(found["manifest"]))
-    except (KeyError, TypeError, ValueError, UsageError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
 
