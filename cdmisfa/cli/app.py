@@ -92,9 +92,22 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Run the command line of this process."""
+    _open_standard_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
     sys.exit(run(sys.argv[1:]))
+
+
+def _open_standard_streams() -> None:
+    """Let what was closed, as a daemon's are, lead nowhere: the next file would take its place."""
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        try:
+            os.fstat(number)
+        except OSError:
+            # the lowest that is free is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
 
 
 def run(args: Sequence[str]) -> int:

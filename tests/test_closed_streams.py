@@ -1,0 +1,48 @@
+"""Commands whose standard streams are closed, as a daemon's are."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CLOSED = ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")
+
+
+def cdmisfa(closed: str, *words: object) -> subprocess.CompletedProcess[str]:
+    line = f'exec "$0" -m cdmisfa "$@" {closed}'
+    return subprocess.run(
+        ["sh", "-c", line, sys.executable, *map(str, words)],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("closed", CLOSED)
+def test_a_command_does_its_work_and_says_so(tmp_path: Path, closed: str) -> None:
+    words = ("record", "oscillatory", "--frames", 128)
+    open_ones = cdmisfa("", *words, "-o", tmp_path / "open")
+    ended = cdmisfa(closed, *words, "-o", tmp_path / "closed")
+    assert (open_ones.returncode, ended.returncode) == (0, 0)
+    assert ended.stderr == ""
+    assert bool(ended.stdout) == (">&-" not in closed.split())
+    for file in (tmp_path / "open").glob("*.mcap"):
+        assert (tmp_path / "closed" / file.name).read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize("closed", CLOSED)
+def test_processes_of_a_command_do_theirs(tmp_path: Path, closed: str) -> None:
+    words = ("record", "oscillatory", "--frames", 256, "--jobs", 2, "-o", tmp_path / "a")
+    ended = cdmisfa(closed, *words)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert len(list((tmp_path / "a").glob("*.mcap"))) == 3
+
+
+@pytest.mark.parametrize("closed", CLOSED)
+def test_an_error_keeps_its_exit_code(tmp_path: Path, closed: str) -> None:
+    assert cdmisfa(closed, "info", tmp_path / "nothing").returncode == 2
