@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -21,7 +23,9 @@ from replay.camera_logs.source import ForeignSource
 PNG = b"\x89PNG"
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_a_signal_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
     folder = tmp_path / "rec"
     words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000"]
@@ -43,6 +47,29 @@ def test_a_signal_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> N
     line = f"cdmisfa: interrupted: {folder} is not finished: go on with --resume\n"
     assert error.lstrip("\n") == line  # behind the terminal's ^C
     assert not list(folder.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_terminal_that_is_closed_ends_it_like_a_signal(tmp_path: Path, jobs: int) -> None:
+    folder = tmp_path / "rec"
+    words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000"]
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, [sys.executable, "-m", "cdmisfa", *words, "--jobs", str(jobs)])
+    deadline = time.monotonic() + 60
+    while sum(path.stat().st_size for path in folder.glob("*.partial")) < 1 << 17:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.close(terminal)
+    ended = 0, 0
+    while not ended[0] and time.monotonic() < deadline:
+        ended = os.waitpid(pid, os.WNOHANG)
+        time.sleep(0.02)
+    if not ended[0]:
+        os.kill(pid, signal.SIGKILL)
+    assert os.waitstatus_to_exitcode(ended[1]) == 129
+    with pytest.raises(RecordingStoppedError):
+        record_scene("oscillatory", folder, frames=100000000, resume=True, stop=lambda: True)
 
 
 def test_going_on_with_a_complete_recording_says_so(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

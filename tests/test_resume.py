@@ -379,6 +379,18 @@ class TestWithoutItsSource:
         command = json.loads((run / "run.json").read_text())["command"]
         assert (command["seed"], command["loop"]) == (4, True)
 
+    @pytest.mark.parametrize("limit", [("--max-iterations", 9), ("--max-modules", 1)])
+    def test_it_ends_where_it_was_to_end(
+        self, tmp_path: Path, cdmisfa: Cdmisfa, limit: tuple[str, int]
+    ) -> None:
+        words = ("oscillatory", *self.WORDS[:2], *limit)
+        whole = cdmisfa("learn", *words, "-o", tmp_path / "run", "--no-rerun", "--json").json
+        ended = cdmisfa("learn", "--resume", "-o", tmp_path / "run", "--no-rerun", "--json")
+        assert ended.err == "nothing was left to do: the run had come as far before\n"
+        assert ended.json["signals_sha256"] == whole["signals_sha256"]
+        more = ("--resume", "-o", tmp_path / "run", limit[0], limit[1] + 1, "--max-iterations", 12)
+        assert cdmisfa("learn", *more, "--no-rerun", "--json").json["iterations"] > 9
+
     def test_after_kill_9_too(self, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
         run = tmp_path / "run"
         cdmisfa("learn", "oscillatory", "-o", run, *self.WORDS[:2], "--max-iterations", 3)

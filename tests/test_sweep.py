@@ -257,6 +257,24 @@ def test_the_processes_of_a_killed_sweep_end_with_it(tmp_path: Path) -> None:
     assert psutil.wait_procs(workers, timeout=10)[1] == []
 
 
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
+    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:4000"]
+    words += ["--jobs", jobs, "-o", str(tmp_path)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2)
+            process.terminate()
+            complaint = process.communicate(timeout=30)[1]
+        finally:
+            process.kill()
+    assert process.returncode == 143
+    assert complaint.splitlines()[-1] == (
+        f"cdmisfa: interrupted: {tmp_path} keeps the trials that are finished: "
+        "say the same again to go on"
+    )
+
+
 # Engines
 
 

@@ -7,17 +7,19 @@ completion never wait for numpy, numba, PyBullet or Rerun.
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import io
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 import click
 
 from cdmisfa.cli.interrupts import interruptible
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
@@ -117,6 +119,7 @@ def run(args: Sequence[str]) -> int:
     """
     with interruptible() as stop:
         try:
+            _refuse_odd_names(args)
             # without standalone mode, Context.exit(code) comes back as the value
             code = cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
             sys.stdout.flush()
@@ -137,6 +140,16 @@ def run(args: Sequence[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
+def _refuse_odd_names(args: Sequence[str]) -> None:
+    """Refuse what no log and no line of output can name, before any work is done."""
+    for arg in args:
+        try:
+            arg.encode()
+        except UnicodeEncodeError:
+            shown = os.fsencode(arg).decode(errors="backslashreplace")
+            raise UsageError(f"{shown} is not UTF-8: give it another name") from None
+
+
 def _explain(error: Exception) -> int:
     match error:
         case CdmisfaError():
@@ -150,6 +163,9 @@ def _explain(error: Exception) -> int:
             return _fail(f"{message} (see {command} --help)", error.exit_code)
         case click.ClickException():
             return _fail(error.format_message(), error.exit_code)
+        case OSError(errno=errno.ENAMETOOLONG):
+            name = max(Path(str(error.filename)).parts, key=len)
+            return _fail(f"{name[:20]}... has {len(name)} letters: choose a shorter name", 2)
         case OSError():
             where = f"{error.filename}: " if error.filename else ""
             return _fail(f"{where}{error.strerror or error}", 1)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: files are finished on the way out, and the exit code says why."""
+"""Ctrl-C, SIGTERM and SIGHUP: files are finished on the way out, and the exit code says why."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stop:
@@ -23,13 +23,13 @@ class Stop:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a command that was stopped: 130 for Ctrl-C, 143 for SIGTERM."""
+        """Of a stopped command: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
         return 128 + (self.number or signal.SIGINT)
 
 
 @contextmanager
 def interruptible() -> Iterator[Stop]:
-    """Make SIGINT and SIGTERM raise KeyboardInterrupt while the body runs."""
+    """Make each of `SIGNALS` raise KeyboardInterrupt while the body runs."""
     stop = Stop()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -60,8 +60,14 @@ def stoppable(
 
 @contextmanager
 def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    def handle(number: int, frame: FrameType | None) -> None:
+        _let_go_of_terminal()
+        handler(number, frame)
+
+    # nohup has SIGHUP ignored
+    kept = {signal.SIGHUP} if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else set()
     try:
-        before = {number: signal.signal(number, handler) for number in SIGNALS}
+        before = {number: signal.signal(number, handle) for number in {*SIGNALS} - kept}
     except ValueError:  # not the main thread: signals are not ours to handle
         yield
         return
@@ -70,3 +76,14 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
+
+
+def _let_go_of_terminal() -> None:
+    """Let standard streams of a terminal that is no more lead nowhere: to write there fails."""
+    for number in (1, 2):
+        try:
+            os.write(number, b"")
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, number)
+            os.close(nowhere)

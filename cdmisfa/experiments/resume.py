@@ -47,8 +47,10 @@ OPTIONS = (
     "size",
     "align",
     "rate",
+    "max_iterations",
+    "max_modules",
 )
-"""What of a command makes a run what it is, besides its source."""
+"""What of a command makes a run what it is, and where it ends, besides its source."""
 
 SET_ASIDE = "run.before.mcap.partial"
 """The log of a run that is being resumed, until the new one has taken over what counts."""

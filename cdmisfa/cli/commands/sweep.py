@@ -62,14 +62,19 @@ def sweep_command(
         def progress(finished: int, failed: int, total: int) -> None:
             shown.update(finished, total, f"{failed} failed" if failed else "")
 
-        report = sweep(
-            source,
-            out,
-            grid=parse_grid(grid),
-            seeds=parse_seeds(seeds),
-            progress=progress,
-            **each,
-        )
+        try:
+            report = sweep(
+                source,
+                out,
+                grid=parse_grid(grid),
+                seeds=parse_seeds(seeds),
+                progress=progress,
+                **each,
+            )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"{out} keeps the trials that are finished: say the same again to go on"
+            ) from None
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if report.outdated:
         click.echo(
