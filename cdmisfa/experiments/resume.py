@@ -238,7 +238,7 @@ class Checkpoints(Sink):
             self.finish()
 
     def finish(self) -> None:
-        """See `Sink`; the log is finished before."""
+        """See `Sink`; the log is flushed before."""
         learner = self._learner
         checkpoint = Checkpoint(learner.iteration, self._source.t, learner.state, versions())
         save_checkpoint(self._run, checkpoint)

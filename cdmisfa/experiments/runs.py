@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
+from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.compiled import needs_compiling
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import versions, write_json
 from cdmisfa.experiments.loop import Digest, learn
 from cdmisfa.experiments.resume import (
@@ -162,7 +162,10 @@ def run(
             log = opened.enter_context(
                 _run_log(folder, source.spec, {**manifest, **begun}, force=force, resume=resume)
             )
-            told += [log, Checkpoints(folder, source, learner, checkpoint_every, log.flush)]
+            told += [
+                _Unfinished(log),
+                Checkpoints(folder, source, learner, checkpoint_every, log.flush),
+            ]
         elif resume:
             raise UsageError("which run to resume? name its folder")
         if live:
@@ -200,14 +203,33 @@ def run(
             summary=learner.summary(),
             ended=ended,
         )
-        if folder is not None:
-            _write_run(folder, result, tables, begun, rerun=rerun)
+        if folder is not None and log is not None:
+            _write_run(folder, result, tables, begun, log, rerun=rerun)
     if exhausted is not None:
         kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {folder}"
         over = RunExhaustedError(f"{exhausted}{kept if folder is not None else ''}")
         over.result = result
         raise over from exhausted
     return result
+
+
+class _Unfinished(Sink):
+    """A run's log that stays open when learning ends, for what is written after it."""
+
+    def __init__(self, log: RunWriter) -> None:
+        self._log = log
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        self._log.block(block, signals, learner)
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """See `Sink`."""
+        self._log.event(t, iteration, text, level)
+
+    def finish(self) -> None:
+        """Hand over what was written."""
+        self._log.flush()
 
 
 @contextlib.contextmanager
@@ -294,9 +316,11 @@ def _write_run(
     result: RunResult,
     tables: Mapping[str, Any],
     begun: Mapping[str, Any],
+    log: RunWriter,
     *,
     rerun: bool,
 ) -> None:
+    from replay.runs.final import final_record
     from replay.runs.folders import MODULES_FILE, RUN_JSON, VIEW_FILE
     from replay.runs.modules import save_modules
 
@@ -314,6 +338,7 @@ def _write_run(
         **begun,
     }
     write_json(out / RUN_JSON, document)
+    log.finish(final_record(out, document, result.signals_sha256, view=rerun))
     if rerun:
         from replay.view.build import build_view
 

@@ -6,9 +6,11 @@ import contextlib
 import itertools
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
+from replay.integrity.run_files import check_run, read_final
 from replay.integrity.survey import SCHEMA, Crc, Kind, moved, survey
 from replay.mcap.reader import LogReader
 from replay.mcap.segments import Problem
@@ -29,10 +31,11 @@ class FileCheck:
 
 @dataclass(frozen=True, slots=True)
 class LogCheck:
-    """Whether a log, or all logs of a folder, are whole."""
+    """Whether a log, or all logs of a folder, are whole; `notes` are no problems."""
 
     problems: tuple[Problem, ...]
     files: tuple[FileCheck, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -49,8 +52,9 @@ def check_log(path: str | Location) -> LogCheck:
 
     What lies behind a URL is copied first, for all of it is needed more than once.
 
-    Of a recording also: each view has every frame once; of a folder, that the views have the
-    same frames and none is missing.
+    Of a run also: its signals and, in its folder, the files beside its log are those that its
+    final record states. Of a recording also: each view has every frame once; of a folder, that
+    the views have the same frames and none is missing.
 
     Raises:
         UsageError: no such log.
@@ -59,6 +63,7 @@ def check_log(path: str | Location) -> LogCheck:
     problems: list[Problem] = []
     files: list[FileCheck] = []
     views: list[Location] = []
+    notes: list[str] = []
     with fetched(place) as copy:
         for file in log_files(copy):
             crc, kind, found = _check_file(file)
@@ -66,10 +71,14 @@ def check_log(path: str | Location) -> LogCheck:
             files.append(FileCheck(str(file).replace(str(copy), str(place)), crc))
             if kind == "recording":
                 views.append(file)
+            if kind == "run" and not found and isinstance(file, Path):
+                problems += check_run(file, beside=isinstance(place, Path) and place.is_dir())
+                if read_final(file) is None:
+                    notes.append(f"{file} holds no final record: nothing proves what is beside it")
         if views:
             problems += _check_views(views, alone=copy.is_file())
     unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
-    return LogCheck(tuple(unique), tuple(files))
+    return LogCheck(tuple(unique), tuple(files), tuple(notes))
 
 
 def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem]]:

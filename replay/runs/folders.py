@@ -26,6 +26,9 @@ VIEW_FILE = "run.rrd"
 RUN_METADATA = "cdmisfa.run"
 """Name of the metadata record that makes a log that of a run."""
 
+FINAL_METADATA = "cdmisfa.final"
+"""Name of the metadata record by which a finished run proves itself; see `final`."""
+
 REQUEST = "sweep.json"
 """File of a sweep that names the trials it was asked for last."""
 

@@ -18,7 +18,7 @@ from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
 from replay.mcap.reader import LogReader
 from replay.runs.columns import columns_of_messages
-from replay.runs.folders import RUN_METADATA
+from replay.runs.folders import FINAL_METADATA, RUN_METADATA
 from replay.runs.log import (
     EVENT_TOPIC,
     PHI_TOPIC,
@@ -163,8 +163,10 @@ class RunWriter(Sink):
         self._log.flush()
         self._next_flush = time.monotonic() + FLUSH_SECONDS
 
-    def finish(self) -> None:
-        """Write the index and give the file its name."""
+    def finish(self, final: Mapping[str, str] | None = None) -> None:
+        """Write a final record where there is one, and the index; give the file its name."""
+        if final is not None:
+            self._log.add_metadata(FINAL_METADATA, final)
         self._log.finish()
 
     def abandon(self) -> None:

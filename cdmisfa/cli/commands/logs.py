@@ -80,6 +80,8 @@ def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
         options.print_json(found.as_json())
     elif found.ok:
         click.echo(f"{path}: whole")
+        for note in found.notes:
+            click.echo(note)
     else:
         options.print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
     if not found.ok:
