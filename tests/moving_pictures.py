@@ -38,6 +38,13 @@ def stroll(rng: Rng, n: int) -> tuple[NDArray[Any], NDArray[Any]]:
     return shown + rng.normal(0, 3, (n, *SHAPE)), bright
 
 
+def dawn(rng: Rng, n: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """A light that only rises; how bright it is."""
+    bright = np.linspace(0.5, 2.0, n)
+    picture = np.random.default_rng(1).random(SHAPE)
+    return 80 * bright[:, None, None] * picture + rng.normal(0, 4, (n, *SHAPE)), bright
+
+
 def noise(rng: Rng, n: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Nothing to be learned."""
     return rng.integers(0, 256, (n, *SHAPE)).astype(float), np.zeros(n)
@@ -51,6 +58,7 @@ def constant(rng: Rng, n: int) -> tuple[NDArray[Any], NDArray[Any]]:
 KINDS: Mapping[str, Callable[[Rng, int], tuple[NDArray[Any], NDArray[Any]]]] = {
     "swing": swing,
     "stroll": stroll,
+    "dawn": dawn,
     "noise": noise,
     "constant": constant,
 }

@@ -21,6 +21,7 @@ from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_e
 from cdmisfa.agents.progress.config import ATTENTIONS, ProgressConfig
 from cdmisfa.agents.progress.judging import flatness, gain, hopeless, promising
 from cdmisfa.agents.progress.learner import ProgressLearner
+from cdmisfa.agents.progress.streams import new_streams, outcome
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Learner
@@ -98,6 +99,22 @@ def test_what_changes_is_learned_anew_or_known() -> None:
     assert len(learner.modules) == 2
     (changed, other) = learner.summary()["streams"]
     assert (changed["state"], changed["module"]) == ("known", other["module"])
+
+
+def test_what_only_drifts_does_not_hold_a_run_up() -> None:
+    """Its slow output is nowhere seen again, so that it is begun anew; but not for ever."""
+    source = MovingPictures("dawn", "swing")
+    learner = ProgressLearner(ProgressConfig(components=8), source.spec, 0)
+    assert learn(source, learner, max_iterations=1500) == "all_decided"
+    assert "swing" in [m.stream for m in learner.modules]
+
+
+def test_what_is_too_slow_to_be_tested_says_so() -> None:
+    own = new_streams(1)[0]
+    own["state"], own["module"], own["slowness"] = 1, 0, 0.001
+    assert "raise learner.test_frames and learner.window" in outcome("a", own, None, 800)["why"]
+    own["slowness"] = 0.002
+    assert outcome("a", own, None, 800)["why"] == ""
 
 
 def test_what_does_not_change_is_not_learned_twice() -> None:

@@ -20,6 +20,7 @@ from cdmisfa.agents.progress.candidate import Candidate
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.agents.progress.judging import (
     NO_PROGRESS,
+    PATIENCE,
     hopeless,
     known_by,
     mastered,
@@ -36,7 +37,7 @@ from cdmisfa.agents.progress.streams import (
     decide,
     differs,
     new_streams,
-    outcome,
+    outcomes,
     watch,
 )
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
@@ -126,8 +127,7 @@ class ProgressLearner:
     def over(self) -> str:
         """Whether no stream is being learned, nor was for `learner.watch` blocks; see `Learner`."""
         learning = (self._streams["state"] == LEARNING).any()
-        idle = int(self._counts["idle"][0])
-        return "all_decided" if not learning and idle > self.config.watch else ""
+        return "all_decided" if not learning and self._counts["idle"][0] > self.config.watch else ""
 
     @property
     def max_modules(self) -> None:
@@ -252,10 +252,9 @@ class ProgressLearner:
         return {
             "final_policy": policy.tolist(),
             "epsilon": self.config.explore,
-            "streams": [
-                outcome(name, self._streams[stream], self._candidates.get(stream))
-                for stream, name in enumerate(self.spec.streams)
-            ],
+            "streams": outcomes(
+                self.spec.streams, self._streams, self._candidates, self.config.test_frames
+            ),
         }
 
     def _new_candidate(self) -> Candidate:
@@ -283,7 +282,9 @@ class ProgressLearner:
             why = hopeless(candidate, self.config)
             if not why and stale(candidate, self.config):
                 del self._candidates[stream]
-                return self._say(stream, "is begun anew: what was slow in it is gone")
+                if own["visits"] - own["decided"] < PATIENCE * self._window:
+                    return self._say(stream, "is begun anew: what was slow in it has come to rest")
+                why = NO_PROGRESS
             if why == NO_PROGRESS and module >= 0:  # then that module is the best there is
                 return self._settle(stream, candidate, module)
             if why:
@@ -322,10 +323,9 @@ class ProgressLearner:
         decide(own, LEARNED if learned else KNOWN, index, eta)
         if index == before:
             return self._say(stream, f"still shows what module {index + 1} gives")
-        what = "has changed and is" if before >= 0 else "is"
         by = "learned by" if learned else f"known by {module.stream}'s"
-        after = f"after {own['decided']} blocks, slowness {eta:.4f}"
-        return self._say(stream, f"{what} {by} module {index + 1} {after}")
+        what = f"{'has changed and is' if before >= 0 else 'is'} {by} module {index + 1}"
+        return self._say(stream, f"{what} after {own['decided']} blocks, slowness {eta:.4f}")
 
     def _learn_again(self, stream: int, module: int, why: str) -> tuple[str, ...]:
         """Begin a candidate anew for a stream that had been decided."""

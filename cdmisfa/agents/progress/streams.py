@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,12 @@ LEARNING, LEARNED, KNOWN, GIVEN_UP = range(len(STATES))
 
 REASONS = ("", *HOPELESS)
 """Why a stream was given up, by the code that is kept."""
+
+TOO_SLOW = (
+    "slower than tests can tell, so it may hold for these frames only; for what takes longer to "
+    "come and go raise learner.test_frames and learner.window, both as many times"
+)
+"""Said of a stream that was learned, but hardly varied within a window of tests."""
 
 STREAM = np.dtype(
     [
@@ -72,17 +79,37 @@ def differs(own: Any, window: int) -> bool:
     return strange(float(steps), float(power), int(own["watched"]), window)
 
 
-def outcome(name: str, own: Any, candidate: Candidate | None) -> dict[str, Any]:
-    """What became of a stream, as JSON values."""
+def outcomes(
+    names: Sequence[str], streams: NDArray[Any], held: Mapping[int, Candidate], test_frames: int
+) -> list[dict[str, Any]]:
+    """The `outcome` of every stream."""
+    return [
+        outcome(name, streams[place], held.get(place), test_frames)
+        for place, name in enumerate(names)
+    ]
+
+
+def outcome(name: str, own: Any, candidate: Candidate | None, test_frames: int) -> dict[str, Any]:
+    """What became of a stream, as JSON values.
+
+    Args:
+        name: of the stream.
+        own: its row of the table.
+        candidate: of it, if one is held.
+        test_frames: frames of a window of tests, within which a slow output must be seen to vary.
+    """
     slowness, module = float(own["slowness"]), int(own["module"])
     learning = int(own["state"]) == LEARNING
     if learning and candidate is not None:
         slowness = float(candidate.tested[0])
+    why = REASONS[int(own["why"])]
+    if int(own["state"]) == LEARNED and slowness * test_frames < 1.0:
+        why = TOO_SLOW
     return {
         "stream": name,
         "state": STATES[int(own["state"])],
         "module": module + 1 if module >= 0 else None,
         "blocks": int(own["visits" if learning else "decided"]),
         "slowness": slowness if math.isfinite(slowness) else None,
-        "why": REASONS[int(own["why"])],
+        "why": why,
     }

@@ -231,8 +231,11 @@ def show(result: RunResult, *, as_json: bool) -> None:
         )
         for module in result.modules
     ]
-    if rows:
+    if rows and "streams" not in result.summary:
         options.print_table(("module", "stream", "iteration", "policy", "eta"), rows)
+    elif rows:  # no policy led to them
+        plain = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
+        options.print_table(("module", "stream", "iteration", "eta"), plain)
     else:
         click.echo("no module was learned")
     for outcome in result.summary.get("streams", ()):
