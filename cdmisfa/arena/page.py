@@ -150,7 +150,8 @@ def _panel(panel: Any, name: str, entries: Sequence[Entry]) -> None:
         panel.plot(at, mean, dash, color=rgb, label=learner, linewidth=1.6 if not place else 1.0)
     panel.set_xscale("log")
     panel.set_ylim(-0.03, 1.03)
-    panel.set_title(name, loc="left")
+    panel.minorticks_off()
+    panel.set_title(name.replace(" ", "\n"), loc="left")
 
 
 def _learners(document: Mapping[str, Any]) -> list[str]:
