@@ -150,4 +150,4 @@ def test_a_learner_of_ones_own_is_learned_with_by_its_name(
     assert (done.code, done.json["iterations"]) == (0, 5), done.err
     assert done.json["epsilon"] == pytest.approx(1.2 * 0.999**5)
     other = cdmisfa("learn", "oscillatory", "--set", "learner.first_mean=0.5")
-    assert "unknown key learner.first_mean" in other.err
+    assert "learner.first_mean is of the learner plain, and this is 2.0" in other.err
