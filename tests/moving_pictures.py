@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 
 SHAPE = (12, 16)
 LENGTH = 6000
@@ -64,26 +64,19 @@ KINDS: Mapping[str, Callable[[Rng, int], tuple[NDArray[Any], NDArray[Any]]]] = {
 }
 
 
-class MovingPictures(SeekableSource):
+class MovingPictures(ClockedSource):
     """Streams by their names, as "swing", "swing.2" (the same once more) or "swing>noise".
 
     The latter changes at frame `changes_at`. Streams begin again after `LENGTH` frames.
     """
 
     def __init__(self, *names: str, seed: int = 0, changes_at: int = 0) -> None:
-        self.names, self._t = names, 0
+        self.names = names
+        self._spec = SourceSpec(names, SHAPE, "uint8", ("state",))
         self._at = changes_at
         self._shown = [
             [self._made(word.partition(".")[0], seed) for word in name.split(">")] for name in names
         ]
-
-    @property
-    def spec(self) -> SourceSpec:
-        return SourceSpec(self.names, SHAPE, "uint8", ("state",))
-
-    @property
-    def t(self) -> int:
-        return self._t
 
     @staticmethod
     def _made(kind: str, seed: int) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -101,11 +94,5 @@ class MovingPictures(SeekableSource):
         self._t += n
         return Block(stream, self._t - n, freeze(frames), freeze(state[:, None]))
 
-    def seek(self, t: int) -> None:
-        self._t = t
-
     def describe(self) -> Mapping[str, Any]:
         return {"kind": "moving pictures", "streams": list(self.names)}
-
-    def close(self) -> None:
-        return

@@ -9,21 +9,14 @@ import numpy as np
 
 from cdmisfa.arena.library import Library
 from cdmisfa.arena.streams import BEGIN_APART, Signal, parse
-from cdmisfa.core.blocks import (
-    Block,
-    SeekableSource,
-    SourceSpec,
-    check_frame,
-    check_request,
-    freeze,
-)
+from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import UsageError
 
 CHANGE: Final = 60_000
 """Frame from which on a stream that changes shows something else."""
 
 
-class ArenaSource(SeekableSource):
+class ArenaSource(ClockedSource):
     """Streams from a library on one clock; each begins again where its frames are over.
 
     The cut where a stream begins again is not told, nor is the change of one.
@@ -42,7 +35,7 @@ class ArenaSource(SeekableSource):
         self, words: Sequence[str], library: Library, seed: int, *, change: int = CHANGE
     ) -> None:
         self.phases = [parse(word) for word in words]
-        self._change, self._seed, self._t = change, seed, 0
+        self._change, self._seed = change, seed
         names = {signal.name for phases in self.phases for signal in phases}
         self.streams = {name: library.stream(name, seed) for name in sorted(names)}
         kinds = {(s.frames.shape[1:], str(s.frames.dtype)) for s in self.streams.values()}
@@ -50,16 +43,6 @@ class ArenaSource(SeekableSource):
             raise UsageError(f"{', '.join(words)}: frames of one size and type can be a set")
         ((shape, dtype),) = kinds
         self._spec = SourceSpec(tuple(words), shape, dtype)
-
-    @property
-    def spec(self) -> SourceSpec:
-        """What the source delivers."""
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        """Global counter of the next frame."""
-        return self._t
 
     def begins(self, phase: int) -> int:
         """First frame at which streams show what stands at a place in their words."""
@@ -85,14 +68,6 @@ class ArenaSource(SeekableSource):
         self._t += n
         return block
 
-    def seek(self, t: int) -> None:
-        """Move the clock to frame t; see `FrameSource.seek`."""
-        check_frame(t)
-        self._t = t
-
     def describe(self) -> Mapping[str, Any]:
         """The streams and their seed."""
         return {"kind": "arena", "streams": list(self._spec.streams), "seed": self._seed}
-
-    def close(self) -> None:
-        """Nothing to let go of."""

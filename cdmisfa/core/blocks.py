@@ -160,6 +160,34 @@ class SeekableSource(FrameSource, Protocol):
         return tuple(blocks)
 
 
+class ClockedSource(SeekableSource):
+    """A source that holds its spec and its clock, and so needs `take` and `describe` alone.
+
+    A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.
+    """
+
+    _spec: SourceSpec
+    _t: int = 0
+
+    @property
+    def spec(self) -> SourceSpec:
+        """What the source delivers."""
+        return self._spec
+
+    @property
+    def t(self) -> int:
+        """Global counter of the next frame."""
+        return self._t
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t; see `SeekableSource.seek`."""
+        check_frame(t)
+        self._t = t
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
 @dataclass(frozen=True, slots=True)
 class HeadPose:
     """Where the head is in the robot's root frame.

@@ -9,14 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import (
-    Block,
-    SeekableSource,
-    SourceSpec,
-    check_frame,
-    check_request,
-    freeze,
-)
+from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.config import SceneConfig, check_view_names
@@ -92,7 +85,7 @@ class OscillatoryConfig(SceneConfig):
         check_view_names(self.streams, "scene.streams")
 
 
-class OscillatorySource(SeekableSource):
+class OscillatorySource(ClockedSource):
     """Deterministic two-dimensional streams on the common clock.
 
     Args:
@@ -122,18 +115,7 @@ class OscillatorySource(SeekableSource):
             raise UsageError("a source has at least one stream: name some of " + ", ".join(STREAMS))
         self._shown = list(streams)
         self._tables = [one_period(name) for name in streams]
-        self._t = 0
         self._spec = SourceSpec(tuple(streams), (2,), "float64", ("theta",), fps, start_ns, length)
-
-    @property
-    def spec(self) -> SourceSpec:
-        """What the source delivers."""
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        """Global counter of the next frame."""
-        return self._t
 
     def replace(self, stream: int, name: str) -> None:
         """From the next block on, show another signal on a stream (the abrupt swap)."""
@@ -154,14 +136,6 @@ class OscillatorySource(SeekableSource):
         self._t += n
         return block
 
-    def seek(self, t: int) -> None:
-        """Move the clock to frame t; see `FrameSource.seek`."""
-        check_frame(t)
-        self._t = t
-
     def describe(self) -> Mapping[str, Any]:
         """The streams shown now."""
         return {"kind": "oscillatory", "streams": list(self._shown)}
-
-    def close(self) -> None:
-        """Nothing to let go of."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from replay.camera_logs.alignment import (
@@ -37,7 +37,7 @@ FRAME_SIZE = (48, 128)
 Align = Literal["index", "time"]
 
 
-class ForeignSource(SeekableSource):
+class ForeignSource(ClockedSource):
     """Cameras in MCAP logs, ROS bags, videos and folders of pictures, gray and small, on one clock.
 
     Args:
@@ -86,7 +86,6 @@ class ForeignSource(SeekableSource):
         named = [paths] if isinstance(paths, str | Path | Url) else paths
         self._files = image_logs(named)
         self._loop = loop
-        self._t = 0
         self._hashes: list[dict[str, Any]] | None = None
         self._size = size
         self._goal = goal
@@ -114,14 +113,6 @@ class ForeignSource(SeekableSource):
         found = map(counts, self._times, self._rows)
         self.alignment = dict(zip(names, found, strict=True))
         self.warnings = tuple(dict.fromkeys(w for s in self._streams for w in s.warnings))
-
-    @property
-    def spec(self) -> SourceSpec:
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        return self._t
 
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a stream shows at t .. t+n-1; moves t by n.
@@ -153,11 +144,9 @@ class ForeignSource(SeekableSource):
             LogExhaustedError: the logs end before it.
             ValueError: t is below 0.
         """
-        if t < 0:
-            raise ValueError(f"frame {t} lies before the first, 0")
         if not self._loop and t > self._count:
             raise LogExhaustedError(f"{self._files[0]}: it ends at frame {self._count}, before {t}")
-        self._t = t
+        super().seek(t)
 
     def describe(self) -> Mapping[str, Any]:
         """The logs with their SHA-256, the topics, and how they became frames."""

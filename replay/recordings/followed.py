@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request
+from cdmisfa.core.blocks import Block, ClockedSource, check_request
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
 from recorder.log.whole import PARTIAL
 from replay.recordings.source import RecordedSource
@@ -19,7 +19,7 @@ POLL: Final = 0.1
 """Seconds between two looks at the files."""
 
 
-class FollowedSource(SeekableSource):
+class FollowedSource(ClockedSource):
     """The views of a recording, of which more frames come while it is read.
 
     A recorder hands over whole seconds of frames; a block that is not there yet is waited
@@ -55,21 +55,12 @@ class FollowedSource(SeekableSource):
         self.stop = stop
         self._path = Path(path)
         self._timeout = timeout
-        self._t = 0
         self._taken = False
         self._seen: object = None
         self._source: RecordedSource | None = None
         self._wait(0, "frame 0")
         self._t = self._now.t
         self._spec = replace(self._now.spec, length=None)
-
-    @property
-    def spec(self) -> SourceSpec:
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        return self._t
 
     @property
     def finished(self) -> bool:

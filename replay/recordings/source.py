@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, SeekableSource, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, ClockedSource, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
 from recorder.log.whole import PARTIAL
 from replay.mcap.identity import identity
@@ -34,7 +34,7 @@ _SCENE: Final = ("scene", "seed", "config_sha256")
 _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", *_SCENE)
 
 
-class RecordedSource(SeekableSource):
+class RecordedSource(ClockedSource):
     """The views of a recording on their common clock.
 
     Args:
@@ -106,14 +106,6 @@ class RecordedSource(SeekableSource):
                 view.close()
         self._files, self._hashes, self._views = [v.path for v in opened + added], None, views
         self._set_clock()
-
-    @property
-    def spec(self) -> SourceSpec:
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        return self._t
 
     @property
     def frames(self) -> int:
