@@ -16,6 +16,7 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.learning import overwrite
 from cdmisfa.core.signals import BlockSignals, SignalsHash, values
 from recorder.world.oscillatory import OscillatorySource, one_period
 
@@ -392,3 +393,15 @@ def test_inputs_that_cannot_be_learned_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match=words):
         CuriousLearner(config, SourceSpec(("a", "b"), shape, "float64"), seed=0)
+
+
+@pytest.mark.parametrize("second", [None, np.ones(3), np.ones(2, np.float32)])
+def test_what_was_stored_is_taken_whole_or_not_at_all(second: np.ndarray | None) -> None:
+    own = {"first": np.zeros(2), "second": np.zeros(2)}
+    stored = {"first": np.ones(2)} | ({} if second is None else {"second": second})
+    with pytest.raises(ValueError, match="second is missing or of another shape or type"):
+        overwrite(own, stored)
+    assert not own["first"].any()
+    overwrite(own, stored | {"second": np.ones(2), "another": np.ones(2)})
+    assert own["first"].all()
+    assert own["second"].all()

@@ -22,7 +22,7 @@ from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
-from cdmisfa.core.learning import LearnerState
+from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import NO_STATE, BlockSignals
 from cdmisfa.features.feature import Feature, MakeFeature
@@ -164,11 +164,7 @@ class CuriousLearner:
         ]
         self._freeze()
         self.abstraction = self._new_abstraction()
-        for name, own in self._arrays().items():
-            array = state.arrays.get(name)
-            if array is None or array.shape != own.shape or array.dtype != own.dtype:
-                raise ValueError(f"{name} is missing or of another shape or type")
-            own[...] = array
+        overwrite(self._arrays(), state.arrays)
         self.policy_rng.bit_generator.state = dict(state.policy_rng)
 
     def step(self, block: Block) -> BlockSignals:

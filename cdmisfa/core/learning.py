@@ -125,6 +125,20 @@ class Sink(Protocol):
         return
 
 
+def overwrite(own: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]]) -> None:
+    """Write what was stored into a learner's arrays of the same names, all of them or none.
+
+    Raises:
+        ValueError: an array is missing or of another shape or type.
+    """
+    for name, array in own.items():
+        found = stored.get(name)
+        if found is None or found.shape != array.shape or found.dtype != array.dtype:
+            raise ValueError(f"{name} is missing or of another shape or type")
+    for name, array in own.items():
+        array[...] = stored[name]
+
+
 def weights_after(signals: BlockSignals, learner: Learner) -> NDArray[np.float64]:
     """The weights (J, I) that a learner's last iteration ended with, frozen where it saved them."""
     return learner.modules[-1].phi if signals.saved else learner.phi

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.learning import overwrite
 from cdmisfa.features.recursive.recursive import RecursiveSFA, State
 from cdmisfa.features.slowness import slowness, window_rate
 
@@ -170,34 +172,24 @@ class Candidate:
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything that changes in it, by name; copies."""
-        counters = np.array([self.blocks, self.tests, self._reference_age], dtype=np.int64)
-        measures = np.array([self.change, self.regret])
+        """Everything that changes in it, by name; no copies."""
         own = {
-            "counters": counters,
-            "measures": measures,
-            "errors": self.errors.copy(),
-            "moments": self._moments.copy(),
-            "reference": self._reference.copy(),
+            "counters": np.array([self.blocks, self.tests, self._reference_age], dtype=np.int64),
+            "measures": np.array([self.change, self.regret]),
+            "errors": self.errors,
+            "moments": self._moments,
+            "reference": self._reference,
         }
-        sfa = self.sfa.state
-        return own | {f"sfa.{n}": a.copy() for n, a in zip(State._fields, sfa, strict=True)}
+        sfa = zip(State._fields, self.sfa.state, strict=True)
+        return own | {f"sfa.{name}": array for name, array in sfa}
 
-    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Go to where another of the same sizes was.
 
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
         own = self.arrays
-        for name, array in own.items():
-            found = arrays.get(name)
-            if found is None or found.shape != array.shape or found.dtype != array.dtype:
-                raise ValueError(f"{name} is missing or of another shape or type")
-        self.blocks, self.tests, self._reference_age = arrays["counters"].tolist()
-        self.change, self.regret = arrays["measures"].tolist()
-        self.errors[:] = arrays["errors"]
-        self._moments[:] = arrays["moments"]
-        self._reference[:] = arrays["reference"]
-        for name, array in zip(State._fields, self.sfa.state, strict=True):
-            array[...] = arrays[f"sfa.{name}"]
+        overwrite(own, arrays)
+        self.blocks, self.tests, self._reference_age = own["counters"].tolist()
+        self.change, self.regret = own["measures"].tolist()

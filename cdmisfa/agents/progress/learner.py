@@ -42,7 +42,7 @@ from cdmisfa.agents.progress.streams import (
 )
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand
-from cdmisfa.core.learning import LearnerState
+from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.features.projection import mean_output, outputs
@@ -139,7 +139,7 @@ class ProgressLearner:
         """The learner's state, a copy."""
         held = sorted(self._candidates)
         arrays = {
-            f"candidate.{stream}.{name}": array
+            f"candidate.{stream}.{name}": array.copy()
             for stream in held
             for name, array in self._candidates[stream].arrays.items()
         }
@@ -153,12 +153,8 @@ class ProgressLearner:
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
-        arrays = dict(state.arrays)
-        for name, own in (("streams", self._streams), ("counts", self._counts)):
-            found = arrays.get(name)
-            if found is None or found.shape != own.shape or found.dtype != own.dtype:
-                raise ValueError(f"{name} is missing or of another shape or type")
-            own[...] = found
+        arrays = state.arrays
+        overwrite({"streams": self._streams, "counts": self._counts}, arrays)
         self._candidates = {}
         for stream in arrays.get("held", np.zeros(0, np.int64)).tolist():
             prefix = f"candidate.{stream}."
