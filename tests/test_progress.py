@@ -277,7 +277,7 @@ def test_every_rule_chooses_a_stream(name: str, learning: list[bool], seed: int)
     situation = Situation(
         stream=int(rng.integers(n)),
         learning=np.array(learning),
-        errors=tuple(rng.random(int(rng.integers(RECENT + 1))) for _ in range(n)),
+        errors={s: rng.random(int(rng.integers(RECENT + 1))) for s in range(0, n, 2)},
         visits=rng.integers(1, 100, n),
         draws=rng.random(2),
         explore=0.1,

@@ -28,7 +28,7 @@ class Situation:
     Attributes:
         stream: the one watched last.
         learning: (S,) whether each is being learned, and may be watched now.
-        errors: for each stream its last learning errors, the newest last.
+        errors: the last learning errors of each stream whose candidate is held, the newest last.
         visits: (S,) blocks each was watched so far.
         draws: (2,) uniform in [0, 1): whether to explore, and which.
         explore: probability of any stream, of the rules that explore.
@@ -36,7 +36,7 @@ class Situation:
 
     stream: int
     learning: NDArray[np.bool_]
-    errors: tuple[Float, ...]
+    errors: Mapping[int, Float]
     visits: NDArray[np.int64]
     draws: Float
     explore: float
@@ -77,8 +77,12 @@ def interest(situation: Situation) -> Float:
 
 
 def _of_each(s: Situation, value: Callable[[Float, int], float], otherwise: float) -> Float:
-    rows = zip(s.errors, s.visits.tolist(), s.learning, strict=True)
-    return np.array([value(errors, visits) if on else otherwise for errors, visits, on in rows])
+    """(S,) the value of each stream by its errors and visits, another where it is not learned."""
+    values = np.where(s.learning, value(np.zeros(0), 0), otherwise)  # without a candidate
+    for stream, errors in s.errors.items():
+        if s.learning[stream]:
+            values[stream] = value(errors, int(s.visits[stream]))
+    return values
 
 
 def _exploring(value: Callable[[Situation], Float]) -> Rule:

@@ -87,7 +87,7 @@ class Candidate:
             frames: (n, I) consecutive frames.
             gap: they do not follow those before.
         """
-        begun = bool(self.sfa.state.weights.any())
+        begun = self.alive
         changes = self.sfa.update(frames, gap)
         self.blocks += 1
         if begun:

@@ -229,7 +229,7 @@ class ProgressLearner:
             reward=error - candidate.error,
             R=np.empty((0, 2, 0)),
             Q=np.full((len(learning), 2), np.nan),
-            policy=np.where(learning, 0, 1),
+            policy=self._policy,
             epsilon=self.config.explore,
             explored=explored,
             action=int(self.stream != stream),
@@ -244,14 +244,18 @@ class ProgressLearner:
 
     def summary(self) -> dict[str, Any]:
         """What became of each stream, as JSON values."""
-        policy = np.where(self._streams["state"] == LEARNING, 0, 1)
         return {
-            "final_policy": policy.tolist(),
+            "final_policy": self._policy.tolist(),
             "epsilon": self.config.explore,
             "streams": outcomes(
                 self.spec.streams, self._streams, self._candidates, self.config.test_frames
             ),
         }
+
+    @property
+    def _policy(self) -> NDArray[np.int64]:
+        """(S,): 0 stay with a stream, for it is being learned; 1 switch."""
+        return np.where(self._streams["state"] == LEARNING, 0, 1)
 
     def _new_candidate(self) -> Candidate:
         c = self.config
@@ -288,11 +292,11 @@ class ProgressLearner:
                 return self._say(stream, f"is given up after {own['decided']} blocks: {why}")
         elif state == GIVEN_UP:
             if REASONS[int(own["why"])] != NO_PROGRESS and promising(candidate, self.config):
-                return self._learn_again(
-                    stream, -1, "is learned after all: something in it is slow"
-                )
+                self._learn_again(stream, -1)
+                return self._say(stream, "is learned after all: something in it is slow")
         elif differs(own, self._window):
-            return self._learn_again(stream, module, f"no longer fits module {module + 1}")
+            self._learn_again(stream, module)
+            return self._say(stream, f"no longer fits module {module + 1}")
         if state != LEARNING and candidate.blocks >= SHADOW * self._window:
             del self._candidates[stream]
         return ()
@@ -323,11 +327,10 @@ class ProgressLearner:
         what = f"{'has changed and is' if before >= 0 else 'is'} {by} module {index + 1}"
         return self._say(stream, f"{what} after {own['decided']} blocks, slowness {eta:.4f}")
 
-    def _learn_again(self, stream: int, module: int, why: str) -> tuple[str, ...]:
+    def _learn_again(self, stream: int, module: int) -> None:
         """Begin a candidate anew for a stream that had been decided."""
         self._candidates.pop(stream, None)
         decide(self._streams[stream], LEARNING, module, math.nan)
-        return self._say(stream, why)
 
     def _say(self, stream: int, what: str) -> tuple[str, ...]:
         return (f"stream {self.spec.streams[stream]} {what}",)
@@ -340,7 +343,7 @@ class ProgressLearner:
         again = (streams["state"] == GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
         for stream in np.flatnonzero(again).tolist():
             streams["looks"][stream] += 1
-            self._learn_again(stream, -1, "")
+            self._learn_again(stream, -1)
         names = ", ".join(self.spec.streams[s] for s in np.flatnonzero(again))
         return (f"looking once more at what was given up: {names}",) if names else ()
 
@@ -356,7 +359,7 @@ class ProgressLearner:
                 band_mean=candidate.tested,
                 band_sd=np.full(self._n_outputs, np.nan),
                 eta=candidate.tested,
-                policy=np.where(self._streams["state"] == LEARNING, 0, 1),
+                policy=self._policy,
                 expansion=self._expansion,
                 scale=self._scale,
             )
@@ -376,10 +379,7 @@ class ProgressLearner:
         held[list(self._candidates)] = True
         if (learning & held).sum() >= self._held:
             learning &= held
-        errors = tuple(
-            self._candidates[s].recent_errors(RECENT) if held[s] else np.zeros(0)
-            for s in range(len(learning))
-        )
+        errors = {s: c.recent_errors(RECENT) for s, c in self._candidates.items()}
         situation = Situation(
             self.stream, learning, errors, self._streams["visits"], draws, self.config.explore
         )
