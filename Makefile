@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: demo test lint bench fuzz clean install
+.PHONY: demo test lint bench fuzz torture clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
@@ -21,6 +21,9 @@ bench: $(INSTALLED)
 
 fuzz: $(INSTALLED)
 	$(BIN)/python tests/fuzz.py --cases 1000000 --jobs 2
+
+torture: $(INSTALLED)
+	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),30) --seed $(or $(SEED),0)
 
 install: $(INSTALLED)
 

@@ -1,0 +1,168 @@
+"""The campaigns find what they are to find, and go on where they were stopped."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.torture import harness, page
+from tests.torture.campaigns import CAMPAIGNS, campaign
+from tests.torture.commands import Ran, judge
+from tests.torture.outcomes import (
+    CLEAR_ERROR,
+    HANG,
+    LOST,
+    MEMORY,
+    RIGHT,
+    TRACEBACK,
+    WRONG,
+    Defect,
+    Job,
+    Limits,
+    Outcome,
+)
+
+
+def made(case: Any, results: harness.Results, **limits: Any) -> harness.Campaign:
+    module: Any = SimpleNamespace(case=case)
+    return harness.Campaign("made", module, results.seeds("made", 0), None, Limits(**limits))
+
+
+def ran(case: Any, folder: Path, **limits: Any) -> dict[str, Any]:
+    results = harness.Results(folder / "cases.jsonl")
+    return harness.end(harness.begin(made(case, results, **limits), 7))
+
+
+def test_a_case_is_the_same_from_its_seed(tmp_path: Path) -> None:
+    def case(job: Job) -> Outcome:
+        assert list(job.folder.iterdir()) == []
+        return Outcome(RIGHT, "random", str(job.rng.random()))
+
+    first, again = ran(case, tmp_path), ran(case, tmp_path)
+    assert first["kind"] == RIGHT
+    assert first["detail"] == again["detail"]
+
+
+def lost(job: Job) -> Outcome:
+    raise Defect(LOST, "group", "two seconds")
+
+
+def broken(job: Job) -> Outcome:
+    raise KeyError("x")
+
+
+def endless(job: Job) -> Outcome:
+    while True:
+        time.sleep(1)
+
+
+def greedy(job: Job) -> Outcome:
+    return Outcome(RIGHT, "group", str(len(b"x" * (600 << 20))))
+
+
+@pytest.mark.parametrize(
+    ("case", "kind", "limits"),
+    [
+        (lost, LOST, {}),
+        (broken, WRONG, {}),
+        (greedy, MEMORY, {"megabytes": 512.0}),
+    ],
+)
+def test_what_must_not_happen_is_a_defect(
+    tmp_path: Path, case: Any, kind: str, limits: dict[str, Any]
+) -> None:
+    line = ran(case, tmp_path, **limits)
+    assert line["kind"] == kind
+    assert line["defect"].startswith(kind)
+
+
+def test_a_case_that_hangs_is_ended_with_all_that_it_started(tmp_path: Path) -> None:
+    def hanging(job: Job) -> Outcome:
+        child = subprocess.Popen(["sleep", "600"])
+        (tmp_path / "child").write_text(str(child.pid))
+        return endless(job)
+
+    results = harness.Results(tmp_path / "cases.jsonl")
+    hung = made(hanging, results, seconds=0.5)
+    harness.run([hung], results, 0.001, 1, io.StringIO())
+    assert [line["kind"] for line in results.lines] == [HANG]
+    state = Path("/proc", (tmp_path / "child").read_text(), "stat")
+    assert not state.exists() or state.read_text().split()[2] == "Z"
+
+
+def test_results_are_gone_on_with(tmp_path: Path) -> None:
+    path = tmp_path / "cases.jsonl"
+    for _ in range(2):
+        results = harness.Results(path)
+        good = made(lambda job: Outcome(RIGHT, "group"), results)
+        harness.run([good], results, 0.002, 2, io.StringIO())
+        with path.open("a") as file:
+            file.write('{"campaign": "ma')  # cut off
+    seeds = [line["seed"] for line in harness.Results(path).lines]
+    assert sorted(seeds) == list(range(len(seeds)))
+    assert len(seeds) > 2
+
+
+@pytest.mark.parametrize(
+    ("code", "err", "seconds", "kind"),
+    [
+        (0, "", 1.0, RIGHT),
+        (2, "cdmisfa: no such file\n", 1.0, CLEAR_ERROR),
+        (1, "Traceback (most recent call last):\n", 1.0, TRACEBACK),
+        (1, "cdmisfa: unexpected KeyError: 1\n", 1.0, TRACEBACK),
+        (1, "", 1.0, TRACEBACK),
+        (-11, "", 1.0, TRACEBACK),
+        (0, "", 6.0, HANG),
+    ],
+)
+def test_how_commands_are_judged(code: int, err: str, seconds: float, kind: str) -> None:
+    try:
+        found = judge(Ran(("info",), code, "", err, seconds), "group")
+    except Defect as defect:
+        found = defect.outcome
+    assert found.kind == kind
+
+
+def test_the_page_counts_what_was_found() -> None:
+    shared = {"seconds": 36.0, "megabytes": 90}
+    lines = [
+        {"run": {"commit": "abc", "python": "3.11", "platform": "here", "seed": 0}},
+        *({"campaign": CAMPAIGNS[0], "seed": n, **Outcome(RIGHT, "a", count=3).as_json(), **shared}
+          for n in range(4)),
+        {"campaign": CAMPAIGNS[0], "seed": 9, **Outcome(LOST, "b", "much").as_json(), **shared,
+         "defect": "lost: much"},
+    ]  # fmt: skip
+    found = page.summary(lines)
+    text = page.markdown(json.loads(json.dumps(found)))
+    assert "13 cases in 0.1 hours of work, 1 defects" in text
+    assert "| a | 12 | 12 | 0 | 0 |" in text
+    assert "| b | 1 | 0 | 0 | 1 |" in text
+    assert f"python -m tests.torture {CAMPAIGNS[0]} --case 9" in text
+
+
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_every_campaign_is_what_the_harness_takes(name: str) -> None:
+    module = campaign(name)
+    assert module.__doc__
+    assert callable(module.case)
+
+
+def test_an_unknown_campaign_is_refused() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.torture", "kittens"],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "no campaign kittens" in done.stderr

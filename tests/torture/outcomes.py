@@ -1,0 +1,101 @@
+"""What a case is given, and what it comes to."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+RIGHT = "right"
+CLEAR_ERROR = "clear error"
+SKIPPED = "skipped"
+GOOD = (RIGHT, CLEAR_ERROR, SKIPPED)
+
+HANG = "hang"
+MIXED = "mixed"
+LOST = "lost"
+TRACEBACK = "traceback"
+MEMORY = "memory"
+WRONG = "wrong"
+DEFECTS = (HANG, MIXED, LOST, TRACEBACK, MEMORY, WRONG)
+"""Over 5 s; of two inputs; more than the stated second; no clear error; over the limit; others."""
+
+MEANING = {
+    RIGHT: "the result, or what is left after a kill, is what it must be",
+    CLEAR_ERROR: "one line that names what is wrong, and nothing worse",
+    SKIPPED: "not possible on this machine",
+    HANG: "a command that was to end did not within 5 s",
+    MIXED: "results of other bytes than those that they name, or not the same bits after resuming",
+    LOST: "more lost than the last second before the end",
+    TRACEBACK: "an error that is no clear line",
+    MEMORY: "more memory than the limit",
+    WRONG: "anything else that must not be",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One case.
+
+    Attributes:
+        seed: its number; the same one is the same case.
+        rng: everything random comes from here.
+        folder: empty, its own.
+        given: what `prepare` gave.
+    """
+
+    seed: int
+    rng: Random
+    folder: Path
+    given: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a case came to.
+
+    Attributes:
+        kind: one of `GOOD` or `DEFECTS`.
+        group: which row of the page it belongs to.
+        detail: what happened, in a line.
+        count: how many such cases it stands for.
+    """
+
+    kind: str
+    group: str
+    detail: str = ""
+    count: int = 1
+
+    def as_json(self) -> dict[str, Any]:
+        """As it stands in a line of the results."""
+        return asdict(self)
+
+
+class Defect(Exception):  # noqa: N818 - it is what was found
+    """What must not happen.
+
+    Args:
+        kind: one of `DEFECTS`.
+        group: as in `Outcome`.
+        detail: what was seen, with the command.
+    """
+
+    def __init__(self, kind: str, group: str, detail: str) -> None:
+        super().__init__(detail)
+        self.outcome = Outcome(kind, group, detail)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Of the cases of a campaign.
+
+    Attributes:
+        seconds: a case that takes longer hangs, whatever it is doing.
+        megabytes: most memory of one process of a case; None where inputs are not hostile.
+        share: of the time of all campaigns.
+    """
+
+    seconds: float = 120.0
+    megabytes: float | None = None
+    share: float = 1.0
