@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
+from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, description
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
@@ -251,10 +251,10 @@ def _identity(
             f"[{slowest:g}, {fastest:g}]"
         )
     if scene is None:
-        stated = dict(source.describe())
+        stated = description(source)
         seed = stated.get("seed")
         known = seed if isinstance(seed, int) else 0
-        return Identity(str(stated["kind"]), known, spec, {"source": stated})
+        return Identity(stated["kind"], known, spec, {"source": stated})
     clock = replace(settings, fps=spec.fps, start_ns=spec.start_ns)
     return Identity(
         scene.name,

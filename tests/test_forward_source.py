@@ -212,6 +212,21 @@ def test_a_source_that_shows_what_it_does_not_state_is_stopped_at_once(tmp_path:
         record(source, tmp_path / "rec", frames=9)
 
 
+def test_a_source_that_does_not_say_what_it_is_is_refused(tmp_path: Path) -> None:
+    class Nameless(Webcams):
+        def describe(self) -> Mapping[str, Any]:
+            return {}
+
+    for do in (
+        lambda: record(Nameless(), tmp_path / "out", frames=9),
+        lambda: run(Nameless(), CONFIG, tmp_path / "out", max_iterations=1),
+        lambda: run(Nameless(), CONFIG, tmp_path / "out", resume=True),
+    ):
+        with pytest.raises(UsageError, match=r"Nameless .*give its describe\(\) a kind"):
+            do()
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_url_is_no_folder_for_the_library_either() -> None:
     with pytest.raises(UsageError, match="s3://x/y is a URL: name a path on this machine"):
         record(Webcams(), "s3://x/y", frames=9)

@@ -201,6 +201,20 @@ class HeadPose:
     quaternion: tuple[float, float, float, float]
 
 
+def description(source: FrameSource) -> dict[str, Any]:
+    """What identifies a source, its kind at least; see `FrameSource.describe`.
+
+    Raises:
+        UsageError: it does not state its kind.
+    """
+    described = dict(source.describe())
+    if not isinstance(described.get("kind"), str):
+        raise UsageError(
+            f"{type(source).__name__} does not state what it is: give its describe() a kind, a text"
+        )
+    return described
+
+
 def check_request(spec: SourceSpec, stream: int, n: int) -> None:
     """Refuse a block that no source can give.
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
+from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.compiled import needs_compiling
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -147,13 +147,14 @@ def run(
     learner = open_learner(config, source.spec, seed)
     digest = Digest()
     tables = {**(sections or {}), "learner": as_table(config)}
-    manifest = {"config": tables, "seed": seed, "source": dict(source.describe())}
+    described = description(source)
+    manifest = {"config": tables, "seed": seed, "source": described}
     begun = {} if command is None else {COMMAND: dict(command)}
     told: list[Sink] = [digest]
     exhausted: LogExhaustedError | None = None
     if resume and not isinstance(source, SeekableSource):
         raise UsageError(
-            f"{source.describe()['kind']} cannot go back to where the run was "
+            f"{described['kind']} cannot go back to where the run was "
             "stopped: resume from its recording, or begin another run"
         )
     with contextlib.ExitStack() as opened:

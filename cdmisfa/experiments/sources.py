@@ -219,8 +219,9 @@ def open_source(
     else:
         source = _open_log(paths, cameras, loop=loop, salvage=salvage)
     try:
-        kind = scene_kind_for(source.spec, source.describe(), preset)
-        learner = None if source.describe().get("scene") in SCENES else OF_CAMERAS
+        described = source.describe()
+        kind = scene_kind_for(source.spec, described, preset)
+        learner = None if described.get("scene") in SCENES else OF_CAMERAS
         return source, configure(kind, preset, settings, seed, learner=learner)
     except BaseException:
         source.close()
