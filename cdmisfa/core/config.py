@@ -14,7 +14,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -91,9 +91,7 @@ class LearnerConfig:
         from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy
 
         convert_fields(self, "learner")
-        if self.expansion not in EXPANSIONS:
-            hint = did_you_mean(self.expansion, EXPANSIONS)
-            raise UsageError(f"learner.expansion is {self.expansion}: {hint}")
+        one_of(self, "learner", EXPANSIONS, "expansion")
         positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
         positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
         positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
@@ -107,10 +105,7 @@ class LearnerConfig:
         within(self, "learner", 0.0, 0.999999, "gamma")
         if self.beta is not None:
             within(self, "learner", 0.0, math.inf, "beta")
-        if self.outputs > self.components:
-            raise UsageError(
-                f"learner.outputs is {self.outputs}, more than learner.components {self.components}"
-            )
+        outputs_within_components(self, "learner")
 
     def reward_beta(self, n_streams: int) -> float:
         """Weight of the expert reward: as set, or the paper's nu ln 2 / (2 (n-1)).
@@ -158,6 +153,31 @@ def within(section: Any, prefix: str, low: float, high: float, *names: str) -> N
         value = getattr(section, name)
         if not low <= value <= high or (value == math.inf):
             raise UsageError(f"{prefix}.{name} is {value}: it must be in [{low:g}, {high:g}]")
+
+
+def one_of(section: Any, prefix: str, choices: Collection[str], *names: str) -> None:
+    """Refuse texts that are none of the choices, naming the key and the nearest choice.
+
+    Raises:
+        UsageError: at the first such value.
+    """
+    for name in names:
+        value = getattr(section, name)
+        if value not in choices:
+            raise UsageError(f"{prefix}.{name} is {value}: {did_you_mean(value, choices)}")
+
+
+def outputs_within_components(section: Any, prefix: str) -> None:
+    """Refuse a learner that is to give more slow features than it has components.
+
+    Raises:
+        UsageError: it has.
+    """
+    if section.outputs > section.components:
+        raise UsageError(
+            f"{prefix}.outputs is {section.outputs}, more than {prefix}.components "
+            f"{section.components}"
+        )
 
 
 def presets() -> tuple[str, ...]:

@@ -8,11 +8,11 @@ from cdmisfa.core.config import (
     MAX_COMPONENTS,
     MAX_TAU,
     convert_fields,
+    one_of,
+    outputs_within_components,
     positive,
     within,
 )
-from cdmisfa.core.errors import UsageError
-from cdmisfa.core.registry import did_you_mean
 
 ATTENTIONS = ("progress", "random", "robin", "novel", "sticky", "gamma", "ucb")
 """How the stream to watch is chosen, see `attention`."""
@@ -47,19 +47,12 @@ class ProgressConfig:
         if self.expansion is not None:
             from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy
 
-            if self.expansion not in EXPANSIONS:
-                hint = did_you_mean(self.expansion, EXPANSIONS)
-                raise UsageError(f"learner.expansion is {self.expansion}: {hint}")
-        if self.attention not in ATTENTIONS:
-            hint = did_you_mean(self.attention, ATTENTIONS)
-            raise UsageError(f"learner.attention is {self.attention}: {hint}")
+            one_of(self, "learner", EXPANSIONS, "expansion")
+        one_of(self, "learner", ATTENTIONS, "attention")
         positive(self, "learner", "components", "outputs", "visit", "test_frames")
         positive(self, "learner", "window", "settled", "agreement", "looks")
         within(self, "learner", 0.0, 1.0, "explore", "slow", "even")
         within(self, "learner", 0.0, float(2**62), "watch")
         within(self, "learner", 1, MAX_COMPONENTS, "components")
         within(self, "learner", 3, MAX_TAU, "tau")
-        if self.outputs > self.components:
-            raise UsageError(
-                f"learner.outputs is {self.outputs}, more than learner.components {self.components}"
-            )
+        outputs_within_components(self, "learner")
