@@ -12,17 +12,21 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from conftest import Cdmisfa
 from source_contract import SourceContract, same
 
-from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, SourceSpec, freeze
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.experiments.runs import RunResult, run
 from recorder.log.split import Split
-from recorder.recording import record_scene
-from recorder.world.oscillatory import OscillatorySource
-from replay.recordings.followed import FollowedSource
+from recorder.recording import record, record_scene
+from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
+from replay.recordings.followed import FollowedSource, ReplacedError
 from replay.storage.store import FileStore
 
 FRAMES = 600
@@ -186,6 +190,82 @@ def test_a_resumed_recorder_is_followed_on(tmp_path: Path) -> None:
     same(source.take(2, 250), live.take(2, 250))
     assert source.finished
     source.close()
+
+
+class Unseeded(ClockedSource):
+    """Two streams that show random values, and of their seed say nothing."""
+
+    def __init__(self, seed: int) -> None:
+        self._spec = SourceSpec(("a", "b"), (3,), "float64")
+        self._frames = np.random.default_rng(seed).normal(size=(400, 3))
+
+    def take(self, stream: int, n: int) -> Block:
+        frames = self._frames[self._t : self._t + n] + stream
+        self._t += n
+        return Block(stream, self._t - n, freeze(frames), freeze(np.empty((n, 0))))
+
+    def describe(self) -> dict[str, str]:
+        return {"kind": "unseeded"}
+
+
+def half_recorded(folder: Path, seed: int, frames: int = 200) -> None:
+    """Leave what a recorder of 400 frames leaves that is killed after some."""
+
+    def stop(done: float) -> None:
+        if done >= frames:
+            raise RuntimeError("stop")
+
+    config = OscillatoryConfig(seed=seed)
+    with pytest.raises(RuntimeError, match="stop"):
+        record_scene("oscillatory", folder, config, frames=400, force=True, progress=stop)
+
+
+@pytest.mark.parametrize("frames", [100, 300])
+def test_another_recording_in_its_place_is_refused(tmp_path: Path, frames: int) -> None:
+    half_recorded(tmp_path / "rec", 1)
+    source = FollowedSource(tmp_path / "rec", timeout=30)
+    source.take(0, 150)
+    half_recorded(tmp_path / "rec", 2, frames)
+    with pytest.raises(ReplacedError, match=r"rec: another recording took the place .*--force"):
+        source.take(2, 250)
+    assert source.t == 150
+    source.close()
+
+
+def test_other_frames_under_the_same_name_are_refused(tmp_path: Path) -> None:
+    """What is no scene may show others and state the same of itself."""
+
+    def recorded(seed: int, frames: int) -> None:
+        record(Unseeded(seed), tmp_path / "rec", frames=frames, force=True)
+        for path in (tmp_path / "rec").glob("*.mcap"):
+            path.rename(f"{path}.partial")
+
+    recorded(1, 100)
+    source = FollowedSource(tmp_path / "rec", timeout=30)
+    source.take(0, 80)
+    recorded(1, 120)
+    source.take(1, 30)
+    recorded(2, 200)
+    with pytest.raises(ReplacedError, match="another recording"):
+        source.take(0, 40)
+    source.close()
+
+
+def test_a_resumed_run_goes_on_with_the_frames_that_it_had(tmp_path: Path) -> None:
+    words = {"max_iterations": 5, "rerun": False}
+    config = LearnerConfig(tau=20)
+
+    def learned(**more: Any) -> RunResult:
+        with contextlib.closing(FollowedSource(tmp_path / "rec", timeout=1)) as source:
+            return run(source, config, tmp_path / "run", **{**words, **more})
+
+    record(Unseeded(1), tmp_path / "rec", frames=200)
+    learned()
+    record(Unseeded(0), tmp_path / "rec", frames=200, force=True)
+    with pytest.raises(LogDamagedError, match="what it learned from is not there"):
+        learned(resume=True, max_iterations=9)
+    record(Unseeded(1), tmp_path / "rec", frames=300, force=True)
+    learned(resume=True, max_iterations=9)
 
 
 def test_a_stopped_run_goes_on_following(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

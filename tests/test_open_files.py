@@ -61,17 +61,21 @@ def test_closed_parts_are_opened_again_with_the_same_frames(
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     monkeypatch.setattr(store, "OPEN_FILES", 1)
-    files = [tmp_path / "a.mcap.partial", tmp_path / "b.mcap"]
+    files = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     for path in files:
         path.write_bytes(path.name.encode())
     return files
 
 
-def test_a_file_that_its_recorder_renamed_is_found_again(files: list[Path]) -> None:
+def test_a_file_that_is_being_written_stays_open(files: list[Path]) -> None:
+    """Its size and time change, so another in its place could not be told from it."""
+    files[0] = files[0].rename(f"{files[0]}.partial")
     one, two = map(FileStore, files)
     assert two.read(0, 1) == b"b"
-    files[0].rename(files[0].with_suffix(""))
+    files[0].unlink()
+    files[0].write_bytes(b"another")
     assert one.read(0, 6) == b"a.mcap"
+    assert not one.is_at(files[0])
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -81,7 +85,7 @@ def test_a_file_that_was_replaced_is_not_read_on(files: list[Path], there: bool)
     files[0].unlink()
     if there:
         files[0].write_bytes(b"z")
-    with pytest.raises(LogDamagedError, match=r"a\.mcap\.partial: .*while it was read"):
+    with pytest.raises(LogDamagedError, match=r"a\.mcap: .*while it was read"):
         one.read(0, 6)
 
 

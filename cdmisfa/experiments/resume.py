@@ -115,12 +115,15 @@ class Checkpoint:
         t: the source's next frame.
         state: of the learner.
         versions: of the packages that computed it.
+        taken: the SHA-256 of the frames before it, of a source that says so; see
+            `FollowedSource`.
     """
 
     iteration: int
     t: int
     state: LearnerState
     versions: Mapping[str, str]
+    taken: str | None = None
 
 
 def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
@@ -135,6 +138,7 @@ def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
         "t": checkpoint.t,
         "policy_rng": checkpoint.state.policy_rng,
         "versions": checkpoint.versions,
+        "taken": checkpoint.taken,
     }
     arrays: dict[str, NDArray[Any]] = {_HEAD: np.frombuffer(json.dumps(head).encode(), np.uint8)}
     for field in dataclasses.fields(Module):
@@ -170,7 +174,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
             if name.startswith(_MODULES)
         }
         state = LearnerState(arrays, _modules(columns), head["policy_rng"])
-        return Checkpoint(int(head["iteration"]), int(head["t"]), state, head["versions"])
+        at, t = int(head["iteration"]), int(head["t"])
+        return Checkpoint(at, t, state, head["versions"], head.get("taken"))
     except _UNREADABLE as error:
         text = " ".join(str(error).split())[:200]
         raise LogDamagedError(f"{path}: not a whole checkpoint ({text}); remove it") from error
@@ -239,8 +244,9 @@ class Checkpoints(Sink):
 
     def finish(self) -> None:
         """See `Sink`; the log is flushed before."""
-        learner = self._learner
-        checkpoint = Checkpoint(learner.iteration, self._source.t, learner.state, versions())
+        learner, taken = self._learner, getattr(self._source, "taken", None)
+        at, t = learner.iteration, self._source.t
+        checkpoint = Checkpoint(at, t, learner.state, versions(), taken)
         save_checkpoint(self._run, checkpoint)
 
 

@@ -19,7 +19,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.compiled import needs_compiling
 from cdmisfa.core.config import as_table
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
@@ -287,6 +287,13 @@ def _restore(log: Any, learner: Learner, source: Any, digest: Digest) -> None:
         restore(learner, checkpoint)
         for signals in log.take_over(before, checkpoint.iteration):
             digest.add(signals)
+            if checkpoint.taken is not None:
+                source.take(signals.stream, learner.tau)
+        if checkpoint.taken is not None and source.taken != checkpoint.taken:
+            raise LogDamagedError(
+                f"{folder}: what it learned from is not there any more: begin anew with --force, "
+                "or choose another folder"
+            )
         source.seek(checkpoint.t)
         last = max(checkpoint.iteration - 1, 0)
         log.event(source.t, last, f"resumed at iteration {checkpoint.iteration}")

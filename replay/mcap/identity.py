@@ -34,13 +34,13 @@ def identity(path: Location, reader: LogReader | None = None) -> dict[str, Any]:
 
     Args:
         path: the log.
-        reader: of the log behind a URL.
+        reader: of the log; without it the file that has its path now.
 
     Raises:
         CdmisfaError: it cannot be read.
     """
     if isinstance(path, Path):
-        return {"file": path.name, "sha256": sha256(path)}
+        return {"file": path.name, "sha256": reader.digest() if reader else sha256(path)}
     if reader is None:
         raise ValueError(f"{path} is identified by its reader")
     name = "index_sha256" if reader.by_index else "sha256"

@@ -250,6 +250,10 @@ class LogReader:
         """Whether a path leads to the very file that was opened."""
         return self._file.is_at(path)
 
+    def moved(self, path: Path) -> None:
+        """Hear that the very file that was opened has another name now."""
+        self.path = self._file.path = path
+
     def refresh(self) -> bool:
         """Look for what a recorder wrote since; whether the file grew.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ from typing import Any, Final
 
 from cdmisfa.core.blocks import Block, ClockedSource, check_request
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
+from recorder.log.begun import read_recording
 from recorder.log.whole import PARTIAL
 from replay.recordings.source import RecordedSource
 from replay.storage.listing import log_files
@@ -19,11 +21,18 @@ POLL: Final = 0.1
 """Seconds between two looks at the files."""
 
 
+class ReplacedError(CdmisfaError):
+    """Another recording took the place of the one that was followed."""
+
+    exit_code = 3
+
+
 class FollowedSource(ClockedSource):
     """The views of a recording, of which more frames come while it is read.
 
     A recorder hands over whole seconds of frames; a block that is not there yet is waited
-    for, until the recorder finishes its files.
+    for, until the recorder finishes its files. One that is resumed writes its unfinished files
+    again: they are gone on with once they are known to hold every frame that was taken.
 
     Args:
         path: the recording's folder, which may not be there yet.
@@ -55,9 +64,11 @@ class FollowedSource(ClockedSource):
         self.stop = stop
         self._path = Path(path)
         self._timeout = timeout
-        self._taken = False
+        self._blocks: list[tuple[int, int, int]] = []
+        self._sha256 = hashlib.sha256()
         self._seen: object = None
         self._source: RecordedSource | None = None
+        self._identity: object = None
         self._wait(0, "frame 0")
         self._t = self._now.t
         self._spec = replace(self._now.spec, length=None)
@@ -67,20 +78,27 @@ class FollowedSource(ClockedSource):
         """Whether the recorder has finished every file."""
         return any(self._path.glob("*.mcap")) and not any(self._path.glob(f"*{PARTIAL}*"))
 
+    @property
+    def taken(self) -> str:
+        """SHA-256 of the blocks that were taken, in their order."""
+        return self._sha256.hexdigest()
+
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a view shows at t .. t+n-1, waited for; moves t by n.
 
         Raises:
             LogExhaustedError: the recording ended, or its recorder is gone; t stays.
             LogDamagedError: a chunk is damaged; t stays.
+            ReplacedError: another recording took its place; t stays.
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
         self._wait(self._t + n, f"frame {self._t + n - 1}")
         self._now.seek(self._t)
         block = self._now.take(stream, n)
+        self._blocks.append((stream, self._t, n))
+        _add(self._sha256, block)
         self._t += n
-        self._taken = True
         return block
 
     def seek(self, t: int) -> None:
@@ -88,6 +106,7 @@ class FollowedSource(ClockedSource):
 
         Raises:
             LogExhaustedError: the recording ended before it, or its recorder is gone.
+            ReplacedError: another recording took its place.
             ValueError: t lies before the recording's first frame.
         """
         self._wait(t, f"frame {t}")
@@ -100,7 +119,7 @@ class FollowedSource(ClockedSource):
         A file that still grows is named by its first `bytes`, and their SHA-256.
         """
         views: list[dict[str, Any]] = [{"name": name} for name in self._spec.streams]
-        if self._taken:
+        if self._blocks:
             views = self._now.describe_files()
         return {"kind": "recording", **self._now.scene(), "followed": True, "views": views}
 
@@ -152,16 +171,73 @@ class FollowedSource(ClockedSource):
     def _look(self) -> CdmisfaError | None:
         """Take in what was added to the files; give why that cannot be (yet)."""
         try:
-            seen = [(path, os.stat(str(path)).st_size) for path in log_files(self._path)]
+            seen = [(path, _state(path)) for path in log_files(self._path)]
             if seen == self._seen:
                 return None
-            if self._source is None:
-                self._source = RecordedSource(self._path)
-            else:
-                self._source.refresh()
+            # A file that was given its name between two steps is found by a second look.
+            if self._source is None or not (self._source.refresh() or self._source.refresh()):
+                self._go_on_with(RecordedSource(self._path))
+            elif _identity(self._source) != self._identity:
+                raise self._replaced()
         except (UsageError, LogDamagedError) as error:
             return error
         except OSError:  # renamed between two looks
             return None
         self._seen = seen
         return None
+
+    def _go_on_with(self, found: RecordedSource) -> None:
+        """Read from now on what was opened anew, in place of what is not there any more."""
+        before = self._source
+        try:
+            self._check(found)
+        except BaseException:
+            found.close()
+            raise
+        self._source, self._identity = found, _identity(found)
+        if before is not None:
+            before.close()
+
+    def _check(self, found: RecordedSource) -> None:
+        """Refuse files that are not all there yet, or do not hold what was taken.
+
+        Raises:
+            UsageError: more may come.
+            LogDamagedError: more may come, or a chunk is damaged.
+            ReplacedError: they are of another recording.
+        """
+        absent = read_recording(self._path).options["frames"].keys() - set(found.spec.streams)
+        if absent or not found.refresh():
+            raise UsageError(f"{self._path}: its files are not all there yet")
+        if self._source is not None and _identity(found) != self._identity:
+            raise self._replaced()
+        if found.first_frame + found.frames < max((t + n for _, t, n in self._blocks), default=0):
+            raise LogDamagedError(f"{self._path}: it lacks frames that it had before")
+        again = hashlib.sha256()
+        for stream, t, n in self._blocks:
+            found.seek(t)
+            _add(again, found.take(stream, n))
+        if again.digest() != self._sha256.digest():
+            raise self._replaced()
+
+    def _replaced(self) -> ReplacedError:
+        return ReplacedError(
+            f"{self._path}: another recording took the place of the one that was followed: "
+            "learn from it in another run, or anew with --force"
+        )
+
+
+def _identity(source: RecordedSource) -> tuple[object, ...]:
+    return replace(source.spec, length=None), source.scene(), source.first_frame
+
+
+def _add(sha256: Any, block: Block) -> None:
+    sha256.update(f"{block.stream} {block.t} {len(block)}\n".encode())
+    sha256.update(block.frames)
+    sha256.update(block.truth)
+
+
+def _state(path: object) -> tuple[int, ...]:
+    """What of a file changes when it is written or replaced."""
+    found = os.stat(str(path))
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns

@@ -76,22 +76,29 @@ class RecordedSource(ClockedSource):
             raise
         self._t = self._first
 
-    def refresh(self) -> None:
+    def refresh(self) -> bool:
         """Take in what a recorder wrote since: more frames, and further parts of a view.
 
-        What is there already is not read again, unless a file was replaced.
+        What is there already is not read again.
+
+        Returns:
+            False, and nothing was taken in, where a file was removed or replaced.
 
         Raises:
             UsageError: no such recording any more.
             LogDamagedError: what was written is damaged.
         """
         before = {view.path.name.removesuffix(PARTIAL): view for view in self._all()}
+        files = log_files(self._paths)
+        there = {path.name.removesuffix(PARTIAL): path for path in files if isinstance(path, Path)}
+        if not all(n in there and v.reader.is_at(there[n]) for n, v in before.items()):
+            return False
         opened: list[ViewFile] = []
         added: list[ViewFile] = []
         try:
-            for path in log_files(self._paths):
+            for path in files:
                 view = before.get(path.name.removesuffix(PARTIAL))
-                if view is not None and isinstance(path, Path) and view.reader.is_at(path):
+                if view is not None and isinstance(path, Path):
                     view.refresh(path)
                     opened.append(view)
                 elif not _only_begun(path):
@@ -101,11 +108,9 @@ class RecordedSource(ClockedSource):
             for view in added:
                 view.close()
             raise
-        for view in before.values():
-            if view not in opened:
-                view.close()
         self._files, self._hashes, self._views = [v.path for v in opened + added], None, views
         self._set_clock()
+        return True
 
     @property
     def frames(self) -> int:

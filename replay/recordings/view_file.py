@@ -86,7 +86,8 @@ class ViewFile:
 
     def refresh(self, path: Path) -> None:
         """Take in the frames that a recorder wrote since; it may have renamed the file."""
-        self.path = self.reader.path = path
+        self.path = path
+        self.reader.moved(path)
         if self.reader.refresh():
             self._scanner = None
             for rows in self._channels:

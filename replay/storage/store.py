@@ -113,9 +113,11 @@ class FileStore(Store):
 
     def is_at(self, path: Path) -> bool:
         try:
-            return os.path.samestat(os.stat(path), self._seen)
+            now = os.stat(path)
         except OSError:
             return False
+        unchanged = self in _OPEN or self._unchanged(now)
+        return unchanged and os.path.samestat(now, self._seen)
 
     def grow(self) -> bool:
         self._seen = os.fstat(self._open().number)
@@ -139,29 +141,28 @@ class FileStore(Store):
         return self._opened_again()
 
     def _opened_again(self) -> _Descriptor:
-        """Open the very file that was opened before; a recorder may have given it its name."""
-        path = Path(str(self.path))
-        reason = "it was removed or replaced"
-        for name in (path, path.with_suffix("") if path.suffix == PARTIAL else path):
-            try:
-                file = _Descriptor(name)
-                now = os.fstat(file.number)
-            except OSError as error:
-                reason = error.strerror or reason
-                continue
-            unchanged = (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
-            grown = path.suffix == PARTIAL and now.st_size > self.size
-            if os.path.samestat(now, self._seen) and (unchanged or grown):
-                self._keep(file)
-                return file
-            reason = "it was replaced"
-        raise LogDamagedError(f"{path}: {reason} while it was read")
+        """Open the very file that was opened before."""
+        try:
+            file = _Descriptor(Path(str(self.path)))
+            now = os.fstat(file.number)
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror} while it was read") from None
+        if not (os.path.samestat(now, self._seen) and self._unchanged(now)):
+            raise LogDamagedError(f"{self.path}: it was replaced while it was read")
+        self._keep(file)
+        return file
+
+    def _unchanged(self, now: os.stat_result) -> bool:
+        return (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
 
     def _keep(self, file: _Descriptor) -> None:
+        """Hold a file open, and close others; those that still grow are known only while open."""
         with _LOCK:
             _OPEN[self] = file
-            while len(_OPEN) > OPEN_FILES:
-                _OPEN.popitem(last=False)
+            if (above := len(_OPEN) - OPEN_FILES) > 0:
+                whole = [f for f in _OPEN if f is not self and f.path.suffix != PARTIAL]
+                for one in whole[:above]:
+                    del _OPEN[one]
 
 
 class _Descriptor:
