@@ -22,6 +22,7 @@ from cdmisfa.core.modules import Module
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from recorder.log.whole import whole
+from replay.storage.arrays import read_arrays
 
 RECIPE: Final = 2
 """Rises when streams are made in another way, so that those on disk are made anew."""
@@ -143,10 +144,10 @@ class Library:
         """
         path = self._reference(name, seed, components, expansion)
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                scale, mean = float(arrays["scale"]), arrays["mean"]
-                both = [linear(arrays[k], mean, expansion, scale) for k in ("phi", "directions")]
-                return Reference(float(arrays["slowness"]), *both)
+            arrays = read_arrays(path)
+            scale, mean = float(arrays["scale"]), arrays["mean"]
+            both = [linear(arrays[k], mean, expansion, scale) for k in ("phi", "directions")]
+            return Reference(float(arrays["slowness"]), *both)
         except (OSError, ValueError, KeyError) as error:
             raise UsageError(f"{path} is damaged: delete it, and it is made anew") from error
 

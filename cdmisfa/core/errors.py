@@ -35,3 +35,8 @@ class NotReproducedError(CdmisfaError):
     """A result differs from the one it was compared with."""
 
     exit_code = 4
+
+
+def one_line(error: BaseException) -> str:
+    """What an error of others says, short and in one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__

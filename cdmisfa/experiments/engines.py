@@ -17,7 +17,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.processes import Workers
 from cdmisfa.core.registry import did_you_mean
 
@@ -147,15 +147,11 @@ def _spread(
         for index, death in lost.items():
             deaths[index] += 1
             if pool.gave_up or deaths[index] >= DEATHS:
-                yield index, WorkerDied(f"every worker that tried it died ({_line(death)})")
+                yield index, WorkerDied(f"every worker that tried it died ({one_line(death)})")
             elif deaths[index] == DEATHS - 1:
                 alone.append(index)
             else:
                 waiting.appendleft(index)
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _open(engine: str, jobs: int, scheduler: str | None) -> Pool:
@@ -216,7 +212,7 @@ class DaskPool:
                 )
         except (OSError, TimeoutError, ValueError) as error:
             raise EngineError(
-                f"no dask scheduler answers at {scheduler}: {_line(error)}"
+                f"no dask scheduler answers at {scheduler}: {one_line(error)}"
             ) from error
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_SECONDS)

@@ -11,19 +11,16 @@ import contextlib
 import dataclasses
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
@@ -60,11 +57,6 @@ SCHEMA = 2
 
 KEPT = 2
 """Checkpoints that a run's folder keeps: the newest, and one in case its log was lost."""
-
-_UNREADABLE = (
-    *(OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, OverflowError),
-    *(MemoryError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile, zlib.error),
-)  # what numpy, zipfile and json raise for damaged files
 
 _HEAD = "checkpoint"
 _MODULES = "modules."
@@ -163,8 +155,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
     Raises:
         LogDamagedError: the file is damaged, or not a checkpoint of this version.
     """
+    from replay.storage.arrays import read_arrays
+
     try:
-        arrays = _plain_arrays(path)
+        arrays = read_arrays(path)
         head = json.loads(arrays.pop(_HEAD).tobytes())
         if head["schema"] != SCHEMA:
             raise LogDamagedError(f"{path}: a checkpoint of version {head['schema']}, not {SCHEMA}")
@@ -176,18 +170,10 @@ def load_checkpoint(path: Path) -> Checkpoint:
         state = LearnerState(arrays, _modules(columns), head["policy_rng"])
         at, t = int(head["iteration"]), int(head["t"])
         return Checkpoint(at, t, state, head["versions"], head.get("taken"))
-    except _UNREADABLE as error:
-        text = " ".join(str(error).split())[:200]
-        raise LogDamagedError(f"{path}: not a whole checkpoint ({text}); remove it") from error
-
-
-def _plain_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    with zipfile.ZipFile(path) as archive:
-        # Stored as they are, members cannot unpack to more than the file's size.
-        if any(m.compress_type != zipfile.ZIP_STORED for m in archive.infolist()):
-            raise ValueError("it is compressed")
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    except (OSError, LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise LogDamagedError(
+            f"{path}: not a whole checkpoint ({one_line(error)}); remove it"
+        ) from error
 
 
 def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
-import struct
-import zipfile
-import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.modules import Module
 from recorder.log.whole import whole
 from replay.runs.folders import MODULES_FILE
+from replay.storage.arrays import read_arrays
+
+Arrays = Mapping[str, NDArray[Any]]
 
 _NAME = re.compile(r"module([1-9]\d{0,8})_([a-z_]+)")
 _NUMBERS = ("index", "stream_index", "iteration")
@@ -30,7 +29,6 @@ _ARRAYS = tuple(
     if f.name not in (*_NUMBERS, *(name for name, _, _ in _PLAIN))
 )
 
-_END = struct.Struct("<4s4H2LH")
 _FIELDS = {field.name for field in dataclasses.fields(Module)}
 
 
@@ -58,34 +56,29 @@ def load_modules(path: Path) -> tuple[Module, ...]:
     path = Path(path)
     path = path / MODULES_FILE if path.is_dir() else path
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-            _refuse_compressed(stored.zip)
-            return tuple(_module(stored, index) for index in _indices(stored))
+        stored = read_arrays(path)
+        return tuple(_module(stored, index) for index in _indices(stored))
     except FileNotFoundError as error:
         raise UsageError(f"{path} does not exist: name a run's folder") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
-        raise LogDamagedError(f"{path} holds no modules ({_line(error)})") from error
-    except (MemoryError, OverflowError, RecursionError, SyntaxError, TokenError) as error:
-        raise LogDamagedError(f"{path} holds no modules (an impossible array)") from error
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
-        raise LogDamagedError(f"{path} is damaged ({_line(error)})") from error
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise LogDamagedError(f"{path} holds no modules ({one_line(error)})") from error
 
 
-def _module(stored: Any, index: int) -> Module:
-    before_names = _key(index, "stream_index") not in stored.files  # then "stream" is the index
+def _module(stored: Arrays, index: int) -> Module:
+    before_names = _key(index, "stream_index") not in stored  # then "stream" is the index
     values: dict[str, Any] = {"stream": ""}
     for name in _NUMBERS:
         kept = "stream" if before_names and name == "stream_index" else name
         values[name] = int(stored[_key(index, kept)])
     for name in _ARRAYS:
-        if name in _OPTIONAL and _key(index, name) not in stored.files:
+        if name in _OPTIONAL and _key(index, name) not in stored:
             continue
         array = stored[_key(index, name)]
         if array.dtype.kind not in "fi":
             raise ValueError(f"{name} is no array of numbers")
         values[name] = array
     for name, kind, of_type in _PLAIN:
-        if _key(index, name) in stored.files and not (before_names and name == "stream"):
+        if _key(index, name) in stored and not (before_names and name == "stream"):
             array = stored[_key(index, name)]
             if array.dtype.kind != kind:
                 raise ValueError(f"{name} is no {of_type.__name__}")
@@ -102,13 +95,13 @@ def _module(stored: Any, index: int) -> Module:
     return Module(**values)
 
 
-def _indices(stored: Any) -> list[int]:
+def _indices(stored: Arrays) -> list[int]:
     """The modules' indices, of a file in which every name is that of a module's field.
 
     A checksum protects what the arrays hold, but nothing their names and number.
     """
     fields: dict[int, set[str]] = {}
-    for name in stored.files:
+    for name in stored:
         found = _NAME.fullmatch(name)
         if found is None or found[2] not in _FIELDS:
             raise ValueError(f"{name[:40]!r} is nothing of a module")
@@ -121,35 +114,6 @@ def _indices(stored: Any) -> list[int]:
     if any(int(stored[_key(index, "index")]) != index for index in indices):
         raise ValueError("the numbers of modules are mixed up")
     return indices
-
-
-def _refuse_compressed(archive: zipfile.ZipFile) -> None:
-    """Refuse what was not stored as it is: only then nothing unpacks to more than the file."""
-    members = archive.infolist()
-    if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-        raise ValueError("it is compressed")
-    if len(members) != _stated_members(archive):
-        raise ValueError("its directory is cut")
-    if len({member.filename for member in members}) < len(members):
-        raise ValueError("two arrays have one name")
-    end = 0
-    for member in members:
-        if member.header_offset < end:
-            raise ValueError("its arrays overlap")
-        end = member.header_offset + member.file_size
-
-
-def _stated_members(archive: zipfile.ZipFile) -> int:
-    """How many members the last record of a zip file without a comment states."""
-    if archive.fp is None or archive.comment:
-        raise ValueError("it has a comment")
-    archive.fp.seek(-_END.size, os.SEEK_END)
-    return int(_END.unpack(archive.fp.read(_END.size))[4])
-
-
-def _line(error: Exception) -> str:
-    """What an error says, short and in one line."""
-    return " ".join(str(error).split())[:200]
 
 
 def _key(index: int, name: str) -> str:

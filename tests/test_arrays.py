@@ -1,0 +1,53 @@
+"""Files of plain arrays: what was written is read, and nothing else is."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replay.storage.arrays import read_arrays
+
+
+def test_what_was_written_is_read(tmp_path: Path) -> None:
+    written = {"a.b": np.arange(6.0).reshape(2, 3), "none": np.zeros((0, 2)), "text": np.array("x")}
+    np.savez(tmp_path / "file.npz", **written)
+    found = read_arrays(tmp_path / "file.npz")
+    assert sorted(found) == sorted(written)
+    for name, array in written.items():
+        assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
+        assert found[name].tobytes() == array.tobytes()
+    with pytest.raises(FileNotFoundError):
+        read_arrays(tmp_path / "other.npz")
+
+
+def test_members_that_share_bytes_are_refused(tmp_path: Path) -> None:
+    """A small file whose directory names its one array many times would fill the memory."""
+    path = tmp_path / "file.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY")
+        archive.writestr("b.npy", b"")
+        archive.infolist()[1].header_offset = 0
+    with pytest.raises(ValueError, match="its arrays overlap"):
+        read_arrays(path)
+
+
+def test_what_is_no_array_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "file.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"some text")
+    with pytest.raises(ValueError, match="not all of it are arrays"):
+        read_arrays(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04" + bytes(60), b"\x93NUMPY\x01\x00"])
+def test_what_is_no_such_file_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "file.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"^[^\n]{5,200}$"):
+        read_arrays(path)
+    np.save(path.with_suffix(".npy"), np.zeros(3))
+    with pytest.raises(ValueError, match=r"^[^\n]{5,200}$"):
+        read_arrays(path.with_suffix(".npy"))
