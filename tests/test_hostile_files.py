@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import zipfile
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.resume import Checkpoint, checkpoints, load_checkpoint, save_checkpoint
-from cdmisfa.experiments.store import ROWS, read_rows
+from cdmisfa.experiments.store import DONE, ROWS, read_rows
 from recorder.log.logfile import LogFile
 from replay.camera_logs import picture_folder
 from replay.camera_logs.opening import open_images
@@ -148,3 +149,15 @@ def test_deep_json_is_damage(tmp_path: Path) -> None:
     (tmp_path / ROWS).write_text(DEEP + "\n")
     with pytest.raises(LogDamagedError, match=ROWS):
         list(read_rows(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "result", [{"iterations": 1}, {"iterations": "x", "modules": []}, {"modules": 3}, [], None]
+)
+def test_a_row_that_is_no_result_is_damage(tmp_path: Path, result: object) -> None:
+    request = {"trials": [{"id": "a", "point": {}}]}
+    (tmp_path / REQUEST).write_text(json.dumps(request))
+    row = {"id": "a", "status": DONE, "point": {}, "result": result}
+    (tmp_path / ROWS).write_text(json.dumps(row) + "\n")
+    with pytest.raises(LogDamagedError, match=ROWS):
+        results(tmp_path)

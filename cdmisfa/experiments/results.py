@@ -14,7 +14,7 @@ from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments.statistics import Summary, summary
-from cdmisfa.experiments.store import DONE, FAILED, read_rows
+from cdmisfa.experiments.store import DONE, FAILED, ROWS, read_rows
 from cdmisfa.experiments.sweep import REQUEST
 
 SCHEMA = 1
@@ -65,7 +65,13 @@ def results(folder: Path) -> list[PointResult]:
     points: dict[tuple[tuple[str, str], ...], list[Any]] = {}
     for number, point in trials:
         points.setdefault(tuple(point.items()), []).append(rows.get(number))
-    return [_point(dict(key), found) for key, found in points.items()]
+    try:
+        return [_point(dict(key), found) for key, found in points.items()]
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise LogDamagedError(
+            f"{folder / ROWS}: a row is no trial's result ({error}): remove the file and run the "
+            "sweep again"
+        ) from error
 
 
 def _point(point: Mapping[str, str], rows: Sequence[Mapping[str, Any] | None]) -> PointResult:

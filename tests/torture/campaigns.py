@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-CAMPAIGNS = ("damage",)
+CAMPAIGNS = ("kills", "damage")
 """Modules of this folder, in the order of the page."""
 
 

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,31 +102,36 @@ class Process:
 
     def __init__(self, folder: Path, *words: object, shell: str = "") -> None:
         self.words = tuple(map(str, words))
+        self.code: int | None = None
         streams = Path(tempfile.mkdtemp(dir=folder.parent))
         self._out, self._err = streams / "out", streams / "err"
+        with self._out.open("w") as out, self._err.open("w") as err:
+            self.pid = self._begin(folder, out.fileno(), err.fileno(), shell)
+        self._began = time.monotonic()
+
+    def _begin(self, folder: Path, out: int, err: int, shell: str) -> int:
         line = [sys.executable, "-m", "cdmisfa", *self.words]
         if shell:
             line = ["sh", "-c", f'exec "$@" {shell}', "sh", *line]
-        with self._out.open("w") as out, self._err.open("w") as err:
-            self.process = subprocess.Popen(
-                line,
-                cwd=folder,
-                env=environment(),
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=err,
-            )
-        self._began = time.monotonic()
+        process = subprocess.Popen(
+            line, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=out, stderr=err
+        )
+        process.returncode = 0  # it is waited for here, and by nobody else
+        return process.pid
 
     @property
     def running(self) -> bool:
         """Whether it has not ended."""
-        return self.process.poll() is None
+        if self.code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            if pid:
+                self.code = os.waitstatus_to_exitcode(status)
+        return self.code is None
 
     def send(self, number: int) -> None:
         """Send it a signal, unless it has ended."""
-        with contextlib.suppress(ProcessLookupError):
-            self.process.send_signal(number)
+        if self.running:
+            os.kill(self.pid, number)
 
     def wait(self, seconds: float, group: str, why: str = "") -> Ran:
         """What it came to.
@@ -133,20 +139,52 @@ class Process:
         Raises:
             Defect: it hangs.
         """
-        try:
-            code = self.process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-            ran = self._ran(-signal.SIGKILL)
-            what = f"{ran.line} {why} did not end within {seconds:g} s"
-            raise Defect(HANG, group, what) from None
-        return self._ran(code)
+        if not until(lambda: not self.running, seconds):
+            self.send(signal.SIGKILL)
+            until(lambda: not self.running, 10)
+            ran = self.ran()
+            what = f"{ran.line} {why} did not end within {seconds:g} s: {ran.told()}"
+            raise Defect(HANG, group, what)
+        return self.ran()
 
-    def _ran(self, code: int) -> Ran:
+    def ran(self) -> Ran:
+        """What it has said until now, and its code, once it has ended."""
         seconds = time.monotonic() - self._began
         texts = [path.read_text(errors="replace") for path in (self._out, self._err)]
-        return Ran(self.words, code, texts[0], texts[1], seconds)
+        return Ran(self.words, -signal.SIGKILL if self.code is None else self.code, *texts, seconds)
+
+
+class Fork(Process):
+    """The same, forked off this process, so that nothing is imported again.
+
+    Args:
+        folder: as for `Process`, as are `words`.
+        tweak: called there first.
+    """
+
+    def __init__(self, folder: Path, *words: object, tweak: Callable[[], None] = int) -> None:
+        self._tweak = tweak
+        super().__init__(folder, *words)
+
+    def _begin(self, folder: Path, out: int, err: int, shell: str) -> int:
+        pid = os.fork()
+        if pid:
+            return pid
+        code = 70
+        try:
+            os.chdir(folder)
+            os.dup2(out, 1)
+            os.dup2(err, 2)
+            self._tweak()
+            from cdmisfa.cli import run
+
+            code = run(list(self.words))
+            sys.stdout.flush()
+            sys.stderr.flush()
+        except BaseException:
+            os.write(2, traceback.format_exc().encode())
+        finally:
+            os._exit(code)
 
 
 def call(folder: Path, *words: object, seconds: float = 110, group: str = "setup") -> Ran:
