@@ -175,6 +175,15 @@ class Panels:
             row_shares=[3, 6, 3],
         )
 
+    def looks(self) -> list[rrb.View]:
+        """How much it watched each stream of late."""
+        few = len(self.spec.streams) <= MANY
+        return self.lines(
+            "Where it looks: share of the last 50 blocks",
+            ["/decision/attention"],
+            (0.0, 1.05) if few else None,
+        )
+
     def now(self, weights: str = "Weights φ") -> rrb.Container:
         """Input and weights."""
         return rrb.Vertical(

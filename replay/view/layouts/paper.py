@@ -6,7 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from replay.runs.outline import Outline
-from replay.view.layouts.panels import MANY, MOST_MODULES, Panels, heights, stacked
+from replay.view.layouts.panels import MOST_MODULES, Panels, heights, stacked
 
 HEAT = rrb.TensorScalarMapping(colormap="viridis")
 FIT = rrb.components.ViewFit.Fill
@@ -31,18 +31,15 @@ def feels(panels: Panels) -> list[rrb.View]:
 
 
 def _overview(panels: Panels) -> rrb.Container:
-    streams = len(panels.spec.streams)
     lanes = panels.lanes(
         "What it does, and decides: the policy in each stream", "/lanes/**", "/policy/**"
     )
-    looks = panels.lines(
-        "Where it looks: share of the last 50 blocks",
-        ["/decision/attention"],
-        (0.0, 1.05) if streams <= MANY else None,
-    )
     expects = panels.lines("What it expects: reward R for staying", ["/decision/R_stay/**"])
     story = stacked(
-        ([lanes], heights(5 + streams)), (looks, 125), (feels(panels), 190), (expects, 125)
+        ([lanes], heights(5 + len(panels.spec.streams))),
+        (panels.looks(), 125),
+        (feels(panels), 190),
+        (expects, 125),
     )
     return rrb.Horizontal(panels.sees(), story, column_shares=[2, 5], name="Overview")
 

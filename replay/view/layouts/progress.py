@@ -5,7 +5,7 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from replay.view.labels import label
-from replay.view.layouts.panels import MANY, Panels, heights, stacked
+from replay.view.layouts.panels import Panels, heights, stacked
 
 MOST_WEIGHTS = 3
 """Modules whose weights stand beside one another."""
@@ -26,7 +26,6 @@ def progress_layout(panels: Panels) -> rrb.Blueprint:
 
 
 def _overview(panels: Panels) -> rrb.Container:
-    streams = len(panels.spec.streams)
     lanes = panels.lanes(
         "What it watches, and what became of each stream", "/lanes/1_stream", "/streams/state/**"
     )
@@ -35,21 +34,16 @@ def _overview(panels: Panels) -> rrb.Container:
         ["/streams/learning_error/**", "/streams/threshold", "/streams/saved"],
         panels.outline.span("learning_error", low=0.0, below=UNTESTED),
     )
-    looks = panels.lines(
-        "Where it looks: share of the last 50 blocks",
-        ["/decision/attention"],
-        (0.0, 1.05) if streams <= MANY else None,
-    )
     interest = panels.lines(
         "What each stream promises: interest; above the panel where it was hardly watched",
         ["/streams/interest/**"],
         panels.outline.span("interest", low=0.0, below=HARDLY_WATCHED),
     )
     story = stacked(
-        ([lanes], heights(1 + streams)),
+        ([lanes], heights(1 + len(panels.spec.streams))),
         (error, 190),
         (_slowness(panels), 150),
-        (looks, 110),
+        (panels.looks(), 110),
         (interest, 110),
     )
     sees = panels.sees(_looks_for(panels))
