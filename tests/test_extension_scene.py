@@ -15,9 +15,9 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import (
     Block,
+    ClockedSource,
     SeekableSource,
     SourceSpec,
-    check_frame,
     check_request,
     freeze,
 )
@@ -42,42 +42,25 @@ class PendulumConfig(SceneConfig):
     period: float = 90.0
 
 
-@dataclass
-class Pendulums(SeekableSource):
+class Pendulums(ClockedSource):
     """Two pendulums and noise that the seed decides."""
 
-    config: PendulumConfig
-    clock: RecordConfig
-    now: int = 0
-
-    @property
-    def spec(self) -> SourceSpec:
-        names = ("swing", "slow_swing")
-        return SourceSpec(names, (3,), "float64", ("angle",), self.clock.fps, self.clock.start_ns)
-
-    @property
-    def t(self) -> int:
-        return self.now
+    def __init__(self, config: PendulumConfig, clock: RecordConfig) -> None:
+        self.config, names = config, ("swing", "slow_swing")
+        self._spec = SourceSpec(names, (3,), "float64", ("angle",), clock.fps, clock.start_ns)
 
     def take(self, stream: int, n: int) -> Block:
         check_request(self.spec, stream, n)
-        t = np.arange(self.now, self.now + n)
+        t = np.arange(self._t, self._t + n)
         angle = 2 * np.pi * t / self.config.period / (1 + stream)
         noise = [np.random.default_rng((self.config.seed or 0, stream, at)).random() for at in t]
         frames = np.stack([np.sin(angle), np.cos(9 * angle), noise], axis=1)
-        block = Block(stream, self.now, freeze(frames), freeze(t[:, None] / self.config.period))
-        self.now += n
+        block = Block(stream, self._t, freeze(frames), freeze(t[:, None] / self.config.period))
+        self._t += n
         return block
-
-    def seek(self, t: int) -> None:
-        check_frame(t)
-        self.now = t
 
     def describe(self) -> Mapping[str, Any]:
         return {"kind": "pendulum", "seed": self.config.seed, "period": self.config.period}
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.fixture(autouse=True)
