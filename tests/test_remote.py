@@ -53,6 +53,11 @@ def web(server: WebServer) -> WebServer:
     return server
 
 
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("replay.storage.tries.FIRST_WAIT", 0.02)
+
+
 @pytest.fixture
 def views(web: WebServer, oscillatory_recording: Path) -> list[str]:
     """URLs of the recording's views."""
@@ -160,7 +165,7 @@ def test_every_variant_of_the_format_gives_the_same_messages(
             assert far.complete == near.complete
 
 
-def test_cut_logs_are_read_as_far_as_they_go(
+def test_cut_logs_are_said_to_be_cut_and_saved(
     cdmisfa: Cdmisfa, web: WebServer, oscillatory_recording: Path, tmp_path: Path
 ) -> None:
     data = (oscillatory_recording / "x1.mcap").read_bytes()
@@ -171,6 +176,9 @@ def test_cut_logs_are_read_as_far_as_they_go(
     assert far["channels"] == near["channels"]
     assert not far["complete"]
     assert cdmisfa("verify", url).code == 3
+    learned = cdmisfa("learn", url, *QUICK)
+    assert (learned.code, "sends less than the log" in learned.err) == (3, True), learned
+    assert cdmisfa("learn", url, "--salvage", *QUICK).code == 0
     saved = cdmisfa("recover", url, "-o", tmp_path / "saved.mcap", "--json")
     assert saved.code == 3
     assert url in saved.json["lost"][0]["where"]
@@ -293,6 +301,35 @@ def test_a_run_on_a_server_is_looked_at_and_not_learned_from(
     for source, out in ((url, "far.csv"), (oscillatory_run, "near.csv")):
         assert cdmisfa("export", source, "-o", tmp_path / out).code == 0
     assert (tmp_path / "far.csv").read_bytes() == (tmp_path / "near.csv").read_bytes()
+
+
+def test_runs_on_a_server_are_compared_and_drawn(
+    cdmisfa: Cdmisfa, web: WebServer, oscillatory_run: Path, tmp_path: Path
+) -> None:
+    web.files["/runs/a/run.mcap"] = (oscillatory_run / "run.mcap").read_bytes()
+    url = web.url("/runs/a/run.mcap")
+    same = cdmisfa("compare", oscillatory_run, url, "--json")
+    assert (same.code, same.json["identical"]) == (0, True), same
+    assert [row["run"] for row in same.json["runs"]] == [oscillatory_run.name, "a"]
+    drawn = cdmisfa("plot", url, "-o", tmp_path / "figures")
+    assert drawn.code == 0, drawn
+    assert len(list((tmp_path / "figures").iterdir())) > 2
+    bare = cdmisfa("plot", url)
+    assert (bare.code, "-o FOLDER" in bare.err) == (2, True), bare
+    for words in (("compare", oscillatory_run), ("plot",)):
+        missing = cdmisfa(*words, web.url("/none/run.mcap"))
+        assert (missing.code, "/none/run.mcap: the server answers 404" in missing.err) == (2, True)
+        assert "http:/1" not in missing.err
+
+
+@pytest.mark.parametrize("words", [("results",), ("view", "RUN", "--save", "OUT", "--all-views")])
+def test_where_no_url_can_be_read_one_line_says_so(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    names = {"RUN": oscillatory_run, "OUT": tmp_path / "a.rrd"}
+    done = cdmisfa(*(names.get(word, word) for word in words), "https://host/a/b")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "https://host/a/b is a URL: name a path on this machine" in done.err
 
 
 def test_camera_logs_on_a_server_are_converted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import shlex
@@ -23,8 +24,8 @@ SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
 
 
-class WrittenPath(click.Path):
-    """A path to write at, which is on this machine: a URL would become a folder `s3:`."""
+class LocalPath(click.Path):
+    """A path on this machine: a URL would become a folder `s3:`."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """See `click.ParamType`."""
@@ -33,8 +34,8 @@ class WrittenPath(click.Path):
         return super().convert(value, param, ctx)
 
 
-OUT = WrittenPath(path_type=Path)
-"""Type of every option that says where something is written."""
+OUT = LocalPath(path_type=Path)
+"""Type of every option that says where something is written, and of what is read from no URL."""
 
 
 as_json = click.option(
@@ -79,6 +80,41 @@ def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command
     return lambda command: functools.reduce(lambda c, option: option(c), reversed(each), command)
 
 
+def _limit(name: str) -> Callable[[click.Context, click.Parameter, float], None]:
+    def hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
+        from replay.storage.limits import limited, limits
+
+        ctx.with_resource(limited(dataclasses.replace(limits(), **{name: value})))
+
+    return hold
+
+
+server_limits = together(
+    click.option(
+        "--timeout",
+        type=click.FloatRange(0.1, 1e6),
+        default=60.0,
+        show_default=True,
+        metavar="SECONDS",
+        callback=_limit("total"),
+        is_eager=True,
+        expose_value=False,
+        help="Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
+    ),
+    click.option(
+        "--read-timeout",
+        type=click.FloatRange(0.1, 1e6),
+        default=20.0,
+        show_default=True,
+        metavar="SECONDS",
+        callback=_limit("read"),
+        is_eager=True,
+        expose_value=False,
+        help="Ask a server again that sends nothing for so long.",
+    ),
+)
+"""How long the servers of URLs are waited for; a command with a URL among its arguments has it."""
+
 engine = together(
     click.option(
         "--engine",
@@ -97,12 +133,12 @@ def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]
 
 
 def path_argument(name: str) -> Callable[[Command], Command]:
-    """A path; whether it exists is for the library to say, in its own words."""
-    return click.argument(name, type=click.Path(path_type=Path))
+    """A path of this machine; whether it exists is for the library to say, in its own words."""
+    return click.argument(name, type=OUT)
 
 
-def fetched_argument(name: str) -> Callable[[Command], Command]:
-    """A path; a log behind a URL is copied into a file for as long as the command runs.
+def fetched_argument(name: str, *, nargs: int = 1) -> Callable[[Command], Command]:
+    """A path, or several; a log behind a URL is copied into a file while the command runs.
 
     What the command complains about then names the URL, not the copy.
     """
@@ -119,20 +155,36 @@ def fetched_argument(name: str) -> Callable[[Command], Command]:
                 error.args = (text,)
                 raise
 
-        return cast(Command, click.argument(name, callback=_fetched)(naming_the_url))
+        argument = click.argument(name, nargs=nargs, required=True, callback=_fetched)
+        return cast(Command, argument(naming_the_url))
 
     return wrapped
 
 
-def _fetched(ctx: click.Context, param: click.Parameter, value: str) -> Path:
-    if "://" not in value:
-        return Path(value)
+def is_fetched(path: Path) -> bool:
+    """Whether a path is that of a copy, which goes when the command ends."""
+    names = click.get_current_context().meta.get(FETCHED, ())
+    return any(str(path) == copy for copy, _ in names)
+
+
+def _fetched(
+    ctx: click.Context, param: click.Parameter, value: str | tuple[str, ...]
+) -> Path | tuple[Path, ...]:
+    if isinstance(value, tuple):
+        return tuple(_copy_of(ctx, word) for word in value)
+    return _copy_of(ctx, value)
+
+
+def _copy_of(ctx: click.Context, word: str) -> Path:
+    if "://" not in word:
+        return Path(word)
     from replay.storage.location import location
     from replay.storage.opening import fetched
 
-    place = location(value)
+    place = location(word)
     copy = ctx.with_resource(fetched(place))
-    ctx.meta[FETCHED] = [(str(copy), str(place)), (str(copy.parent), str(place.parent))]
+    names = ctx.meta.setdefault(FETCHED, [])
+    names += [(str(copy), str(place)), (str(copy.parent), str(place.parent))]
     return copy
 
 

@@ -23,6 +23,7 @@ from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES, open_scene
+from replay.storage.limits import Limits, limited, limits
 
 REQUEST = "sweep.json"
 """What was asked for last."""
@@ -43,6 +44,7 @@ class SweepTrial:
         seed: of the learner, and of a live scene.
         log: folder in which to keep its log, or None.
         code: version of the code that the hash is about; workers must have the same.
+        limits: of the time for servers that the source is on.
     """
 
     id: str
@@ -55,6 +57,7 @@ class SweepTrial:
     max_modules: int | None
     log: Path | None
     code: str
+    limits: Limits
 
 
 def sweep(
@@ -152,7 +155,7 @@ def plan(
     # Workers may have another working directory.
     paths = tuple(str(w) if w == kind or "://" in str(w) else str(Path(w).resolve()) for w in words)
     each = tuple(dict.fromkeys(seeds))
-    limits = [max_iterations, max_modules]
+    ends = [max_iterations, max_modules]
     trials: dict[str, SweepTrial] = {}
     for point in points:
         chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
@@ -162,7 +165,7 @@ def plan(
             depends = [as_table(configuration.learner)]
             if recorded is None:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
-            name = identity(depends, seed, recorded, limits, code())
+            name = identity(depends, seed, recorded, ends, code())
             trial = SweepTrial(
                 id=name,
                 source=paths,
@@ -174,6 +177,7 @@ def plan(
                 max_modules=max_modules,
                 log=logs / name if logs is not None else None,
                 code=code(),
+                limits=limits(),
             )
             trials.setdefault(trial.id, trial)
     return list(trials.values())
@@ -245,7 +249,8 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     if _is_live(trial.source):
         source = open_scene(trial.source[0], configuration.scene, configuration.record)
     else:
-        source, _ = open_source(trial.source, loop=trial.loop)
+        with limited(trial.limits):
+            source, _ = open_source(trial.source, loop=trial.loop)
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:

@@ -30,7 +30,8 @@ class LogReader:
     Damage is an error that names the file, the chunk and its time range. With
     `salvage` the damaged chunk is left out and noted in `problems` instead, and the
     unverifiable part of a chunk in which the file ends is read too. Of a URL only what is
-    asked for is read, as far as its summary accounts for every message.
+    asked for is read, as far as its summary accounts for every message; one that lacks its
+    end is damaged, as nothing tells whether the server sent all of it.
 
     Attributes:
         path: the file.
@@ -71,6 +72,11 @@ class LogReader:
             definitions = self._structure.definitions
             self._chunks = Chunks(self._file, definitions, self._note, cache_bytes)
             self._settle()
+            if by_index and not (self.complete or salvage):
+                raise LogDamagedError(
+                    f"{self.path}: {self.missing}: the server sends less than the log, or the log "
+                    "was cut (cdmisfa recover saves what is there)"
+                )
         except MalformedRecord as error:
             self._file.close()
             raise LogDamagedError(f"{self.path}: {error}") from None

@@ -5,6 +5,7 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "replay.storage.limits": "Limits limited",
         "replay.storage.listing": "log_files",
         "replay.storage.location": "Location Url",
         "replay.storage.opening": "open_store",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,6 +52,11 @@ def fetched(place: Location) -> Iterator[Path]:
 def _copy(log: Location, target: Path) -> None:
     with contextlib.closing(open_store(log)) as source:
         try:
+            if source.size > (room := shutil.disk_usage(target.parent).free):
+                raise CdmisfaError(
+                    f"{log}: it has {source.size} bytes, and there is room for {room} at "
+                    f"{target.parent}: set TMPDIR"
+                )
             with target.open("xb") as copy:
                 for block in source.blocks(0, source.size):
                     copy.write(block)

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import asyncio
 import bisect
-import time
+import functools
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import Final
 
+from replay.storage.limits import limits
 from replay.storage.location import Url
-from replay.storage.servers import TRIES, WAIT_SECONDS, Again, Part, RemoteError, connect, refusal
+from replay.storage.servers import SPARE_SECONDS, Part, RemoteError, connect, refusal
 from replay.storage.store import Store
+from replay.storage.tries import Again, patiently
 
 EDGE_BYTES: Final = 64 * 1024
 """What is read of the beginning, and of the end, at once."""
@@ -32,7 +34,7 @@ class RemoteStore(Store):
     def __init__(self, url: Url) -> None:
         """Look for the object and read its beginning; errors as those of `open_store`."""
         super().__init__(url)
-        self._server = connect(url)
+        self._server, self._limits = connect(url), limits()
         self._parts: OrderedDict[int, bytes] = OrderedDict()
         self._begins: list[int] = []
         self._held = 0
@@ -130,21 +132,17 @@ class RemoteStore(Store):
         self._ahead.clear()
 
     def _start(self, start: int, stop: int) -> Future[Part]:
-        return asyncio.run_coroutine_threadsafe(self._server.part(start, stop), self._server.loop)
+        ask = functools.partial(self._server.part, start, stop)
+        patient = patiently(ask, self._limits.of(stop - start))
+        return asyncio.run_coroutine_threadsafe(patient, self._server.loop)
 
     def _wait(self, future: Future[Part], start: int, stop: int) -> Part:
-        """Wait for a part; what may be a passing fault is tried again."""
-        for attempt in range(TRIES):
-            try:
-                return future.result(WAIT_SECONDS)
-            except Again as error:
-                if attempt == TRIES - 1 or not self.size:
-                    raise refusal(self.path, error.__cause__ or error) from None
-            except Exception as error:
-                raise refusal(self.path, error) from None
-            time.sleep(0.2 * 4**attempt)
-            future = self._start(start, stop)
-        raise AssertionError("every try ends")
+        try:
+            return future.result(self._limits.of(stop - start) + SPARE_SECONDS)
+        except Again as error:
+            raise refusal(self.path, error.__cause__ or error) from None
+        except Exception as error:
+            raise refusal(self.path, error) from None
 
     def _checked(self, part: Part, start: int, stop: int) -> bytes:
         if (part.total, part.tag) != (self.size, self.tag):

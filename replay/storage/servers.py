@@ -12,13 +12,25 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.storage.limits import limits
 from replay.storage.location import Location, Url
+from replay.storage.tries import Again, UnreachableError, asked_wait, patiently
 
-TRIES: Final = 3
-_CONNECT_SECONDS: Final = 20.0
-_READ_SECONDS: Final = 60.0
-WAIT_SECONDS: Final = 600.0
+SPARE_SECONDS: Final = 5.0
+"""For what is waited for on another thread to end by itself, after its time."""
+
+_LISTED: Final = 1 << 20
+_LENGTH: Final = re.compile(r"\d{1,19}", re.ASCII)
 _RANGE: Final = re.compile(r"bytes (\d{1,19})-(\d{1,19})/(\d{1,19})", re.ASCII)
+_BROKEN_OFF: Final = (
+    "ClientPayloadError",
+    "ConnectionClosedError",
+    "IncompleteRead",
+    "IncompleteReadError",
+    "ReadTimeoutError",
+    "ResponseStreamingError",
+    "SocketTimeoutError",
+)
 _NOTHING: Final = re.compile(r"bytes \*/0+", re.ASCII)
 
 Value = TypeVar("Value")
@@ -26,14 +38,6 @@ Value = TypeVar("Value")
 
 class RemoteError(LogDamagedError):
     """A server that sends less than it says, or not the log that was opened."""
-
-
-class UnreachableError(CdmisfaError):
-    """A server that cannot be reached, or does not give parts of the log."""
-
-
-class Again(Exception):  # noqa: N818 - asks for another try
-    """What may go better the next time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +57,15 @@ class _HttpServer:
         import fsspec
         from yarl import URL
 
-        timeout = aiohttp.ClientTimeout(
-            total=None, sock_connect=_CONNECT_SECONDS, sock_read=_READ_SECONDS
-        )
         # Unpacking on the way would make other bytes of the parts, without a limit.
-        settings = {"timeout": timeout, "auto_decompress": False}
+        settings = {"auto_decompress": False}
         self._files = fsspec.filesystem(url.scheme, client_kwargs=settings)
+        self._timeout = aiohttp.ClientTimeout(
+            total=None, sock_connect=limits().read, sock_read=limits().read
+        )
         self.loop = self._files.loop
         self._address = URL(url.address, encoded="%" in url.address)
+        self._reached = False
 
     async def part(self, start: int, stop: int) -> Part:
         import aiohttp
@@ -68,16 +73,36 @@ class _HttpServer:
         session = await self._files.set_session()
         headers = {"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"}
         try:
-            async with session.get(self._address, headers=headers) as answer:
+            async with session.get(self._address, headers=headers, timeout=self._timeout) as answer:
+                self._reached = True
+                self._check_way(answer)
                 return await self._taken(answer, start, stop)
+        except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError):
+            raise UnreachableError("the server sends us to what is no http address") from None
+        except aiohttp.TooManyRedirects:
+            raise UnreachableError("the server sends us from address to address") from None
+        except aiohttp.ClientResponseError as error:
+            what = error.message.split("\n")[0].split(": b")[0].rstrip(":")
+            raise UnreachableError(f"the server's answer is no HTTP: {what[:80]}") from None
+        except aiohttp.ClientConnectorError as error:
+            if not self._reached:  # a name that is wrong does not get better
+                raise
+            raise Again from error
         except (aiohttp.ClientError, asyncio.IncompleteReadError, TimeoutError) as error:
             raise Again from error
+
+    def _check_way(self, answer: Any) -> None:
+        """Refuse to be sent from an encrypted to an open address."""
+        ways = {step.url.scheme for step in (*answer.history, answer)}
+        if self._address.scheme == "https" and ways != {"https"}:
+            raise UnreachableError("the server sends us from https to http")
 
     async def _taken(self, answer: Any, start: int, stop: int) -> Part:
         headers = answer.headers
         tag = headers.get("ETag") or headers.get("Last-Modified") or ""
-        if answer.status >= 500 or answer.status == 429:
-            raise Again(f"the server answers {answer.status} {answer.reason}")
+        if _passing(answer.status):
+            wait = asked_wait(headers.get("Retry-After", ""))
+            raise Again(f"the server answers {answer.status} {answer.reason}", wait)
         if answer.status == 416 and _NOTHING.fullmatch(headers.get("Content-Range", "")):
             return Part(b"", 0, tag)
         if answer.status in (404, 410):
@@ -88,7 +113,7 @@ class _HttpServer:
             raise UnreachableError("the server packs it on the way: download it first")
         if answer.status == 200:
             length = headers.get("Content-Length", "")
-            if start or not length.isdecimal() or int(length) > stop:
+            if start or not _LENGTH.fullmatch(length) or int(length) > stop:
                 raise UnreachableError(
                     "the server sends no parts of a file (range requests): download it first"
                 )
@@ -106,20 +131,44 @@ class _S3Server:
         self._bucket, self._key, _ = self._files.split_path(url.address)
 
     async def part(self, start: int, stop: int) -> Part:
+        place = {"Bucket": self._bucket, "Key": self._key}
+        span = f"bytes={start}-{stop - 1}"
         try:
-            place = {"Bucket": self._bucket, "Key": self._key}
-            span = f"bytes={start}-{stop - 1}"
             answer = await self._files._call_s3("get_object", **place, Range=span)
-        except OSError as error:
+        except Exception as error:
             if "InvalidRange" in f"{error} {error.__cause__!r}" and not start:
                 return Part(b"", 0, "")
+            _ask_again(error)
             raise
         total, count = _range_of(answer.get("ContentRange", ""), start, stop)
         data = bytearray()
-        async with answer["Body"] as body:
-            while len(data) < count and (more := await body.read(count - len(data))):
-                data += more
+        try:
+            async with answer["Body"] as body:
+                while len(data) < count and (more := await body.read(count - len(data))):
+                    data += more
+        except Exception as error:
+            _ask_again(error)
+            raise
         return Part(bytes(data), total, answer.get("ETag", ""))
+
+
+def _passing(status: int) -> bool:
+    """Whether what a server answers may go better the next time."""
+    return status in (408, 429) or (status >= 500 and status != 501)
+
+
+def _ask_again(error: Exception) -> None:
+    """Ask for another try after what may be a passing fault of an S3 server."""
+    found: BaseException | None = error
+    while found is not None:
+        facts = getattr(found, "response", None)
+        said = facts.get("ResponseMetadata", {}) if isinstance(facts, dict) else {}
+        if _passing(int(said.get("HTTPStatusCode", 0))):
+            wait = asked_wait(str(said.get("HTTPHeaders", {}).get("retry-after", "")))
+            raise Again(f"the server answers {said['HTTPStatusCode']}", wait) from error
+        if type(found).__name__ in _BROKEN_OFF:
+            raise Again from error
+        found = found.__cause__
 
 
 def listed(url: Url) -> list[Url]:
@@ -131,11 +180,19 @@ def listed(url: Url) -> list[Url]:
     """
     files = _importing(_s3)
 
+    seconds = limits().of(_LISTED)
+
     async def keys() -> list[str]:
-        return [str(e["name"]) for e in await files._ls(url.address, detail=True, refresh=True)]
+        try:
+            entries = await files._ls(url.address, detail=True, refresh=True)
+        except Exception as error:
+            _ask_again(error)
+            raise
+        return [str(entry["name"]) for entry in entries]
 
     try:
-        names = asyncio.run_coroutine_threadsafe(keys(), files.loop).result(WAIT_SECONDS)
+        asked = asyncio.run_coroutine_threadsafe(patiently(keys, seconds), files.loop)
+        names = asked.result(seconds + SPARE_SECONDS)
     except Exception as error:
         raise refusal(url, error) from None
     logs = [Url(f"s3://{n}") for n in sorted(names) if n.endswith((".mcap", ".mcap.partial"))]
@@ -163,9 +220,14 @@ def connect(url: Url) -> _S3Server | _HttpServer:
 def _s3() -> Any:
     import fsspec
 
-    limits = {"connect_timeout": _CONNECT_SECONDS, "read_timeout": _READ_SECONDS}
-    files = fsspec.filesystem("s3", use_listings_cache=False, config_kwargs=limits)
-    files.retries = TRIES
+    seconds = limits().read
+    settings = {  # tries are counted and spread by `patiently` alone
+        "connect_timeout": seconds,
+        "read_timeout": seconds,
+        "retries": {"total_max_attempts": 1, "mode": "standard"},
+    }
+    files = fsspec.filesystem("s3", use_listings_cache=False, config_kwargs=settings)
+    files.retries = 1
     return files
 
 
@@ -187,7 +249,8 @@ def refusal(url: Location, error: BaseException) -> CdmisfaError:
         kind = UsageError
     elif isinstance(error, asyncio.IncompleteReadError) or "Payload" in type(error).__name__:
         kind = RemoteError
-    return kind(f"{url}: {_words(error)}")
+    words = "".join(letter if letter.isprintable() else "?" for letter in _words(error))
+    return kind(f"{url}: {words[:300]}")
 
 
 def _words(error: BaseException) -> str:
@@ -207,4 +270,6 @@ def _words(error: BaseException) -> str:
         return "the server does not answer in time"
     if isinstance(error, asyncio.IncompleteReadError):
         return f"the server sent {len(error.partial)} bytes of {error.expected} and went away"
+    if "Payload" in type(error).__name__:
+        return "the server sent fewer bytes than it said, and went away"
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 @camera_options
 @click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")
 @click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
+@options.server_limits
 @options.force
 @options.as_json
 @click.pass_context

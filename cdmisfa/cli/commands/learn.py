@@ -59,6 +59,7 @@ TICK = 0.1
     help="With --follow, give up when no frame came for so long.",
 )
 @camera_options
+@options.server_limits
 @options.force
 @options.as_json
 @click.pass_context

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 @click.command("info")
 @click.argument("path")
+@options.server_limits
 @options.as_json
 @click.pass_context
 def info_command(ctx: click.Context, path: str, as_json: bool) -> None:
@@ -66,6 +67,7 @@ def _clock(ns: int | None) -> str:
 
 @click.command("verify")
 @click.argument("path")
+@options.server_limits
 @options.as_json
 @click.pass_context
 def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
@@ -91,6 +93,7 @@ def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
 @click.command("recover")
 @click.argument("path")
 @options.out("The whole log to write.", required=True)
+@options.server_limits
 @options.force
 @options.as_json
 @click.pass_context

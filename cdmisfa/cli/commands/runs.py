@@ -14,13 +14,14 @@ from cdmisfa.experiments.documents import markdown
 
 
 @click.command("compare")
-@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.fetched_argument("runs", nargs=-1)
 @click.option(
     "--save",
     type=options.OUT,
     metavar="F.rrd",
     help="Also write their curves, one over the other, as a view.",
 )
+@options.server_limits
 @options.force
 @options.as_json
 @click.pass_context
@@ -30,7 +31,8 @@ def compare_command(
     """Check that runs' signals are the same bits, and show their curves.
 
     Of two runs it says where they first differ, and exits with 4 if they do. Of more it
-    prints a table, each run compared with the first, and exits with 0.
+    prints a table, each run compared with the first, and exits with 0. A run may be the URL of
+    its run.mcap, of which a copy is made.
     """
     if len(runs) < 2:
         raise click.UsageError("name two runs, or more")
@@ -63,12 +65,18 @@ def compare_command(
 
 
 @click.command("plot")
-@options.path_argument("run")
+@options.fetched_argument("run")
 @options.out("Folder of the figures; by default the run's own folder figures.")
+@options.server_limits
 @options.force
 @options.as_json
 def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> None:
-    """Draw the figures of a run."""
+    """Draw the figures of a run.
+
+    RUN is its folder, or its run.mcap, which may be behind a URL: then a copy is made.
+    """
+    if out is None and options.is_fetched(run):
+        raise click.UsageError("of a run behind a URL say where the figures go: -o FOLDER")
     from replay.export.figures import draw_figures
 
     files = draw_figures(run, out, force=force)
@@ -91,6 +99,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 )
 @options.out("The file to write, for a recording the folder.", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
+@options.server_limits
 @options.force
 @options.as_json
 def export_command(

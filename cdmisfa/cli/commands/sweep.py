@@ -38,6 +38,7 @@ MOST_SEEDS = 1_000_000
 @options.engine
 @click.option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
 @click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
+@options.server_limits
 @options.as_json
 @click.pass_context
 def sweep_command(

@@ -29,11 +29,12 @@ from cdmisfa.core.errors import UsageError
 )
 @click.option(
     "--all-views",
-    type=click.Path(path_type=Path),
+    type=options.OUT,
     metavar="RECORDING",
     help="Also show what was not watched, from the recording that the run learned from.",
 )
 @click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
+@options.server_limits
 @options.force
 def view_command(
     run: Path,

@@ -1,0 +1,185 @@
+"""Servers that lie, and the time that they are given; `server_cases` has all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+from lying_server import Exchange, lying
+from server_cases import CASES, Case, Given, check, prepare
+from server_lies import LIES
+
+from replay.storage import tries
+from replay.storage.limits import Limits, limited, limits
+from replay.storage.location import Url
+from replay.storage.remote import RemoteStore
+from replay.storage.tries import UnreachableError, asked_wait, backoff
+
+pytest.importorskip("aiohttp")
+
+BODY = bytes(range(256)) * 1200
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tries, "FIRST_WAIT", 0.02)
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Given:
+    return prepare(tmp_path_factory.mktemp("lies"))
+
+
+def read(lie: str, held: Limits, at: int = 200_000) -> bytes:
+    """What a store gives of a server's object, after its beginning."""
+    with lying(BODY, LIES[lie]) as server, limited(held):
+        store = RemoteStore(Url(server.address))
+        with contextlib.closing(store):
+            return store.read_at(at, 100)
+
+
+QUICK = Limits(total=0.8, read=0.3)
+
+SAMPLE = (
+    ("the truth", "recording", "learn"),
+    ("503 twice", "cameras", "convert"),
+    ("half of it as all of it", "recording", "learn"),
+    ("half of it as all of it, in parts", "cameras", "convert"),
+    ("40 kB of it as all of it", "cameras", "learn"),
+    ("less than the whole that was said", "recording", "info"),
+    ("replaced in silence", "recording", "learn"),
+    ("replaced", "cameras", "verify"),
+    ("10^18 bytes", "cameras", "verify"),
+    ("bits flipped at random", "cameras", "convert"),
+    ("a reason for the terminal", "recording", "info"),
+    ("to a file", "cameras", "info"),
+    ("headers without end", "recording", "info"),
+    ("packed", "cameras", "learn"),
+)
+
+
+@pytest.mark.parametrize("case", SAMPLE, ids=" ".join)
+def test_it_is_the_right_bits_or_one_clear_line(
+    case: tuple[str, str, str], given: Given, tmp_path: Path
+) -> None:
+    assert Case(*case) in CASES
+    check(Case(*case), given, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        "40 kB of it as all of it",
+        "half of it as all of it, in parts",
+        "less than the whole that was said",
+        "half of a part, then closed",
+    ],
+)
+def test_a_short_answer_is_damage_and_not_learned_from(
+    cdmisfa: Cdmisfa, given: Given, lie: str
+) -> None:
+    for log, words in (("recording", ()), ("cameras", ("--topic", "/left", "--size", "16x12"))):
+        with lying(given.logs[log][0], LIES[lie]) as server:
+            done = cdmisfa("learn", server.address, *words, "--max-iterations", 3)
+        assert (done.code, done.out, done.err.count("\n")) == (3, "", 1), done
+
+
+def test_a_server_that_is_busy_at_first_is_asked_again() -> None:
+    for lie in ("503 twice", "429 at once again", "503 at no time", "408 once"):
+        assert read(lie, Limits()) == BODY[200_000:200_100], lie
+
+
+def test_a_server_is_left_alone_as_long_as_it_asks() -> None:
+    def busy(x: Exchange) -> None:
+        x.refuse("503 Busy", Retry_After=1) if x.number == 1 else x.part()
+
+    began = time.monotonic()
+    with lying(BODY, busy) as server:
+        RemoteStore(Url(server.address)).close()
+        assert server.requests == 2
+    assert time.monotonic() - began >= 1
+
+
+@pytest.mark.parametrize("lie", ["429 in an hour", "503 next year", "503 in 10^400 s"])
+def test_a_longer_wait_than_the_limit_is_not_waited_for(lie: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(UnreachableError, match=r"asks for \d+ s, longer than --timeout leaves"):
+        read(lie, Limits())
+    assert time.monotonic() - began < 1
+
+
+@pytest.mark.parametrize(
+    "lie",
+    ["a byte in half a second", "a body a byte in half a second", "silence", "go on, for ever"],
+)
+def test_what_comes_too_slowly_ends_by_the_limit(lie: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(UnreachableError, match=r"took longer than 0\.8 s: raise --timeout"):
+        read(lie, QUICK)
+    assert 0.7 < time.monotonic() - began < 3
+
+
+def test_what_stands_still_is_asked_for_again() -> None:
+    def stalls(x: Exchange) -> None:
+        x.liar.ended.wait(60) if x.number == 2 else x.part()
+
+    with lying(BODY, stalls) as server, limited(replace(QUICK, total=20)):
+        store = RemoteStore(Url(server.address))
+        assert store.read_at(200_000, 100) == BODY[200_000:200_100]
+        store.close()
+        assert server.requests == 3
+
+
+def test_a_server_is_not_asked_for_ever() -> None:
+    with lying(BODY, LIES["503 for ever"]) as server:
+        with pytest.raises(UnreachableError, match="the server answers 503 Busy"):
+            RemoteStore(Url(server.address))
+        assert server.requests == tries.TRIES
+
+
+def test_what_does_not_get_better_is_asked_once() -> None:
+    for lie in ("403", "410", "501", "to a file", "packed", "always all of it", "another part"):
+        with lying(BODY, LIES[lie]) as server:
+            with pytest.raises(Exception, match=r"^http://127\.0\.0\.1"):
+                RemoteStore(Url(server.address))
+            assert server.requests == 1, lie
+
+
+def test_the_limit_is_for_each_mebibyte() -> None:
+    held = Limits(total=2)
+    assert (held.of(10), held.of(1 << 20), held.of(5 << 20)) == (2, 2, 10)
+
+
+def test_waits_grow_and_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tries, "FIRST_WAIT", 1.0)
+    for attempt in range(5):
+        waits = {backoff(attempt) for _ in range(20)}
+        assert len(waits) > 10
+        assert 0.5 * 2**attempt <= min(waits) <= max(waits) <= 2**attempt
+
+
+def test_the_wait_that_is_asked_for_is_read_or_none() -> None:
+    assert [asked_wait(text) for text in ("7", " 120 ", "", "soon", "-3", "1.5", "٣")] == [
+        *(7.0, 120.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    ]
+    assert asked_wait("Wed, 21 Oct 2099 07:28:00 GMT") > 1e9
+    assert asked_wait("Wed, 21 Oct 1999 07:28:00 GMT") == 0
+
+
+def test_the_options_are_the_limits(cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr("replay.integrity.info.describe", lambda path: seen.append(limits()))
+    cdmisfa("info", "https://host/a.mcap")
+    cdmisfa("info", "https://host/a.mcap", "--timeout", 7, "--read-timeout", 3)
+    assert seen == [Limits(), Limits(7, 3)]
+    assert limits() == Limits()
+
+
+def test_no_more_is_copied_than_there_is_room_for(cdmisfa: Cdmisfa, given: Given) -> None:
+    with lying(given.logs["recording"][0], LIES["10^18 bytes"]) as server:
+        done = cdmisfa("verify", server.address)
+    assert (done.code, "there is room for" in done.err) == (1, True), done
