@@ -82,6 +82,7 @@ def record(
     jobs: int = 1,
     force: bool = False,
     resume: bool = False,
+    fsync_every: float | None = None,
     stop: Callable[[], bool] = lambda: False,
     progress: Progress | None = None,
 ) -> list[ViewRecording]:
@@ -104,6 +105,8 @@ def record(
         jobs: processes that render; only a scene can be opened in more than one.
         force: overwrite an earlier recording in the folder.
         resume: continue where an earlier attempt with the same arguments ended.
+        fsync_every: seconds after which the disk has what was written, so that a power cut takes
+            no more; None leaves it to the operating system until a file is finished.
         stop: asked after every block; true ends the recording with an error.
         progress: called after every block; never where there was nothing left to record.
 
@@ -159,7 +162,15 @@ def record(
             if place.complete:
                 continue
             log = ViewParts(
-                folder, view, identity, settings, split, poses.get(view), parts[view], place.first
+                folder,
+                view,
+                identity,
+                settings,
+                split,
+                poses.get(view),
+                parts[view],
+                place.first,
+                fsync_every,
             )
             open_logs.callback(log.abandon)
             if log_to_resume is not None:

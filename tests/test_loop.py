@@ -68,7 +68,7 @@ class TestRunWriter(SinkContract):
 
 class TestCheckpoints(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        return Checkpoints(folder, source, learner, 7, lambda: None)
+        return Checkpoints(folder, source, learner, 7, lambda: None, lambda: None)
 
 
 class TestLiveView(SinkContract):
@@ -134,7 +134,7 @@ def test_a_sink_that_fails_ends_the_run_and_finishes_nothing() -> None:
 def test_a_learner_learns_on_from_where_it_is(tmp_path: Path) -> None:
     source = OscillatorySource()
     learner, digest = learner_for(source), Digest()
-    keep = Checkpoints(tmp_path, source, learner, 4, lambda: None)
+    keep = Checkpoints(tmp_path, source, learner, 4, lambda: None, lambda: None)
     for iterations in (3, 11):
         learn(source, learner, (digest, keep), max_iterations=iterations, max_modules=9)
     whole, straight = OscillatorySource(), Digest()

@@ -64,6 +64,14 @@ preset = click.option(
     help="Preset (icub, oscillatory) or a .toml file; by default the one of the source.",
 )
 
+fsync_every = click.option(
+    "--fsync-every",
+    type=click.FloatRange(0.0, 1e6),
+    metavar="SECONDS",
+    help="Let the disk have what is written after so long, so that a power cut takes no more; by "
+    "default the operating system decides until a file is finished.",
+)
+
 force = click.option("--force", is_flag=True, help="Overwrite what is already there.")
 
 jobs = click.option(

@@ -10,8 +10,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
-from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
 from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
@@ -56,7 +58,10 @@ SCHEMA = 2
 """Version of a checkpoint; rises when the state of a learner changes its meaning."""
 
 KEPT = 2
-"""Checkpoints that a run's folder keeps: the newest, and one in case its log was lost."""
+"""Newest checkpoints that a run's folder keeps: one more in case the log of the last was lost."""
+
+SETTLED_SECONDS = 60.0
+"""Time after which the operating system has written a file by itself; Linux does within 35."""
 
 _HEAD = "checkpoint"
 _MODULES = "modules."
@@ -118,12 +123,12 @@ class Checkpoint:
     taken: str | None = None
 
 
-def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint into a run's folder and drop all but the newest ones.
+def save_checkpoint(run: Path, checkpoint: Checkpoint, *, sync: bool = False) -> Path:
+    """Write a checkpoint into a run's folder.
 
-    The run's log must already hold every iteration before it.
+    The run's log must already hold every iteration before it; with `sync`, on disk.
     """
-    path = run / f"checkpoint-{checkpoint.iteration:012d}.npz"
+    path = checkpoint_path(run, checkpoint.iteration)
     head = {
         "schema": SCHEMA,
         "iteration": checkpoint.iteration,
@@ -137,11 +142,28 @@ def save_checkpoint(run: Path, checkpoint: Checkpoint) -> None:
         values = [getattr(module, field.name) for module in checkpoint.state.modules]
         arrays[_MODULES + field.name] = np.array(values)
     arrays.update(checkpoint.state.arrays)
-    # Not synced to disk: a power cut costs time, as damaged checkpoints are passed over.
-    with whole(path, sync=False) as partial, open(partial, "wb") as file:
+    # One that is not synced and cut by a power cut is passed over as damaged.
+    with whole(path, sync=sync) as partial, open(partial, "wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-    for old in checkpoints(run)[KEPT:]:
-        old.unlink()
+    return path
+
+
+def checkpoint_path(run: Path, iteration: int) -> Path:
+    """Where a checkpoint lies in a run's folder."""
+    return run / f"checkpoint-{iteration:012d}.npz"
+
+
+def drop(paths: Iterable[Path]) -> None:
+    """Remove files of a run that nothing needs any more.
+
+    Raises:
+        LogWriteError: one cannot be removed.
+    """
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise LogWriteError(f"{path} cannot be removed: {error.strerror}") from error
 
 
 def checkpoints(run: Path) -> list[Path]:
@@ -208,7 +230,9 @@ class Checkpoints(Sink):
         source: what it learns from.
         learner: what learns.
         every: iterations between two; 0 saves one at the end only.
-        flush: lets the disk have all of the log.
+        flush: hands all of the log to the operating system.
+        sync: lets the disk have all of it.
+        fsync_every: seconds after which the disk is to have a checkpoint, too.
     """
 
     def __init__(
@@ -218,22 +242,48 @@ class Checkpoints(Sink):
         learner: Learner,
         every: int,
         flush: Callable[[], None],
+        sync: Callable[[], None],
+        fsync_every: float | None = None,
     ) -> None:
         self._run, self._source, self._learner = run, source, learner
-        self._every, self._flush = every, flush
+        self._every, self._flush, self._sync = every, flush, sync
+        self._fsync_every = math.inf if fsync_every is None else fsync_every
+        self._synced = time.monotonic()
+        self._settled: Path | None = None
+        self._settling: tuple[Path, float] | None = None
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         if self._every and learner.iteration % self._every == 0:
-            self._flush()
-            self.finish()
+            if time.monotonic() - self._synced >= self._fsync_every:
+                self._sync()
+                self._save(sync=True)
+                self._synced = time.monotonic()
+            else:
+                self._flush()
+                self._save(sync=False)
 
     def finish(self) -> None:
-        """See `Sink`; the log is flushed before."""
-        learner, taken = self._learner, getattr(self._source, "taken", None)
-        at, t = learner.iteration, self._source.t
+        """See `Sink`."""
+        self._sync()
+        self._save(sync=True)
+
+    def _save(self, *, sync: bool) -> None:
+        """Save a checkpoint, and drop all but the newest and one that the disk has."""
+        if self._settled is None and self._settling is None:
+            self._settled = next(iter(checkpoints(self._run)), None)  # from which it was resumed
+        learner, now = self._learner, time.monotonic()
+        at, t, taken = learner.iteration, self._source.t, getattr(self._source, "taken", None)
         checkpoint = Checkpoint(at, t, learner.state, versions(), taken)
-        save_checkpoint(self._run, checkpoint)
+        path = save_checkpoint(self._run, checkpoint, sync=sync)
+        if sync:
+            self._settled, self._settling = path, None
+        elif self._settling is None:
+            self._settling = path, now
+        elif now - self._settling[1] >= SETTLED_SECONDS:
+            self._settled, self._settling = self._settling[0], (path, now)
+        kept = {self._settled, self._settling and self._settling[0]}
+        drop(p for p in checkpoints(self._run)[KEPT:] if p not in kept)
 
 
 def restore(learner: Learner, checkpoint: Checkpoint) -> None:
@@ -271,7 +321,10 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
     if found == partial_path(run / RUN_FILE) and not checkpoints(run) and not _has_header(found):
         return
     refuse_difference(run, found, spec, manifest)
-    os.replace(found, run / SET_ASIDE)
+    try:
+        os.replace(found, run / SET_ASIDE)
+    except OSError as error:
+        raise LogWriteError(f"{found} cannot be set aside: {error.strerror}") from error
 
 
 def _has_header(log: Path) -> bool:

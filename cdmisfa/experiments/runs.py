@@ -29,13 +29,16 @@ from cdmisfa.experiments.resume import (
     COMMAND,
     SET_ASIDE,
     Checkpoints,
+    checkpoint_path,
     checkpoints,
+    drop,
     newest_covered,
     restore,
     set_aside,
 )
 from cdmisfa.features.incsfa import strict
 from recorder.log.folder import folder_here, held, refuse_existing
+from recorder.log.whole import make_folder
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -113,6 +116,7 @@ def run(
     stop: Callable[[], bool] = lambda: False,
     resume: bool = False,
     checkpoint_every: int = 200,
+    fsync_every: float | None = None,
     live: bool = False,
     announce: Callable[[str], None] | None = None,
     command: Mapping[str, Any] | None = None,
@@ -134,6 +138,8 @@ def run(
         resume: resume the run in `folder` where it was stopped, in whatever way; its
             signals become those of a run that was never stopped.
         checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
+        fsync_every: seconds after which the disk has the log and a checkpoint, so that a power cut
+            takes no more; None leaves it to the operating system until the run is finished.
         live: also show the run in Rerun while it learns, to viewers on this machine.
         announce: called with the address of the live view.
         command: how the run is begun, kept with it; see `resume.command_of`.
@@ -161,11 +167,20 @@ def run(
         log = shown = None
         if folder is not None:
             log = opened.enter_context(
-                _run_log(folder, source.spec, {**manifest, **begun}, force=force, resume=resume)
+                _run_log(
+                    folder,
+                    source.spec,
+                    {**manifest, **begun},
+                    force=force,
+                    resume=resume,
+                    fsync_every=fsync_every,
+                )
             )
             told += [
                 _Unfinished(log),
-                Checkpoints(folder, source, learner, checkpoint_every, log.flush),
+                Checkpoints(
+                    folder, source, learner, checkpoint_every, log.flush, log.sync, fsync_every
+                ),
             ]
         elif resume:
             raise UsageError("which run to resume? name its folder")
@@ -235,7 +250,13 @@ class _Unfinished(Sink):
 
 @contextlib.contextmanager
 def _run_log(
-    out: Path, spec: SourceSpec, manifest: Mapping[str, Any], *, force: bool, resume: bool
+    out: Path,
+    spec: SourceSpec,
+    manifest: Mapping[str, Any],
+    *,
+    force: bool,
+    resume: bool,
+    fsync_every: float | None,
 ) -> Iterator[RunWriter]:
     """The run's log, to be finished inside, and its folder held.
 
@@ -247,7 +268,7 @@ def _run_log(
     if not resume:
         refuse_existing(out, force=force)
         try:
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out)
         except OSError as error:
             raise _no_folder(out, error) from error
     with held(out):
@@ -261,7 +282,9 @@ def _run_log(
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise _no_folder(out, error) from error
-        log = RunWriter(out / RUN_FILE, spec, manifest, force=force or resume)
+        log = RunWriter(
+            out / RUN_FILE, spec, manifest, force=force or resume, fsync_every=fsync_every
+        )
         try:
             yield log
         except BaseException:
@@ -304,8 +327,9 @@ def _restore(log: Any, learner: Learner, source: Any, digest: Digest) -> None:
         ]
         if changed:
             log.event(source.t, last, "; ".join(changed), "WARNING")
-        log.flush()
-    before.unlink()
+    log.sync()
+    covered = checkpoint_path(folder, 0 if checkpoint is None else checkpoint.iteration)
+    drop([*(path for path in checkpoints(folder) if path > covered), before])
 
 
 def _say_if_compiling() -> None:

@@ -9,16 +9,18 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from recorder.log.folder import held
+from recorder.log.whole import make_folder, to_disk
 
 ROWS = "rows.jsonl"
 """The rows, in a folder."""
@@ -86,15 +88,21 @@ class TrialStore:
     Raises:
         UsageError: another process holds the folder.
         LogDamagedError: a line is not a row.
+        LogWriteError: the disk does not take it, here or in any later call.
     """
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        self._path = folder / ROWS
         with contextlib.ExitStack() as opened:
+            with self._telling():
+                make_folder(folder)
             opened.enter_context(held(folder))
-            self._file: BinaryIO = opened.enter_context(open(folder / ROWS, "a+b"))
-            self._file.seek(0)
-            self._file.truncate(self._file.read().rfind(b"\n") + 1)  # a kill cut the rest short
+            with self._telling():
+                # Unbuffered: what a disk refused once is not tried again when it is closed.
+                self._file = opened.enter_context(open(self._path, "a+b", buffering=0))
+                self._file.seek(0)
+                self._file.truncate(self._file.read().rfind(b"\n") + 1)  # a kill cut the rest short
+                to_disk(folder)
             self.rows = {row["id"]: row for row in read_rows(folder)}
             self._opened = opened.pop_all()
 
@@ -111,13 +119,23 @@ class TrialStore:
     def add(self, row: Mapping[str, Any]) -> None:
         """Add the row of a trial: its `id`, its `status`, the `point` it is at, and more."""
         line = json.dumps(row, separators=(",", ":"))
-        self._file.write(line.encode() + b"\n")
-        self._file.flush()
+        data = memoryview(line.encode() + b"\n")
+        with self._telling():
+            while data:
+                data = data[self._file.write(data) :]
         self.rows[row["id"]] = json.loads(line)
 
     def close(self) -> None:
-        """Let go of the folder."""
-        self._opened.close()
+        """Let the disk have the rows, and let go of the folder."""
+        with self._opened, self._telling():
+            os.fsync(self._file.fileno())
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise LogWriteError(f"{self._path} cannot be written: {error.strerror}") from error
 
 
 def read_rows(folder: Path) -> Iterator[dict[str, Any]]:

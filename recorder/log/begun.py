@@ -22,7 +22,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from recorder.log.whole import whole
+from cdmisfa.core.errors import LogDamagedError
+from recorder.log.whole import to_disk, whole
 
 RECORDING = "recording.json"
 """File that says how a recording was begun; gone when every view is finished.
@@ -82,13 +83,19 @@ def read_recording(folder: Path) -> Begun:
     Returns:
         The scene as its source, and the options `seed`, `frames` and `split`; the latter two are
         given for each unfinished view.
+
+    Raises:
+        LogDamagedError: the disk does not give it.
     """
+    path = folder / RECORDING
     try:
-        values = json.loads((folder / RECORDING).read_text("utf-8"))
+        values = json.loads(path.read_text("utf-8") if path.is_file() else "")
         frames = {str(view): n for view, n in values["frames"].items() if _is_count(n) and n > 0}
         split = {v: limit for v, limit in values.get("split", {}).items() if isinstance(limit, str)}
         scene, seed = values.get("scene", ""), values.get("seed")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except OSError as error:
+        raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return Begun((), {"frames": {}, "split": {}})
     known = {"seed": seed} if _is_count(seed) and 0 <= seed < 2**63 else {}
     source = (scene,) if scene and isinstance(scene, str) else ()
@@ -112,6 +119,7 @@ def keep_recording(folder: Path, views: Sequence[str], begun: Begun | None = Non
     path = folder / RECORDING
     if not frames:
         path.unlink(missing_ok=True)
+        to_disk(folder)
         return
     with whole(path) as partial:
         values = {"frames": frames, "split": split, "scene": scene, "seed": seed}

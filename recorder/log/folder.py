@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.log.whole import make_folder
 
 
 @contextlib.contextmanager
@@ -87,7 +88,7 @@ def prepared_folder(folder: Path, views: Sequence[str]) -> Iterator[None]:
     """
     with contextlib.ExitStack() as stack:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             stack.enter_context(held(folder))
             for old in (path for view in views for path in view_logs(folder, view)):
                 old.unlink()

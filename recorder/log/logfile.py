@@ -2,13 +2,15 @@
 
 A `LogFile` is `NAME.partial` until it is finished, so a file called NAME is always
 whole. What was written is readable up to the last flush after any end: an error, a
-signal, kill -9, a full disk.
+signal, kill -9, a full disk; after a power cut up to the last `sync`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal, Self
@@ -17,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
-from recorder.log.whole import partial_path
+from recorder.log.whole import partial_path, to_disk
 
 FLUSH_NS = 1_000_000_000
 """Log time after which the chunk in progress is handed to the operating system, by default.
@@ -48,8 +50,20 @@ class LogFile:
         compression: Compression = "zstd",
         chunk_size: int = 1024 * 1024,
         flush_ns: int = FLUSH_NS,
+        fsync_every: float | None = None,
     ) -> None:
         """Open NAME.partial for writing.
+
+        Args:
+            path: the file's name once it is finished.
+            force: overwrite what is there.
+            library: what wrote it, as the header states.
+            profile: of the messages, as the header states.
+            compression: of the chunks.
+            chunk_size: bytes of messages at which a chunk is closed.
+            flush_ns: log time after which it is flushed.
+            fsync_every: seconds of wall time after which a flush lets the disk have everything,
+                too; None leaves that to the operating system until the end. The bytes are the same.
 
         Raises:
             UsageError: the file or its partial exists and `force` is not set.
@@ -60,6 +74,9 @@ class LogFile:
         self._force = force
         self._flush_ns = flush_ns
         self._chunk_start: int | None = None
+        self._fsync_every = math.inf if fsync_every is None else fsync_every
+        self._next_sync = time.monotonic() + self._fsync_every
+        self._named_on_disk = False
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         if self.path.exists() and not force:
             raise UsageError(f"{self.path} exists: choose another name or overwrite with --force")
@@ -155,6 +172,21 @@ class LogFile:
         self._stream.check()
         self._chunk_start = None
         self._writer.flush()  # type: ignore[no-untyped-call]
+        if time.monotonic() >= self._next_sync:
+            self._sync()
+
+    def sync(self) -> None:
+        """Flush, and let the disk have everything: a power cut takes nothing of it."""
+        self.flush()
+        self._sync()
+
+    def _sync(self) -> None:
+        self._stream.sync()
+        if not self._named_on_disk:
+            with self._telling():
+                to_disk(self.partial.parent)
+            self._named_on_disk = True
+        self._next_sync = time.monotonic() + self._fsync_every
 
     def finish(self) -> None:
         """Write the index, make the file durable and give it its name.
@@ -173,24 +205,24 @@ class LogFile:
                 f"{self.path} appeared while it was being written: "
                 f"the new log is whole in {self.partial.name}, rename it"
             )
-        try:
+        with self._telling():
             os.replace(self.partial, self.path)
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-        except OSError as error:
-            raise _write_error(self.path, error) from error
+            to_disk(self.path.parent)
 
     def abandon(self) -> None:
         """Flush what can be flushed and close, leaving a readable `.partial`."""
         if self.closed:
             return
         with contextlib.suppress(LogWriteError):
-            self.flush()
-            self._stream.sync()
+            self.sync()
         self._stream.close()
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise _write_error(self.path, error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -254,6 +286,7 @@ class _LatchedStream:
             yield
         except OSError as error:
             self._error = error
+            self.close()
             raise _write_error(self._path, error) from error
 
 

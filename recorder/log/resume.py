@@ -20,14 +20,14 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 
-from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
 from recorder.log.folder import part_name, part_number
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity, ViewFacts
 from recorder.log.whole import partial_path
 
-_DAMAGE = (McapError, ValueError, struct.error, OSError, OverflowError, MemoryError, KeyError)
+_DAMAGE = (McapError, ValueError, struct.error, OverflowError, MemoryError, KeyError)
 
 
 class FramesHeld(NamedTuple):
@@ -196,9 +196,16 @@ def messages(path: Path) -> Iterator[tuple[Channel, Message]]:
 
 
 def _undamaged(path: Path, read: Callable[[NonSeekingReader], Iterator[Any]]) -> Iterator[Any]:
-    """What a reader of a log gives, up to where the log is damaged or torn."""
-    with contextlib.suppress(*_DAMAGE), path.open("rb") as file:
-        yield from read(NonSeekingReader(file, validate_crcs=True, record_size_limit=2**30))
+    """What a reader of a log gives, up to where the log is damaged or torn.
+
+    Raises:
+        LogDamagedError: the disk does not give it, which says nothing of the log.
+    """
+    try:
+        with contextlib.suppress(*_DAMAGE), path.open("rb") as file:
+            yield from read(NonSeekingReader(file, validate_crcs=True, record_size_limit=2**30))
+    except OSError as error:
+        raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def _refuse_other(path: Path, facts: ViewFacts) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import Block, HeadPose
+from cdmisfa.core.errors import LogDamagedError
 from recorder.config import RecordConfig
 from recorder.log.folder import part_name
 from recorder.log.logfile import LogFile
@@ -43,6 +44,7 @@ class ViewLog:
         pose: of the head in this view, where there is a head; written once a second.
         name: of the file, instead of the view's.
         first_frame: with which the file begins.
+        fsync_every: see `LogFile`.
 
     Attributes:
         file: the log itself, to be flushed, finished or abandoned.
@@ -59,6 +61,7 @@ class ViewLog:
         pose: HeadPose | None = None,
         name: str | None = None,
         first_frame: int = 0,
+        fsync_every: float | None = None,
     ) -> None:
         self.t = self._first = first_frame
         self._spec = spec = identity.spec
@@ -79,6 +82,7 @@ class ViewLog:
             library=f"cdmisfa {version('cdmisfa')}",
             compression=settings.compression,
             chunk_size=settings.chunk_size,
+            fsync_every=fsync_every,
         )
         log.add_metadata(RECORDING_METADATA, identity.facts(view, first_frame).as_metadata())
         log.add_attachment(
@@ -111,13 +115,21 @@ class ViewLog:
             self.t += 1
 
     def copy(self, path: Path, stop: int) -> None:
-        """Take over the frames before `stop` of an earlier log of the same part."""
+        """Take over the frames before `stop` of an earlier log of the same part.
+
+        Raises:
+            LogDamagedError: they are not there any more.
+        """
+        held = self._first
         for channel, message in messages(path):
             if message.sequence >= stop:
                 break
             if channel.topic in self._channels:
                 number, _ = self._channels[channel.topic]
                 self.file.write(number, message.log_time, message.data, message.sequence)
+                held += channel.topic == self._topic
+        if held != stop:
+            raise LogDamagedError(f"{path} changed while it was read: resume it again")
         self.t = stop
 
     def _write(self, topic: str, *values: Any) -> None:
@@ -132,7 +144,7 @@ class ViewParts:
     Where a part ends depends on its frames only, not on the blocks they came in.
 
     Args:
-        folder, view, identity, settings, pose: as for `ViewLog`.
+        folder, view, identity, settings, pose, fsync_every: as for `ViewLog`.
         split: where parts end; None for a single file.
         parts: file and number of frames of each part that is done; more are added.
         first: first frame of the part that is next.
@@ -148,13 +160,16 @@ class ViewParts:
         pose: HeadPose | None,
         parts: list[tuple[Path, int]],
         first: int,
+        fsync_every: float | None = None,
     ) -> None:
         self._parts = parts
         self._view = view
         self._split = split
         self._length = split.frames(identity.spec.fps) if split else None
         self._first = first
-        self._open = partial(ViewLog, folder, view, identity, settings, pose=pose)
+        self._open = partial(
+            ViewLog, folder, view, identity, settings, pose=pose, fsync_every=fsync_every
+        )
         self._log = self._next()
 
     @property

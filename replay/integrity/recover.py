@@ -11,7 +11,7 @@ import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.logfile import LogFile
-from recorder.log.whole import PARTIAL
+from recorder.log.whole import PARTIAL, make_folder
 from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
 from replay.mcap.reader import LogReader
 from replay.mcap.segments import Problem
@@ -94,7 +94,7 @@ def _recover(src: Path, dst: Path, force: bool) -> Recovery:
             raise UsageError(f"{dst} is a file: name a folder for the logs of {src}")
         targets = [dst / file.name.removesuffix(PARTIAL) for file in files]
     try:
-        (dst if src.is_dir() else dst.parent).mkdir(parents=True, exist_ok=True)
+        make_folder(dst if src.is_dir() else dst.parent)
     except OSError as error:
         raise UsageError(f"{dst}: {error.strerror}") from None
     for file, target in zip(files, targets, strict=True):

@@ -59,6 +59,7 @@ class RunWriter(Sink):
         watched_every: keep every this many frames of images; vectors are all kept.
         phi_every: keep the weights every this many iterations, on each save, and where a learner
             that has weights of each stream goes on to another one.
+        fsync_every: see `LogFile`.
 
     Raises:
         UsageError: the file exists and `force` is not set.
@@ -74,6 +75,7 @@ class RunWriter(Sink):
         force: bool = False,
         watched_every: int = 10,
         phi_every: int = 50,
+        fsync_every: float | None = None,
     ) -> None:
         self.spec, self.path = spec, Path(path)
         self._watched_every = max(watched_every, 1)
@@ -83,7 +85,12 @@ class RunWriter(Sink):
         # often, so the wall clock decides. Of images zstd leaves a tenth less than lz4, and
         # takes twice as long.
         self._log = LogFile(
-            path, force=force, compression="lz4", chunk_size=CHUNK_BYTES, flush_ns=NEVER_NS
+            path,
+            force=force,
+            compression="lz4",
+            chunk_size=CHUNK_BYTES,
+            flush_ns=NEVER_NS,
+            fsync_every=fsync_every,
         )
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
@@ -162,6 +169,10 @@ class RunWriter(Sink):
         """Hand everything written so far to the operating system."""
         self._log.flush()
         self._next_flush = time.monotonic() + FLUSH_SECONDS
+
+    def sync(self) -> None:
+        """Let the disk have everything written so far."""
+        self._log.sync()
 
     def finish(self, final: Mapping[str, str] | None = None) -> None:
         """Write a final record where there is one, and the index; give the file its name."""

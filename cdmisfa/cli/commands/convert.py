@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 @click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")
 @click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
 @options.server_limits
+@options.fsync_every
 @options.force
 @options.as_json
 @click.pass_context
@@ -38,6 +39,7 @@ def convert_command(
     rate: float | None,
     salvage: bool,
     resume: bool,
+    fsync_every: float | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -68,6 +70,7 @@ def convert_command(
                 out,
                 force=force,
                 resume=resume,
+                fsync_every=fsync_every,
                 stop=stop,
                 progress=lambda done: shown.update(done, length),
             )

@@ -58,6 +58,7 @@ TICK = 0.1
     metavar="SECONDS",
     help="With --follow, give up when no frame came for so long.",
 )
+@options.fsync_every
 @camera_options
 @options.server_limits
 @options.force
@@ -81,6 +82,7 @@ def learn_command(
     no_rerun: bool,
     follow: bool,
     follow_timeout: float,
+    fsync_every: float | None,
     force: bool,
     as_json: bool,
     **cameras: Any,
@@ -135,6 +137,7 @@ def learn_command(
                 sinks=(reporter,),
                 stop=stop,
                 resume=resume,
+                fsync_every=fsync_every,
                 live=live_view,
                 announce=announce,
                 command=None if out is None else command_of(source, ctx.params, out),

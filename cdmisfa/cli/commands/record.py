@@ -49,6 +49,7 @@ CONVERTED = ("foreign",)
     help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
     "--resume as first asked for.",
 )
+@options.fsync_every
 @options.force
 @options.as_json
 @click.pass_context
@@ -63,6 +64,7 @@ def record_command(
     preset: str | None,
     settings: tuple[str, ...],
     scene_picture: Path | None,
+    fsync_every: float | None,
     force: bool,
     resume: bool,
     split: str | None,
@@ -122,6 +124,7 @@ def record_command(
             force=force,
             resume=resume,
             split=parts,
+            fsync_every=fsync_every,
             stop=stop,
             progress=report,
         )
