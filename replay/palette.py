@@ -24,23 +24,44 @@ PURPLE: Rgb = (204, 121, 167)
 GREY: Rgb = (136, 136, 136)
 
 CYCLE: tuple[Rgb, ...] = (SKY, ORANGE, GREEN, PURPLE, YELLOW, VERMILLION, BLUE)
-"""Colours of things that are counted: streams, modules."""
+"""Colours of streams, and of what belongs to one."""
 
 SAND: Rgb = (190, 180, 130)
 WHITE: Rgb = (240, 240, 240)
 MIST: Rgb = (165, 180, 195)
 DARK: Rgb = (85, 85, 85)
 
+ROSE: Rgb = (214, 170, 165)
+LILAC: Rgb = (175, 160, 205)
+MOSS: Rgb = (135, 155, 115)
+KHAKI: Rgb = (150, 140, 95)
+SILVER: Rgb = (200, 205, 210)
+BROWN: Rgb = (140, 115, 95)
+
 STATES: tuple[Rgb, ...] = (SAND, WHITE, MIST, DARK)
 """Colours of what became of a stream: learning, learned, known, given up; none is a stream's."""
+
+PALE: tuple[Rgb, ...] = (SILVER, SAND, LILAC, MOSS, ROSE, MIST, BROWN)
+"""Colours of lines that belong to no stream: a full colour is a stream's, and its module's."""
 
 STEPS = 255
 """Shades between white and a full colour: as many as eight bits can tell apart."""
 
 
 def colour(index: int) -> Rgb:
-    """The colour of stream or module number `index`, from 0."""
+    """The colour of stream number `index`, from 0."""
     return CYCLE[index % len(CYCLE)]
+
+
+def pale(index: int) -> Rgb:
+    """The colour of line number `index`, from 0, of those that belong to no stream."""
+    return PALE[index % len(PALE)]
+
+
+def dim(rgb: Rgb) -> Rgb:
+    """A colour at half its brightness."""
+    red, green, blue = (value // 2 for value in rgb)
+    return red, green, blue
 
 
 def packed(rgb: Rgb) -> int:

@@ -192,7 +192,10 @@ def test_a_run_opens_in_the_prepared_layout(sweep, tmp_path, dataset):
     url = dataset.segment_url(run_identity(runs[1]))
     with headless_viewer("1200x800") as viewer:
         viewer.ask(lambda client: client.open(url) or True)
-        prepared = {"Events", "Change of weights ξ"}  # as the views of one run are called
+        prepared = {
+            "Events",
+            "Change of weights ξ, as powers of ten",
+        }  # as the views of one run are called
         viewer.ask(lambda client: prepared <= {view.name for view in client.get_state().views})
 
 

@@ -172,17 +172,18 @@ def test_lanes_say_what_was_the_case(shown):
         return [state for frame, state in states if frame <= t][-1]
 
     for s in records:
-        assert at("/lanes/1_stream", s.t) == [spec.streams[s.stream]]
+        assert at("/attends", s.t) == [spec.streams[s.stream]]
         verdict = "novel" if s.novel else f"known by {s.known_by}" if s.known_by > 0 else "constant"
-        assert at("/lanes/3_gate", s.t) == [verdict]
-        assert at("/lanes/4_action", s.t) == [["stay", "switch"][s.action]]
+        assert at("/novelty", s.t) == [verdict]
+        did = "switch" if s.action else f"stay on {spec.streams[s.stream]}"
+        assert at("/does", s.t) == [did]
         for i, name in enumerate(spec.streams):
             assert at(f"/policy/{i + 1}_{name}", s.t) == [["stay", "switch"][s.policy[i]]]
 
 
 def test_eyes_get_threshold_band_weights_and_events(shown):
     spec, records, rows, folder = shown
-    assert set(np.ravel(scalars(rows["/abstraction/delta"]))) == {DELTA}
+    assert set(np.ravel(scalars(rows["/abstraction/delta"]))) == {np.log10(DELTA)}
     band = scalars(rows["/gate/band/1"])
     np.testing.assert_allclose(band, np.tile([0.008, 0.012], (len(band), 1)))
     assert rows["/abstraction/phi"]["iteration"] == [0, 10, 20]
@@ -190,7 +191,11 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
     assert rows["/events"]["TextLog:text"] == [["stopped: the test is over"]]
     assert "/summary" in statics_of(folder / "run.rrd")
     stay = scalars(rows[f"/decision/R_stay/2_{spec.streams[1]}"])[:, 0]
-    np.testing.assert_array_equal(stay, [s.R[1, 0, 1] for s in records])
+    np.testing.assert_allclose(stay, [1000 * s.R[1, 0, 1] for s in records])
+    fell = [np.log10(s.eta_dot[0]) for s in records]
+    np.testing.assert_array_equal(scalars(rows["/abstraction/log_eta_dot"])[:, 0], fell)
+    (first, *_) = rows["/decision/table"]["TextDocument:text"]
+    assert f"| {spec.streams[1]} | {1000 * records[0].Q[1, 0]:.3f} |" in first[0]
 
 
 def test_the_share_of_the_recent_blocks_is_there(shown, monkeypatch):

@@ -106,7 +106,7 @@ def test_each_stream_has_a_lane_that_says_what_became_of_it(shown):
         3: [(0, "learning"), (10, "given up"), (25, "learning")],
     }
     for place, changes in expected.items():
-        (entity,) = [e for e in rows if e.startswith(f"/streams/state/{place}_")]
+        (entity,) = [e for e in rows if e.startswith(f"/state/{place}_")]
         frames, states = column(rows, entity, "StateChange:state")
         assert frames.tolist() == [*(k * TAU for k, _ in changes), ITERATIONS * TAU]
         assert states == [*(state for _, state in changes), ""]
@@ -120,9 +120,11 @@ def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
         tested = np.array([np.isfinite(r.tested) for r in own])
         assert 0 < tested.sum() < len(own) or s == 2
         for signal in ("learning_error", "tested", "fitted", "change"):
-            frames, found = column(rows, f"/streams/{signal}/{s + 1}_{name}", "Scalars:scalars")
+            entity = "log_change" if signal == "change" else signal
+            frames, found = column(rows, f"/streams/{entity}/{s + 1}_{name}", "Scalars:scalars")
             assert frames.tolist() == [r.t for r in own]
             expected = np.where(tested, [getattr(r, signal) for r in own], np.nan)
+            expected = np.log10(expected) if signal == "change" else expected
             np.testing.assert_array_equal(np.array(found, dtype=float), expected)
         _, found = column(rows, f"/streams/interest/{s + 1}_{name}", "Scalars:scalars")
         np.testing.assert_array_equal(found, [r.interest[s] for r in records])
@@ -134,14 +136,14 @@ def test_saves_and_thresholds_are_marked(shown):
     frames, stood = column(rows, "/streams/saved", "Scalars:scalars")
     assert (frames.tolist(), stood) == ([r.t for r in saved], [r.learning_error for r in saved])
     assert set(column(rows, "/streams/threshold", "Scalars:scalars")[1]) == {0.05 + 0.25}
-    assert set(column(rows, "/streams/settled", "Scalars:scalars")[1]) == {0.05}
+    assert set(column(rows, "/streams/settled", "Scalars:scalars")[1]) == {np.log10(0.05)}
 
 
 def test_nothing_is_there_that_the_run_does_not_tell(shown):
     _, _, _, names = shown
     of_2_0 = ("/policy/", "/gate/", "/decision/R", "/decision/Q", "/decision/adv", "/abstraction/d")
     of_2_0 += tuple(f"/signals/{name}" for name in (*UNTOLD, "R"))
-    of_2_0 += ("/lanes/2", "/lanes/3", "/lanes/4", "/lanes/5", "/abstraction/saved")
+    of_2_0 += ("/learns", "/novelty", "/mostly/novelty", "/does", "/explores", "/abstraction/s")
     assert [n for n in names if n.startswith(of_2_0)] == []
     assert {"/signals/learning_error", "/signals/state", "/signals/band_mean/1"} <= names
 
@@ -158,7 +160,7 @@ def test_what_2_0_tells_has_nothing_of_streams(tmp_path):
     names = entities_of(tmp_path / "run.rrd")[1]
     new = tuple(f"/signals/{name}" for name in (*missing, "interest", "state"))
     assert [n for n in names if n.startswith(("/streams", *new))] == []
-    assert {"/signals/Q", "/signals/xi", "/lanes/3_gate"} <= names
+    assert {"/signals/Q", "/signals/xi", "/novelty"} <= names
 
 
 def views_of(part):

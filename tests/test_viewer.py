@@ -54,8 +54,8 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
 
 BY_PROGRESS = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
 NAMED = {
-    "2.0": (6, 25, ("Rewards", "Change of weights ξ", "Output of module 1 on what was watched")),
-    "progress": (4, 18, ("φ 3: right", "Output y on new frames", "Events")),
+    "2.0": (6, 25, ("R and Q, every 10 iterations", "What was done: the last 50 blocks", "Events")),
+    "progress": (4, 18, ("φ 3: right", "Output y on new frames, from least to most", "Events")),
 }
 
 
@@ -76,7 +76,7 @@ def test_every_tab_shows_without_a_complaint_whatever_things_are_called(
     )
     tabs = []
 
-    def side_by_side(*views, name, timeline="frame"):
+    def side_by_side(*views, **_):
         tabs.extend(views)
         return rrb.Blueprint(rrb.Grid(*views), auto_views=False, auto_layout=False)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -90,25 +89,6 @@ class Outline:
     def names(self) -> tuple[str, ...]:
         """Names of the streams."""
         return self.header.spec.streams
-
-    def span(
-        self, *names: str, low: float | None = None, below: float = math.inf
-    ) -> tuple[float, float] | None:
-        """A range that shows these lines without their wildest values.
-
-        Args:
-            names: of the lines.
-            low: where it begins, whatever they are.
-            below: values from here on are left out.
-        """
-        values = np.concatenate([self.lines[name] for name in names])
-        values = values[np.isfinite(values) & (values < below)]
-        if not len(values):
-            return None
-        lower, upper = (float(v) for v in np.percentile(values, (1.0, 98.0)))
-        lower = lower if low is None else low
-        margin = 0.1 * (upper - lower) or 0.1 * abs(upper) or 1.0
-        return (lower - margin if low is None else lower), upper + margin
 
 
 class Tally:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import times_of
-from replay.palette import Rgb, colour, packed_all
+from replay.palette import Rgb, packed_all, pale
 from replay.view.labels import label
 
 FRAME = "frame"
@@ -30,6 +30,12 @@ LOG_TIME = "message_log_time"
 
 TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 """Signals that are not lines but the timelines themselves."""
+
+AGGREGATION = rr.components.AggregationPolicy.MinMax
+"""How a line of more values than the screen has columns is drawn: from the least to the most.
+
+Their mean, which the viewer draws where nothing is said, may be a value that never was.
+"""
 
 ROWS = 4000
 """Rows of a column that are handed over at once."""
@@ -52,6 +58,11 @@ def time_columns(
     if iterations is not None:
         found.append(rr.TimeColumn(ITERATION, sequence=iterations.copy()))
     return found
+
+
+def power_of_ten(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Logarithms of values to the base of ten; NaN of what has none."""
+    return np.log10(np.where(values > 0, values, np.nan))
 
 
 class Column:
@@ -127,12 +138,27 @@ def line_column(
     names: Sequence[str],
     rgbs: Sequence[Rgb] | None = None,
     width: float | None = None,
+    *,
+    steps: bool = False,
 ) -> Column:
-    """A column that is drawn as lines, whose names and colours are said once."""
+    """A column that is drawn as lines, whose names and colours are said once.
+
+    Args:
+        recording: where they go.
+        spec: of the source.
+        path: the entity.
+        names: of the lines.
+        rgbs: their colours.
+        width: of a line.
+        steps: a value holds until the next one; there is nothing between two values.
+    """
+    modes = rr.components.InterpolationMode
     style = rr.SeriesLines(
         names=[label(name) for name in names],
-        colors=packed_all(rgbs or [colour(i) for i in range(len(names))]),
+        colors=packed_all(rgbs or [pale(i) for i in range(len(names))]),
         widths=None if width is None else [width] * len(names),
+        aggregation_policy=AGGREGATION,
+        interpolation_mode=modes.StepAfter if steps else modes.Linear,
     )
     return Column(recording, spec, path, style)
 

@@ -10,11 +10,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cdmisfa.core.blocks import HeadPose
-from replay.palette import colour, packed_all
+from replay.palette import WHITE, colour, packed_all
 from replay.recordings.poses import yaw_of
 from replay.runs.outline import Outline
 from replay.runs.stretches import read_columns
-from replay.view.columns import Column, time_columns
+from replay.view.columns import line_column, time_columns
 from replay.view.labels import label, part
 
 POSES = "head/poses"
@@ -61,9 +61,8 @@ def write_gaze(
     spec, watching = outline.header.spec, -1
     watched = [poses[name] for name in spec.streams]
     yaws = np.array([yaw_of(pose) for pose in watched])
-    column = Column(recording, spec, YAW)
-    name = rr.SeriesLines(names=["head turned to the left [degrees]"])
-    recording.log(YAW, name, static=True)
+    names = ["head turned to the left [degrees]"]
+    column = line_column(recording, spec, YAW, names, [WHITE], steps=True)
     for columns in read_columns(log, outline.header):
         streams = columns["stream"].astype(np.int64)
         column.add(*columns.times(), yaws[streams][:, None])

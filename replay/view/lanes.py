@@ -1,4 +1,10 @@
-"""Lanes: what was the case when, as labelled bars of colour."""
+"""Lanes: what was the case when, as labelled bars of colour.
+
+A lane's label is its entity, and lanes stand in the order of the alphabet: so they have the names
+that they have. What changes with many blocks has two lanes. `/attends` holds every change;
+`/mostly/attends` what was the case in most of the blocks around, which reads when all of a run
+is in view.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +28,22 @@ NameOf = Callable[[int], tuple[str, Rgb]]
 
 Codes = NDArray[np.int64]
 
+ATTENDS, LEARNS, NOVELTY, DOES, EXPLORES = "attends", "learns", "novelty", "does", "explores"
+"""Entities of lanes."""
+
+MOSTLY = "mostly"
+"""Where the lanes are that say what was mostly the case."""
+
+PIECES = 80
+"""Pieces of a run of which such a lane says one thing each."""
+
+MOST_OF = 2 / 3
+"""Share of the blocks of a piece that is most of them."""
+
 STAY, SWITCH = ACTIONS
 
 _NOVEL = -1
+_MIXED = -2
 _KNOWN = STATES.index("known")
 
 
@@ -36,6 +55,8 @@ class Lanes:
         spec: of the source.
         shown: the streams that get a lane of their own: of the policy, or of the stream's state.
         by_progress: the run is one of the progress learner, which has no gate.
+        piece: blocks of which one thing is said in lanes of what was mostly the case; by default
+            so many that they are told once all blocks are known.
     """
 
     def __init__(
@@ -45,37 +66,48 @@ class Lanes:
         shown: Sequence[int],
         *,
         by_progress: bool = False,
+        piece: int | None = None,
     ) -> None:
-        names: dict[str, NameOf] = {
-            "lanes/1_stream": lambda stream: (label(spec.streams[stream]), colour(stream)),
-        }
+        def attended(stream: int) -> tuple[str, Rgb]:
+            return label(spec.streams[stream]), colour(stream)
+
+        names: dict[str, NameOf] = {ATTENDS: attended}
         self._known_by = np.zeros(len(spec.streams), dtype=np.int64)
-        kind = "streams/state" if by_progress else "policy"
+        kind = "state" if by_progress else "policy"
         self._of_stream = {s: f"{kind}/{part(spec.streams, s)}" for s in shown}
+        mostly: dict[str, NameOf] = {ATTENDS: partial(_or_mixed, name=attended, mixed="switches")}
         if by_progress:
             self._codes = self._became
             names |= dict.fromkeys(self._of_stream.values(), _became)
         else:
             self._codes = self._decided
-            names |= _GATED
+            names |= {LEARNS: _learned, NOVELTY: _verdict, EXPLORES: _chosen}
+            names[DOES] = partial(_done, streams=[label(name) for name in spec.streams])
             names |= {path: partial(_planned, stream=s) for s, path in self._of_stream.items()}
+            mostly[NOVELTY] = partial(_or_mixed, name=_verdict, mixed="both")
         self._lanes = {p: Lane(recording, spec, p, name) for p, name in names.items()}
+        self._mostly = {
+            path: MostlyLane(Lane(recording, spec, f"{MOSTLY}/{path}", name), piece)
+            for path, name in mostly.items()
+        }
         self._iteration = 0
 
     def add(self, columns: SignalColumns) -> None:
         """Take the states of consecutive iterations in."""
         self._iteration = int(columns.iterations[-1])
-        codes = {"lanes/1_stream": columns["stream"]} | self._codes(columns)
+        codes = {ATTENDS: columns["stream"]} | self._codes(columns)
         for path, lane in self._lanes.items():
-            lane.add(columns, codes[path])
+            lane.add(columns.frames, columns.iterations, codes[path])
+        for path, mostly in self._mostly.items():
+            mostly.add(columns.frames, columns.iterations, codes[path])
 
     def _decided(self, columns: SignalColumns) -> dict[str, Codes]:
         """What CD-MISFA does and decides."""
         codes = {
-            "lanes/2_learning": columns["module"],
-            "lanes/3_gate": np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0)),
-            "lanes/4_action": columns["action"],
-            "lanes/5_chosen_by": columns["explored"],
+            LEARNS: columns["module"],
+            NOVELTY: np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0)),
+            DOES: columns["stream"] + len(self._known_by) * columns["action"],
+            EXPLORES: columns["explored"],
         }
         return codes | {path: columns["policy"][:, s] for s, path in self._of_stream.items()}
 
@@ -97,14 +129,61 @@ class Lanes:
         Args:
             frames: where the run ended.
         """
-        for lane in self._lanes.values():
+        for mostly in self._mostly.values():
+            mostly.end()
+        for lane in self._every():
             lane.end(frames, self._iteration)
         self.flush()
 
     def flush(self) -> None:
         """Hand over the changes since the last time."""
-        for lane in self._lanes.values():
+        for lane in self._every():
             lane.flush()
+
+    def _every(self) -> list[Lane]:
+        return [*self._lanes.values(), *(mostly.lane for mostly in self._mostly.values())]
+
+
+class MostlyLane:
+    """A lane that says of each piece of a run what was the case in most of its blocks.
+
+    Args:
+        lane: where it is said.
+        piece: blocks of a piece; by default a run has `PIECES`, known at its end.
+    """
+
+    def __init__(self, lane: Lane, piece: int | None) -> None:
+        self.lane, self._piece = lane, piece
+        self._waiting: list[tuple[Codes, Codes, Codes]] = []
+
+    def add(self, frames: Codes, iterations: Codes, codes: Codes) -> None:
+        """Take what was the case in consecutive blocks."""
+        self._waiting.append((frames, iterations, codes))
+        if self._piece is not None:
+            self._say(self._piece, last=False)
+
+    def end(self) -> None:
+        """Say what is left."""
+        blocks = sum(len(codes) for *_, codes in self._waiting)
+        self._say(self._piece or max(blocks // PIECES, 1), last=True)
+
+    def _say(self, piece: int, *, last: bool) -> None:
+        if not self._waiting:
+            return
+        frames, iterations, codes = (np.concatenate(p) for p in zip(*self._waiting, strict=True))
+        stop = len(codes) if last else len(codes) // piece * piece
+        starts = np.arange(0, stop, piece)
+        said = np.array([_most(codes[i : i + piece]) for i in starts], dtype=np.int64)
+        if len(starts):
+            self.lane.add(frames[starts], iterations[starts], said)
+        self._waiting = [(frames[stop:], iterations[stop:], codes[stop:])]
+
+
+def _most(codes: Codes) -> int:
+    """The code that most of these are, `_MIXED` where there is none."""
+    values, counts = np.unique(codes, return_counts=True)
+    place = int(counts.argmax())
+    return int(values[place]) if counts[place] >= MOST_OF * len(codes) else _MIXED
 
 
 class Lane:
@@ -129,10 +208,10 @@ class Lane:
         self._colours: dict[str, Rgb] = {}
         self._declared = 0
 
-    def add(self, columns: SignalColumns, codes: NDArray[np.int64]) -> None:
+    def add(self, frames: Codes, iterations: Codes, codes: Codes) -> None:
         """Keep the places where what the codes stand for changes."""
         begins = np.flatnonzero(np.diff(codes.astype(np.int64), prepend=int(codes[0]) + 1))
-        rows = zip(codes[begins], columns.frames[begins], columns.iterations[begins], strict=True)
+        rows = zip(codes[begins], frames[begins], iterations[begins], strict=True)
         for code, t, iteration in rows:
             state, rgb = self._name(int(code))
             self._colours.setdefault(state, rgb)
@@ -161,18 +240,28 @@ class Lane:
         self._changes = []
 
 
+def _or_mixed(code: int, name: NameOf, mixed: str) -> tuple[str, Rgb]:
+    return (mixed, palette.GREY) if code == _MIXED else name(code)
+
+
+def _learned(module: int) -> tuple[str, Rgb]:
+    return f"module {module}", palette.SAND if module % 2 else palette.KHAKI
+
+
 def _verdict(code: int) -> tuple[str, Rgb]:
     if code == _NOVEL:
-        return "novel", palette.GREEN
-    return (f"known by {code}", colour(code - 1)) if code else ("constant", palette.PURPLE)
+        return "novel", palette.LILAC
+    return (f"known by {code}", palette.MIST) if code else ("constant", palette.BROWN)
 
 
-def _action(action: int) -> tuple[str, Rgb]:
-    return (STAY, palette.SKY) if action == 0 else (SWITCH, palette.VERMILLION)
+def _done(code: int, streams: Sequence[str]) -> tuple[str, Rgb]:
+    if code >= len(streams):
+        return SWITCH, palette.GREY
+    return f"{STAY} on {streams[code]}", colour(code)
 
 
 def _chosen(explored: int) -> tuple[str, Rgb]:
-    return ("explored", palette.ORANGE) if explored else ("greedy", palette.BLUE)
+    return ("explored", palette.ROSE) if explored else ("greedy", palette.MOSS)
 
 
 def _planned(action: int, stream: int) -> tuple[str, Rgb]:
@@ -185,12 +274,3 @@ def _became(code: int) -> tuple[str, Rgb]:
         module = code - len(STATES)
         return f"known by {module}" if module else "known", palette.STATES[_KNOWN]
     return STATES[code].replace("_", " "), palette.STATES[code]
-
-
-_GATED: dict[str, NameOf] = {
-    "lanes/2_learning": lambda module: (f"module {module}", colour(module - 1)),
-    "lanes/3_gate": _verdict,
-    "lanes/4_action": _action,
-    "lanes/5_chosen_by": _chosen,
-}
-"""Lanes of CD-MISFA."""

@@ -17,7 +17,8 @@ from replay.runs.stretches import read_columns
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, Column, line_column
 from replay.view.labels import label, part
-from replay.view.layouts.panels import MOST_STREAMS, blueprint, lines, time_axis
+from replay.view.layouts.panels import MOST_STREAMS
+from replay.view.layouts.plots import blueprint, lines, time_axis
 
 CURVES = {
     "eta_dot": "Change of slowness η̇: a module is saved when it falls below δ",
@@ -150,4 +151,5 @@ def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
         rrb.Grid(*curves(CURVES), name="All curves"),
         name="Comparison",
         timeline=ITERATION,
+        length=max(row.outline.iterations for row in rows),
     )

@@ -19,7 +19,7 @@ from replay.runs.outline import Outline
 from replay.view.columns import FRAME, frames_column, line_column
 from replay.view.heads import gaze, write_gaze, write_heads
 from replay.view.labels import label, part
-from replay.view.layouts.panels import blueprint, lines, time_axis
+from replay.view.layouts.plots import blueprint, lines, time_axis
 
 BLOCK = 500
 """Frames that are read at once."""
@@ -142,4 +142,4 @@ def _layout(spec: SourceSpec, frames: int, head: bool) -> rrb.Blueprint:
     looks = [gaze("Where the head looks")] if head else []
     beside = [*known, *looks]
     below = [rrb.Horizontal(*beside, column_shares=[3, 1][: len(beside)])] if beside else []
-    return blueprint(rrb.Vertical(grid, *below, name="Views"), name="Recording")
+    return blueprint(rrb.Vertical(grid, *below, name="Views"), name="Recording", length=frames)

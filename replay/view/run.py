@@ -7,6 +7,7 @@ those of run.mcap; of a signal that the run never tells there is nothing. `/worl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, Signal
-from replay.palette import GREY, SKY, VERMILLION, Rgb, colour, packed, shade
+from replay.palette import GREY, MIST, WHITE, Rgb, colour, dim, packed, packed_all, pale, shade
 from replay.runs.columns import SignalColumns, told
 from replay.runs.log import RunHeader
 from replay.runs.outline import Outline
@@ -31,16 +32,25 @@ from replay.view.columns import (
     TensorColumn,
     frames_column,
     line_column,
+    power_of_ten,
+    time_columns,
 )
 from replay.view.labels import label, part
 from replay.view.lanes import Lanes
 from replay.view.streams import add_streams, thresholds
+from replay.view.summary import decision_text
 
 AXES = {"S": "stream", "A": "action", "J": "output"}
 """Names of tensors' dimensions; the second S of a tensor is the next stream."""
 
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
 """Colours of signals that are drawn beside another one."""
+
+POWERS = {"eta_dot": "abstraction/log_eta_dot", "xi": "abstraction/log_xi"}
+"""Entities of signals drawn as powers of ten: they fall through several."""
+
+MILLI = 1000.0
+"""Of rewards and values: they are small numbers."""
 
 SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
 """Signals whose name is their symbol, spelled out."""
@@ -49,7 +59,13 @@ RECENT = 50
 """Blocks over which the share of each stream is taken."""
 
 SPARSE = 10
-"""With more streams than are shown one by one, tensors are kept every so many iterations."""
+"""Iterations between two tables of R and Q, and between two tensors of very many streams."""
+
+MOST_IN_TABLE = 6
+"""Streams of these tables."""
+
+WATCHED_NAME = "world/watched/name"
+DECISION_TABLE = "decision/table"
 
 WIDTH = 1.5
 """Of lines."""
@@ -65,23 +81,34 @@ class RunView:
         header: what stands at the beginning of the run's log.
         streams: those that get lines and lanes of their own.
         every: show images of every this many frames.
+        piece: see `Lanes`.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, header: RunHeader, streams: Sequence[int], every: int
+        self,
+        recording: rr.RecordingStream,
+        header: RunHeader,
+        streams: Sequence[int],
+        every: int,
+        *,
+        piece: int | None = None,
     ) -> None:
         self._recording = recording
         self._by_progress = header.by_progress
         self._thresholds = thresholds(header) if header.by_progress else {}
-        if header.delta is not None:
-            self._thresholds["abstraction/delta"] = "δ threshold", header.delta
+        if header.delta is not None and header.delta > 0:
+            self._thresholds["abstraction/delta"] = "δ", math.log10(header.delta)
         self._every = every
         self._spec = header.spec
         self._columns: dict[str, Column] = {}
         self._streams = streams
         self._tau = 1
         self._recent = np.zeros((0, len(streams)), dtype=bool)
-        self._lanes = Lanes(recording, self._spec, streams, by_progress=header.by_progress)
+        self._stream_of: dict[int, int] = {}
+        self._named = -1
+        self._lanes = Lanes(
+            recording, self._spec, streams, by_progress=header.by_progress, piece=piece
+        )
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
@@ -120,6 +147,8 @@ class RunView:
         self._decision(columns)
         self._gate(columns)
         self._saved(columns)
+        self._powers(columns)
+        self._name(columns)
         if self._by_progress:
             add_streams(columns, self._spec.streams, self._streams, self._line)
         self._lanes.add(columns)
@@ -174,14 +203,16 @@ class RunView:
             frames, iterations = columns.times("T" in signal.dims)
             if signal.show == "heat":
                 self._tensor(signal, path, columns, value)
-                if signal.name == "Q":  # what stream and action change is small beside the mean
-                    beside = value - value.mean(axis=(1, 2), keepdims=True)
-                    self._tensor(signal, "decision/Q_beside_mean", columns, beside)
             elif signal.dims == "S":
-                self._column(path, Column).add(frames, iterations, value)
+                names = self._spec.streams
+                rgbs = [colour(s) for s in range(len(names))]
+                self._line(path, names, rgbs=rgbs).add(frames, iterations, value)
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
-                    line = self._line(f"{path}/{i + 1}", _labels(signal, i + 1, outputs), i + 1)
+                    labels = _labels(signal, i + 1, outputs)
+                    line = self._line(
+                        f"{path}/{i + 1}", labels, rgbs=self._of_module(i + 1, labels)
+                    )
                     line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
             else:
                 line = self._line(path, _labels(signal, 0, outputs), BESIDE.get(signal.name, 0))
@@ -198,6 +229,40 @@ class RunView:
                 names[-1] = "next stream"
             column = self._column(path, TensorColumn, names)
             column.add(columns.frames[kept], columns.iterations[kept], value[kept])
+
+    def _powers(self, columns: SignalColumns) -> None:
+        """Signals that fall through several powers of ten."""
+        outputs = columns["y"].shape[2]
+        for name, path in POWERS.items():
+            labels = _labels(SIGNALS[name], 0, outputs)
+            values = columns[name].astype(np.float64).reshape(len(columns), -1)
+            self._line(path, labels[: values.shape[1]]).add(*columns.times(), power_of_ten(values))
+
+    def _name(self, columns: SignalColumns) -> None:
+        """Put a frame around what is watched, in the colour and with the name of its stream."""
+        turns = np.flatnonzero(np.diff(columns["stream"], prepend=self._named))
+        if not self._spec.images or not len(turns):
+            return
+        if self._named < 0:
+            height, width = self._spec.frame_shape
+            frame = rr.Boxes2D(mins=[[0, 0]], sizes=[[width, height]], show_labels=True)
+            self._recording.log(WATCHED_NAME, frame, static=True)
+        streams = columns["stream"][turns].tolist()
+        self._named = streams[-1]
+        names = rr.Boxes2D.columns(
+            labels=[label(self._spec.streams[s]) for s in streams],
+            colors=packed_all([colour(s) for s in streams]),
+        )
+        times = time_columns(self._spec, columns.frames[turns], columns.iterations[turns])
+        self._recording.send_columns(WATCHED_NAME, times, names)
+
+    def _of_module(self, module: int, labels: Sequence[str]) -> list[Rgb] | None:
+        """The colours of a module's lines: that of its stream, of further outputs dimmer."""
+        if module not in self._stream_of:
+            return None
+        rgb = colour(self._stream_of[module])
+        one = len(set(labels)) == 1
+        return [rgb if one or i == 0 else dim(rgb) for i in range(len(labels))]
 
     def _attention(self, columns: SignalColumns) -> None:
         """How much of the recent blocks each shown stream was watched."""
@@ -216,13 +281,28 @@ class RunView:
         """Reward and value of each shown stream, as lines in the streams' colours."""
         reward, value = columns["R"], columns["Q"]
         for s in self._streams:
-            name = self._spec.streams[s]
-            place = part(self._spec.streams, s)
+            place, rgbs = part(self._spec.streams, s), [colour(s)]
+            names = [self._spec.streams[s]]
             if reward.size:
-                line = self._line(f"decision/R_stay/{place}", [f"R stay {name}"], s)
-                line.add(*columns.times(), reward[:, s, 0, s])
-            line = self._line(f"decision/advantage/{place}", [f"Q stay - switch {name}"], s)
-            line.add(*columns.times(), value[:, s, 0] - value[:, s, 1])
+                line = self._line(f"decision/R_stay/{place}", names, rgbs=rgbs)
+                line.add(*columns.times(), MILLI * reward[:, s, 0, s])
+            line = self._line(f"decision/advantage/{place}", names, rgbs=rgbs)
+            line.add(*columns.times(), MILLI * (value[:, s, 0] - value[:, s, 1]))
+        kept = np.flatnonzero(columns.iterations % SPARSE == 0)
+        if reward.size and len(kept):
+            names = [label(self._spec.streams[s]) for s in self._streams[:MOST_IN_TABLE]]
+            shown = list(self._streams[:MOST_IN_TABLE])
+            texts = [
+                decision_text(names, reward[i][shown][:, :, shown], value[i][shown]) for i in kept
+            ]
+            times = time_columns(self._spec, columns.frames[kept], columns.iterations[kept])
+            self._recording.send_columns(
+                DECISION_TABLE,
+                times,
+                rr.TextDocument.columns(
+                    text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts)
+                ),
+            )
 
     def _gate(self, columns: SignalColumns) -> None:
         """Each frozen module's band of 2 SD, whose blocks it knows."""
@@ -230,18 +310,23 @@ class RunView:
         edges = np.concatenate([mean - width, mean + width], axis=2)
         for i in range(edges.shape[1]):
             labels = [f"band of module {i + 1}"] * edges.shape[2]
-            self._line(f"gate/band/{i + 1}", labels, i, width=1.0).add(
+            self._line(f"gate/band/{i + 1}", labels, rgbs=[WHITE] * len(labels), width=1.0).add(
                 *columns.times(), edges[:, i]
             )
 
     def _saved(self, columns: SignalColumns) -> None:
         """Where that which must come down stood when a module was saved."""
-        saved, told_by = columns["saved"], ("abstraction/saved", "eta_dot")
+        saved = columns["saved"]
+        self._stream_of |= zip(
+            columns["module"][saved].tolist(), columns["stream"][saved].tolist(), strict=True
+        )
+        path, name = "abstraction/saved", "eta_dot"
         if self._by_progress:
-            told_by = ("streams/saved", "learning_error")
+            path, name = "streams/saved", "learning_error"
         if saved.any():
-            path, name = told_by
             stood = columns[name][saved].reshape(int(saved.sum()), -1)[:, :1]
+            if name in POWERS:
+                stood = power_of_ten(stood)
             self._column(path, _marks).add(columns.frames[saved], columns.iterations[saved], stood)
 
     def _picture(self, phi: NDArray[np.float64]) -> Any:
@@ -250,7 +335,7 @@ class RunView:
         if self._spec.images and phi.shape[1] == shape[0] * shape[1]:
             return rr.Image(shade(phi.reshape(-1, shape[1])))
         if phi.size <= 256:
-            return rr.BarChart(phi.reshape(-1).copy(), color=packed(SKY))
+            return rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
         return rr.Tensor(phi.copy(), dim_names=("output", "input"))
 
     def _iteration(self, t: Frames) -> Frames:
@@ -272,7 +357,7 @@ class RunView:
     ) -> Column:
         """The column of a line or several, in the colours from `number` on."""
         one = len(set(labels)) == 1
-        rgbs = rgbs or [colour(number + (0 if one else i)) for i in range(len(labels))]
+        rgbs = rgbs or [pale(number + (0 if one else i)) for i in range(len(labels))]
         return self._column(path, line_column, labels, rgbs, width)
 
     def _column(self, path: str, make: Callable[..., Column], *how: Any) -> Column:
@@ -285,7 +370,7 @@ class RunView:
 def _marks(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column:
     """A column that is drawn as marks where a module was saved."""
     style = rr.SeriesPoints(
-        colors=[packed(VERMILLION)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
+        colors=[packed(WHITE)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
     )
     return Column(recording, spec, path, style)
 

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from cdmisfa.core.signals import SIGNALS
-from replay.palette import Rgb, colour
+from replay.palette import colour, dim
 from replay.runs.columns import SignalColumns
 from replay.runs.log import RunHeader
-from replay.view.columns import Column
+from replay.view.columns import Column, power_of_ten
 from replay.view.labels import part
 
 WATCHED = ("learning_error", "tested", "fitted", "change")
 """Signals of the stream that is watched; each stream has its line through its own blocks."""
+
+POWERS = {"change": "log_change"}
+"""Those drawn as powers of ten, with their entities: they fall through several."""
+
+HARDLY_WATCHED = 1000.0
+"""Interest from which on a stream promises most because it was hardly watched: it has no line."""
 
 DIM = ("fitted",)
 """Those that are drawn darker, beside others of the same colour."""
@@ -30,7 +37,7 @@ def add_streams(
 
     `/streams/<signal>/<stream>` holds the signal's values where that stream was watched, NaN where
     its candidate was not tested yet, so that no line leads from one candidate to the next.
-    `/streams/interest/<stream>` holds the values of all iterations.
+    `/streams/interest/<stream>` holds the values of all iterations in which it was watched enough.
     """
     for s in shown:
         own, place = columns["stream"] == s, part(names, s)
@@ -39,11 +46,15 @@ def add_streams(
             rgb = dim(colour(s)) if name in DIM else colour(s)
             label = f"{SIGNALS[name].symbol} {names[s]}"
             values = np.where(np.isnan(columns["tested"][own]), np.nan, columns[name][own])
-            line(f"streams/{name}/{place}", [label], rgbs=[rgb]).add(
+            if name in POWERS:
+                values = power_of_ten(values)
+            line(f"streams/{POWERS.get(name, name)}/{place}", [label], rgbs=[rgb]).add(
                 frames[own], iterations[own], values
             )
-        line(f"streams/interest/{place}", [names[s]], s).add(
-            frames, iterations, columns["interest"][:, s]
+        interest = columns["interest"][:, s]
+        promised = np.where(interest < HARDLY_WATCHED, interest, np.nan)
+        line(f"streams/interest/{place}", [names[s]], rgbs=[colour(s)]).add(
+            frames, iterations, promised
         )
 
 
@@ -53,12 +64,6 @@ def thresholds(header: RunHeader) -> dict[str, tuple[str, float]]:
         return {}
     change, error = header.settled
     return {
-        "streams/settled": ("settled", change),
-        "streams/threshold": ("settled + agreement", error),
+        "streams/settled": ("settled below", math.log10(change)),
+        "streams/threshold": ("learned below", error),
     }
-
-
-def dim(rgb: Rgb) -> Rgb:
-    """A colour at half its brightness."""
-    red, green, blue = (int(value) for value in np.array(rgb) // 2)
-    return red, green, blue

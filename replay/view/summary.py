@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from cdmisfa.core.signals import STATES
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.outline import Outline
 from replay.view.layouts.panels import MOST_STREAMS
 
@@ -88,6 +91,29 @@ def _of_streams(outline: Outline, events: Sequence[str]) -> list[str]:
         lines.append(f"- **{names[s]}**: {became}")
     more = len(names) - MOST_STREAMS
     return [*lines, "", *([f"And {more} streams that were watched less.", ""] if more > 0 else [])]
+
+
+def decision_text(
+    names: Sequence[str], reward: NDArray[np.float64], value: NDArray[np.float64]
+) -> str:
+    """What is expected of staying and switching as Markdown tables, in thousandths.
+
+    Args:
+        names: of the streams.
+        reward: (S, A, S) R from a stream, by an action, to a stream.
+        value: (S, A) Q.
+    """
+    head, rule = " | ".join(names), "|".join(["---"] * (len(names) + 1))
+    lines = []
+    for action, row in enumerate(ACTIONS):
+        lines += [f"**R to {row}** [1/1000]", "", f"| from, to | {head} |", f"|{rule}|"]
+        for name, rewards in zip(names, reward[:, action].tolist(), strict=True):
+            lines.append(f"| {name} | {' | '.join(f'{1000 * r:.3f}' for r in rewards)} |")
+        lines.append("")
+    lines += ["**Q** [1/1000]", "", f"| in | {' | '.join(ACTIONS)} |", "|---|---|---|"]
+    for name, (stay, switch) in zip(names, value.tolist(), strict=True):
+        lines.append(f"| {name} | {1000 * stay:.3f} | {1000 * switch:.3f} |")
+    return "\n".join(lines)
 
 
 def policy_text(policy: tuple[int, ...], streams: tuple[str, ...]) -> str:

@@ -38,6 +38,9 @@ EVERY_SECONDS = 1.5
 MOST_BLOCKS = 500
 """Most blocks that wait, however quick the learner is."""
 
+PIECE = 10
+"""Blocks of which lanes say what was mostly the case: how many there will be is not known."""
+
 LAST_SECONDS = 5.0
 """Longest wait for viewers to take the last piece."""
 
@@ -85,7 +88,7 @@ class LiveView(Sink):
         self._recording.send_blueprint(run_layout(outline))
         # No image is left out here: of each block only the first is taken.
         self._view = RunView(
-            self._recording, outline.header, outline.streams(MOST_STREAMS), every=1
+            self._recording, outline.header, outline.streams(MOST_STREAMS), every=1, piece=PIECE
         )
         self._tau = tau
         self._images = spec.images

@@ -10,13 +10,19 @@ from replay.view.layouts.paper import paper_layout
 from replay.view.layouts.progress import progress_layout
 
 
-def run_layout(outline: Outline, *, all_views: bool = False, head: bool = False) -> rrb.Blueprint:
+def run_layout(
+    outline: Outline, *, all_views: bool = False, head: bool = False, tab: str | None = None
+) -> rrb.Blueprint:
     """The layout of a run, ready to be sent.
 
     Args:
         outline: the run in short.
         all_views: what was not watched is there too.
         head: where the head was turned is there too.
+        tab: name of the tab that is open; by default the first.
+
+    Raises:
+        UsageError: there is no such tab.
     """
     layout = progress_layout if outline.header.by_progress else paper_layout
-    return layout(Panels(outline, all_views=all_views, head=head))
+    return layout(Panels(outline, all_views=all_views, head=head, tab=tab))

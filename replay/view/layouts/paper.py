@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import rerun as rr
+import math
+
 import rerun.blueprint as rrb
 
 from replay.runs.outline import Outline
-from replay.view.layouts.panels import MOST_MODULES, Panels, heights, stacked
+from replay.view.columns import power_of_ten
+from replay.view.lanes import ATTENDS, DOES, EXPLORES, LEARNS, MOSTLY, NOVELTY
+from replay.view.layouts.panels import MOST_MODULES, Panels
+from replay.view.layouts.plots import heights, holding, stacked
 
-HEAT = rrb.TensorScalarMapping(colormap="viridis")
-FIT = rrb.components.ViewFit.Fill
+POWERS_OF_TEN = "as powers of ten"
+
+R_STAY = "/decision/R_stay/**"
 
 
 def paper_layout(panels: Panels) -> rrb.Blueprint:
@@ -22,7 +27,8 @@ def feels(panels: Panels) -> list[rrb.View]:
     threshold = _clusters_below(panels.outline)
     if threshold is None:
         return _convergence(
-            panels, "What it feels: η̇ below δ, blocks novel and of one stream: a module is saved"
+            panels,
+            "What it feels: η̇ [1/frame], saved below δ, where blocks are novel, of one stream",
         )
     return panels.lines(
         f"What it feels: a module is saved when the clustering error's mean is below {threshold:g}",
@@ -31,37 +37,45 @@ def feels(panels: Panels) -> list[rrb.View]:
 
 
 def _overview(panels: Panels) -> rrb.Container:
+    streams = len(panels.spec.streams)
     lanes = panels.lanes(
-        "What it does, and decides: the policy in each stream", "/lanes/**", "/policy/**"
+        "What it learns, mostly attends to, what is novel, and the policy in each stream",
+        f"/{LEARNS}",
+        f"/{MOSTLY}/**",
+        "/policy/**",
     )
-    expects = panels.lines("What it expects: reward R for staying", ["/decision/R_stay/**"])
+    expects = panels.lines("What it expects: reward R for staying [1/1000]", [R_STAY])
     story = stacked(
-        ([lanes], heights(5 + len(panels.spec.streams))),
-        (panels.looks(), 125),
-        (feels(panels), 190),
-        (expects, 125),
+        ([lanes], heights(3 + streams)), (panels.looks(), 125), (feels(panels), 190), (expects, 160)
     )
     return rrb.Horizontal(panels.sees(), story, column_shares=[2, 5], name="Overview")
 
 
 def _abstraction(panels: Panels) -> rrb.Container:
-    span = panels.outline.span
+    xi = holding(power_of_ten(panels.values("xi")))
     curves = rrb.Vertical(
-        *panels.lines("Output y", ["/signals/y"]),
-        *panels.lines("Slowness η [1/frame]", ["/signals/eta"], span("eta", low=0.0)),
-        *_convergence(panels, "Change of slowness η̇, and δ"),
-        *panels.lines("Change of weights ξ", ["/signals/xi"], span("xi", low=0.0)),
+        *panels.lines("Output y, from least to most", ["/signals/y"]),
+        *panels.lines(
+            "Slowness η [1/frame]", ["/signals/eta"], holding(panels.values("eta"), low=0.0)
+        ),
+        *_convergence(panels, "Change of slowness η̇ [1/frame], and δ"),
+        *panels.lines(f"Change of weights ξ, {POWERS_OF_TEN}", ["/abstraction/log_xi"], xi),
         *panels.lines("Recent variance of the output", ["/signals/variance"]),
     )
-    return rrb.Horizontal(panels.now(), curves, column_shares=[2, 5], name="Abstraction")
+    return rrb.Horizontal(
+        panels.now(panels.of_phi().capitalize()), curves, column_shares=[2, 5], name="Abstraction"
+    )
 
 
 def _gate(panels: Panels) -> rrb.Container:
-    verdict = panels.lanes("Verdict", "/lanes/1_stream", "/lanes/2_learning", "/lanes/3_gate")
+    verdict = panels.lanes("What it learns, and the verdict", f"/{LEARNS}", f"/{MOSTLY}/**")
+    blocks = panels.near_lanes("Verdict on each block", f"/{ATTENDS}", f"/{NOVELTY}")
     threshold = _clusters_below(panels.outline)
     judged = _bands(panels) if threshold is None else _clusters(panels, threshold)
     share = panels.lines("Share of novel blocks", ["/signals/share"], (0.0, 1.05))
-    return rrb.Vertical(verdict, *judged, *share, name="Gate")
+    return stacked(
+        ([verdict], heights(3)), ([blocks], heights(2)), (judged, 150), (share, 110), name="Gate"
+    )
 
 
 def _bands(panels: Panels) -> list[rrb.View]:
@@ -105,58 +119,35 @@ def _clusters_below(outline: Outline) -> float | None:
 
 def _decision(panels: Panels) -> rrb.Container:
     rewards = ["curiosity", "expert", "reward"]
-    lanes = panels.lanes(
-        "Policy in each stream, and what was done",
-        "/policy/**",
-        "/lanes/4_action",
-        "/lanes/5_chosen_by",
-    )
+    streams = len(panels.spec.streams)
+    done = panels.near_lanes("What was done", f"/{ATTENDS}", f"/{DOES}", f"/{EXPLORES}")
     curves = stacked(
-        ([lanes], heights(2 + len(panels.spec.streams))),
-        (panels.lines("Reward R for staying", ["/decision/R_stay/**"]), 130),
-        (panels.lines("Value Q of staying minus switching", ["/decision/advantage/**"]), 130),
+        ([panels.lanes("Policy in each stream", "/policy/**")], heights(streams)),
+        ([done], heights(3)),
+        (panels.lines("Reward R for staying [1/1000]", [R_STAY]), 130),
+        (panels.lines("Q of staying minus switching [1/1000]", ["/decision/advantage/**"]), 130),
         (
             panels.lines(
-                "Rewards", [f"/signals/{name}" for name in rewards], panels.outline.span(*rewards)
+                "Rewards, from least to most",
+                [f"/signals/{name}" for name in rewards],
+                holding(panels.values(*rewards)),
             ),
             130,
         ),
         (panels.lines("Exploration ε", ["/signals/epsilon"], (0.0, 1.25)), 100),
     )
-    heat = rrb.Vertical(
-        _reward(0, "R for staying: from stream (down) to stream (across)"),
-        _reward(1, "R for switching: from stream (down) to stream (across)"),
-        rrb.TensorView(
-            origin="/decision/Q_beside_mean",
-            name="Q less its mean: stream (down), stay and switch (across)",
-            scalar_mapping=HEAT,
-            view_fit=FIT,
-        ),
-    )
-    return rrb.Horizontal(curves, heat, column_shares=[5, 2], name="Decision")
+    table = rrb.TextDocumentView(origin="/decision/table", name="R and Q, every 10 iterations")
+    tables = [table] if "R" in panels.outline.told else []
+    shares = [5, 2][: 1 + len(tables)]
+    return rrb.Horizontal(curves, *tables, column_shares=shares, name="Decision")
 
 
 def _convergence(panels: Panels, name: str) -> list[rrb.View]:
-    """Eta-dot with delta well above the floor, and the saves."""
-    outline = panels.outline
-    span, delta = outline.span("eta_dot", low=0.0), outline.header.delta
-    if span is not None and delta is not None:
-        span = 0.0, min(max(span[1], 2.5 * delta), 8 * delta)
+    """Eta-dot with delta, and the saves."""
+    delta = panels.outline.header.delta
+    also = [math.log10(delta)] if delta else []
     return panels.lines(
-        name, ["/signals/eta_dot", "/abstraction/delta", "/abstraction/saved"], span
-    )
-
-
-def _reward(action: int, name: str) -> rrb.View:
-    selection = rrb.TensorSliceSelection(
-        width=2,
-        height=0,
-        indices=[rr.TensorDimensionIndexSelection(dimension=1, index=action)],
-    )
-    return rrb.TensorView(
-        origin="/signals/R",
-        name=name,
-        scalar_mapping=HEAT,
-        slice_selection=selection,
-        view_fit=FIT,
+        f"{name}, {POWERS_OF_TEN}",
+        ["/abstraction/log_eta_dot", "/abstraction/delta", "/abstraction/saved"],
+        holding(power_of_ten(panels.values("eta_dot")), also=also),
     )

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import rerun.blueprint as rrb
+import math
 
+import numpy as np
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from replay.view.columns import power_of_ten
 from replay.view.labels import label
-from replay.view.layouts.panels import Panels, heights, stacked
+from replay.view.lanes import ATTENDS, MOSTLY
+from replay.view.layouts.panels import Panels
+from replay.view.layouts.plots import heights, holding, stacked
+from replay.view.streams import HARDLY_WATCHED
 
 MOST_WEIGHTS = 3
 """Modules whose weights stand beside one another."""
-
-HARDLY_WATCHED = 1000.0
-"""Interest from which on a stream promises most because it was hardly watched."""
-
-FALL = 10
-"""Times the threshold of a change that its panel shows."""
-
-UNTESTED = 3.0
-"""Learning error that stands for none, before anything was tested."""
 
 
 def progress_layout(panels: Panels) -> rrb.Blueprint:
@@ -26,28 +25,35 @@ def progress_layout(panels: Panels) -> rrb.Blueprint:
 
 
 def _overview(panels: Panels) -> rrb.Container:
+    streams = len(panels.spec.streams)
     lanes = panels.lanes(
-        "What it watches, and what became of each stream", "/lanes/1_stream", "/streams/state/**"
+        "What it mostly attends to, and what became of each stream", f"/{MOSTLY}/**", "/state/**"
     )
     error = panels.lines(
         "How well it knows each stream: learning error, where it was watched",
         ["/streams/learning_error/**", "/streams/threshold", "/streams/saved"],
-        panels.outline.span("learning_error", low=0.0, below=UNTESTED),
+        holding(tested_only(panels, "learning_error"), low=0.0),
     )
-    interest = panels.lines(
-        "What each stream promises: interest; above the panel where it was hardly watched",
+    interest = panels.values("interest")
+    promises = panels.lines(
+        "What each stream promises: interest; no line where it was hardly watched",
         ["/streams/interest/**"],
-        panels.outline.span("interest", low=0.0, below=HARDLY_WATCHED),
+        holding(interest[interest < HARDLY_WATCHED], low=0.0),
     )
     story = stacked(
-        ([lanes], heights(1 + len(panels.spec.streams))),
+        ([lanes], heights(1 + streams)),
         (error, 190),
         (_slowness(panels), 150),
         (panels.looks(), 110),
-        (interest, 110),
+        (promises, 110),
     )
     sees = panels.sees(_looks_for(panels))
     return rrb.Horizontal(sees, story, column_shares=[2, 5], name="Overview")
+
+
+def tested_only(panels: Panels, name: str) -> NDArray[np.float64]:
+    """A signal's values where the candidate was tested: those that are drawn."""
+    return np.where(np.isnan(panels.values("tested")), np.nan, panels.values(name))
 
 
 def _looks_for(panels: Panels) -> rrb.Container | None:
@@ -64,28 +70,31 @@ def _looks_for(panels: Panels) -> rrb.Container | None:
 
 def _slowness(panels: Panels) -> list[rrb.View]:
     return panels.lines(
-        "Slowness on new frames (bright) and on those it learned from (dim) [1/frame]",
+        "Slowness on new frames (bright) and on those it learned from (dim), by stream [1/frame]",
         ["/streams/fitted/**", "/streams/tested/**"],
-        panels.outline.span("tested", "fitted", low=0.0),
+        holding(
+            np.concatenate([tested_only(panels, name) for name in ("tested", "fitted")]), low=0.0
+        ),
+        legend=False,
     )
 
 
 def _candidate(panels: Panels) -> rrb.Container:
     """What is being learned of the streams."""
     outline = panels.outline
-    change, settled = outline.span("change", low=0.0), outline.header.settled
-    if change is not None and settled is not None:
-        change = 0.0, min(max(change[1], 2.5 * settled[0]), FALL * settled[0])
+    settled = outline.header.settled
+    also = [math.log10(settled[0])] if settled else []
+    change = holding(power_of_ten(tested_only(panels, "change")), also=also)
     others = panels.lines("Slowness of each output on new frames [1/frame]", ["/signals/eta"])
     curves = stacked(
-        ([panels.lanes("What it watches", "/lanes/1_stream")], heights(1)),
-        (panels.lines("Output y on new frames", ["/signals/y"]), 130),
+        ([panels.lanes("What it mostly attends to", f"/{MOSTLY}/{ATTENDS}")], heights(1)),
+        (panels.lines("Output y on new frames, from least to most", ["/signals/y"]), 130),
         (_slowness(panels), 130),
         (others if outline.outputs > 1 else [], 130),
         (
             panels.lines(
-                "Change of the output with a block: settled below the line",
-                ["/streams/change/**", "/streams/settled"],
+                "Change of the output with a block, as powers of ten: settled below the line",
+                ["/streams/log_change/**", "/streams/settled"],
                 change,
             ),
             130,
@@ -93,7 +102,7 @@ def _candidate(panels: Panels) -> rrb.Container:
         (panels.lines("Variance of the output on new frames", ["/signals/variance"]), 130),
     )
     return rrb.Horizontal(
-        panels.now("Weights φ of its candidate; white: it has none"),
+        panels.now("Weights φ of its candidate (blue below 0, red above); white: it has none"),
         curves,
         column_shares=[2, 5],
         name="Candidate",

@@ -1,0 +1,225 @@
+"""The view does not mislead: how lines are drawn, what their axes hold, what colours mean."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import re
+from collections import defaultdict
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+from run_data import IMAGE, VECTOR, write_run
+
+from cdmisfa.core.errors import UsageError
+from recorder.recording import record_scene
+from recorder.world.oscillatory import OscillatoryConfig
+from replay.palette import CYCLE, packed
+from replay.runs.outline import read_outline
+from replay.view import lanes
+from replay.view.build import build_view
+from replay.view.layouts.of_run import run_layout
+
+ITERATIONS, TAU = 420, 40
+MIN_MAX = rr.components.AggregationPolicy.MinMax.value
+STEP_AFTER = rr.components.InterpolationMode.StepAfter.value
+
+LEARNERS = {
+    "2.0": {"algorithm": "2.0"},
+    "progress": {"algorithm": "progress", "settled": 0.05, "agreement": 0.25},
+}
+
+
+class Built:
+    """A view as it stands in its file: rows and styles by entity, and its layout."""
+
+    def __init__(self, path):
+        reader = RrdReader(str(path))
+        self.rows, self.static = defaultdict(list), defaultdict(dict)
+        for chunk in reader.stream():
+            batch = chunk.to_record_batch()
+            if not chunk.is_static:
+                self.rows[chunk.entity_path].append(batch)
+                continue
+            for name in batch.schema.names:
+                self.static[chunk.entity_path][name] = batch.column(name).to_pylist()[-1]
+        self.layout = defaultdict(dict)
+        (store,) = reader.blueprints()
+        for chunk in reader.stream(store=store):
+            batch = chunk.to_record_batch()
+            for name in batch.schema.names:
+                if ":" in name:
+                    (value,) = batch.column(name).to_pylist()[-1][:1] or (None,)
+                    many = name in ("ViewContents:query", "ContainerBlueprint:contents")
+                    value = batch.column(name).to_pylist()[-1] if many else value
+                    self.layout[chunk.entity_path][name] = value
+
+    def views(self, kind):
+        """Name, entities, range of time and of values of the views of a class."""
+        found = []
+        for path, parts in list(self.layout.items()):
+            if parts.get("ViewBlueprint:class_identifier") == kind:
+                query = self.layout[f"{path}/ViewContents"]["ViewContents:query"]
+                origin = parts["ViewBlueprint:space_origin"]
+                wanted = [q.replace("$origin", origin).replace("**", "*") for q in query]
+                entities = [e for e in self.rows if any(fnmatch.fnmatchcase(e, w) for w in wanted)]
+                time = self.layout[f"{path}/TimeAxis"].get("TimeAxis:view_range")
+                values = self.layout[f"{path}/ScalarAxis"].get("ScalarAxis:range")
+                legend = self.layout[f"{path}/PlotLegend"].get("PlotLegend:visible")
+                name = parts["ViewBlueprint:display_name"]
+                found.append((name, entities, time, values, legend))
+        return found
+
+    def scalars(self, entity):
+        """All numbers of an entity that are numbers."""
+        batches = [b for b in self.rows[entity] if "Scalars:scalars" in b.schema.names]
+        parts = [np.asarray(b.column("Scalars:scalars").flatten(), float) for b in batches]
+        values = np.concatenate([np.empty(0), *parts])
+        return values[np.isfinite(values)]
+
+    def states(self, entity):
+        """The states of a lane in the order of time, with their frames."""
+        changes = []
+        for batch in self.rows[entity]:
+            states = [state[0] for state in batch.column("StateChange:state").to_pylist()]
+            changes += zip(batch.column("frame").to_pylist(), states, strict=True)
+        return sorted(changes)
+
+
+@pytest.fixture(scope="module", params=LEARNERS)
+def built(request, tmp_path_factory):
+    """The view of a run whose last module is saved in its last iteration."""
+    folder = tmp_path_factory.mktemp("run")
+    records = write_run(
+        *(folder / "run.mcap", IMAGE, ITERATIONS),
+        saves=True,
+        learner=LEARNERS[request.param],
+        edit=lambda record: dataclasses.replace(record, eta=np.abs(record.eta)),
+    )
+    assert (records[-1].saved, len(records[-1].y_frozen)) == (True, 2)
+    build_view(folder, folder / "run.rrd")
+    return Built(folder / "run.rrd"), records, folder
+
+
+def test_no_line_is_a_mean(built):
+    view, *_ = built
+    drawn = [
+        e for e, rows in view.rows.items() if any("Scalars:scalars" in b.schema.names for b in rows)
+    ]
+    assert len(drawn) > 30
+    marks = {e for e in drawn if "SeriesPoints:markers" in view.static[e]}
+    for entity in set(drawn) - marks:
+        assert view.static[entity]["SeriesLines:aggregation_policy"] == [MIN_MAX], entity
+    assert {e.rpartition("/")[2] for e in marks} == {"saved"}
+
+
+def test_a_recording_s_lines_are_no_means_either(tmp_path):
+    record_scene("oscillatory", tmp_path / "r", OscillatoryConfig(), frames=50)
+    build_view(tmp_path / "r", tmp_path / "r.rrd")
+    view = Built(tmp_path / "r.rrd")
+    for entity in ("/views/1_x1", "/world/truth"):
+        assert view.static[entity]["SeriesLines:aggregation_policy"] == [MIN_MAX]
+
+
+def test_axes_hold_what_is_drawn_and_leave_room_for_the_legend(built):
+    view, *_ = built
+    plots, held = view.views("TimeSeries"), 0
+    for name, entities, time, values, legend in plots:
+        assert entities, name
+        if values is not None:
+            drawn = np.concatenate([view.scalars(e) for e in entities])
+            assert values[0] <= drawn.min() <= drawn.max() <= values[1], name
+            held += 1
+        if time is not None and time["start"] == 0:
+            assert time["end"] >= 1.1 * ITERATIONS * TAU, name
+        elif time is not None:  # a window of frames up to the cursor, or up to a save
+            assert time["end"] - time["start"] < 20 * TAU, name
+        assert legend is True or len(entities) == 1 or "slowness" in name.lower(), name
+    assert held >= 4
+    assert sum(time["start"] < 0 < time["end"] for _, _, time, *_ in plots if time) >= 3
+
+
+def test_lanes_have_few_states_and_plain_names(built):
+    view, records, _ = built
+    for name, entities, time, *_ in view.views("StateTimeline"):
+        window = time["end"] - time["start"]
+        for entity in entities:
+            begins = [t for t, _ in view.states(entity)]
+            shown = len(begins) if window > ITERATIONS * TAU else window // TAU + 1
+            random = entity.startswith(("/policy", "/state"))  # real ones do not change each block
+            assert random or shown <= lanes.PIECES * 5 / 4, (name, entity)
+            assert re.fullmatch(r"(/[a-z0-9_]+){1,2}", entity)
+    pieces = view.states("/mostly/attends")
+    blocks = ITERATIONS // lanes.PIECES
+    for k in range(0, ITERATIONS, blocks):
+        own = [IMAGE.streams[s.stream] for s in records[k : k + blocks]]
+        most = max(own, key=own.count)
+        said = [state for t, state in pieces if t <= k * TAU][-1]
+        assert said == (most if own.count(most) >= 2 / 3 * len(own) else "switches")
+
+
+def test_a_colour_means_one_thing(built):
+    """A full colour is a stream's, whatever is told of it; no state and no line shares it."""
+    view, *_ = built
+    meaning = defaultdict(set)
+    for entity, parts in view.static.items():
+        names = parts.get("StateConfiguration:values", [])
+        for state, rgb in zip(names, parts.get("StateConfiguration:colors", []), strict=True):
+            own = [s for s in IMAGE.streams if state == "stay" and entity.endswith(f"_{s}")]
+            stream = own or [s for s in IMAGE.streams if s in state.split()]
+            kind = stream[0] if stream else state.partition(" ")[0]
+            meaning[rgb].add("mixed" if kind in ("switches", "both", "switch") else kind)
+        for rgb in parts.get("SeriesLines:colors", []):
+            named = [s for s in IMAGE.streams if s in " ".join(parts["SeriesLines:names"])]
+            assert named or "/signals/" in entity or rgb not in map(packed, CYCLE), entity
+    assert len(meaning) > 5
+    assert {rgb: kinds for rgb, kinds in meaning.items() if len(kinds) > 1} == {}
+    assert [meaning[packed(rgb)] for rgb in CYCLE[:3]] == [{name} for name in IMAGE.streams]
+
+
+def test_every_module_is_shown_also_the_last(built):
+    view, records, _ = built
+    outputs = {name: found for name, found, *_ in view.views("TimeSeries") if "Output of m" in name}
+    last = IMAGE.streams[records[-1].stream]
+    assert {name.partition(" (")[0] for name in outputs} == {
+        f"Output of module {i}" for i in (1, 2, 3)
+    }
+    (ending,) = [name for name in outputs if "module 3" in name]
+    assert ending == f"Output of module 3 ({last}): the last 300 frames until it was saved"
+    assert outputs[ending] == ["/signals/y"]
+
+
+def test_many_modules_stand_on_pages(tmp_path):
+    def eight(record):
+        shape = (8, *record.y.shape)
+        return dataclasses.replace(record, y_frozen=np.zeros(shape))
+
+    write_run(tmp_path / "run.mcap", VECTOR, 3)
+    outline = dataclasses.replace(read_outline(tmp_path), modules=8)
+    layout = run_layout(outline, tab="modules")
+    tabs = layout.root_container.contents
+    (modules,) = [tab for tab in tabs if tab.name == "Modules"]
+    assert [page.name for page in modules.contents] == ["1 to 6", "7 to 8", "Events"]
+    assert layout.root_container.active_tab == tabs.index(modules)
+    with pytest.raises(UsageError, match=r"no tab 'nowhere': there are Overview, .*Table"):
+        run_layout(outline, tab="nowhere")
+
+
+def test_a_run_is_played_in_a_minute(built):
+    view, *_ = built
+    fps = view.layout["/time_panel"]["TimePanelBlueprint:fps"]
+    assert 55 < ITERATIONS * TAU / fps < 65
+
+
+def test_the_picture_has_the_name_of_its_stream(built):
+    view, records, _ = built
+    named = {}
+    for batch in view.rows["/world/watched/name"]:
+        labels = [text for (text,) in batch.column("Boxes2D:labels").to_pylist()]
+        named |= zip(batch.column("frame").to_pylist(), labels, strict=True)
+    stream = None
+    for record in records:
+        stream = named.get(record.t, stream)
+        assert stream == IMAGE.streams[record.stream]
