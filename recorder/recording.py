@@ -18,12 +18,24 @@ from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
 from recorder.log.begun import Begun, keep_recording, read_recording
-from recorder.log.folder import folder_here, prepared_folder, refuse_existing, view_logs
-from recorder.log.resume import FramesHeld, frames_held, resume_view, set_log_aside
+from recorder.log.folder import (
+    folder_here,
+    holds_recording,
+    prepared_folder,
+    refuse_existing,
+    view_logs,
+)
+from recorder.log.resume import (
+    FramesHeld,
+    frames_held,
+    other_recordings,
+    resume_view,
+    set_log_aside,
+)
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewParts
-from recorder.log.whole import whole
+from recorder.log.whole import refuse_taken, whole
 from recorder.world.rendering import render_in_processes, take_here
 from recorder.world.scenes import SCENES, OpenScene, open_scene, scene_of
 
@@ -131,6 +143,8 @@ def record(
         raise UsageError("--force starts anew and --resume goes on: use one of them")
     if not resume:
         refuse_existing(folder, force=force)
+    elif not holds_recording(folder):
+        raise UsageError(f"{folder} holds no recording to go on with: choose another folder")
     identity = _identity(source, names, settings, scene)
     streams = identity.spec.streams
     for view in views or ():
@@ -139,7 +153,8 @@ def record(
             raise UsageError(f"no view {view!r}: the {what} has {', '.join(streams)}")
     chosen = [name for name in streams if not views or name in views]
     with ExitStack() as open_logs:
-        open_logs.enter_context(prepared_folder(folder, chosen if force else ()))
+        stale = other_recordings(folder, identity) if force else []
+        open_logs.enter_context(prepared_folder(folder, chosen if force else (), stale))
         earlier: Earlier = {view: {} for view in chosen}
         if resume:
             earlier, split, frames = _as_begun(folder, identity, chosen, split, frames)
@@ -148,6 +163,8 @@ def record(
             view: resume_view(folder, view, identity, split, there, frames)
             for view, there in earlier.items()
         }
+        if resume and (others := other_recordings(folder, identity)):
+            raise UsageError(f"{others[0]} is of another recording: choose another folder")
         unfinished = [view for view, place in places.items() if not place.complete]
         if unfinished:
             lengths = dict.fromkeys(unfinished, frames)
@@ -334,8 +351,7 @@ def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = Fa
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise UsageError(f"{path}: the picture is a PNG, name it .png")
-    if path.is_dir() or (path.exists() and not force):
-        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+    refuse_taken(path, force=force)
     image = draw(config)
     with whole(path) as partial:
         image.save(partial, format="PNG", optimize=True)

@@ -148,6 +148,12 @@ class FullDisk:
     def tell(self) -> int:
         return self.file.tell()
 
+    def seek(self, offset: int) -> int:
+        return self.file.seek(offset)
+
+    def truncate(self) -> int:
+        return self.file.truncate()
+
     def flush(self) -> None:
         pass
 
@@ -182,7 +188,8 @@ def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch):
     assert not log.path.exists()
 
 
-def test_a_real_full_device_is_an_error_not_a_loss(tmp_path):
+def test_a_real_full_device_is_an_error_not_a_loss(tmp_path, monkeypatch):
+    monkeypatch.setattr("recorder.log.logfile.refuse_special", lambda _: None)
     (tmp_path / "a.mcap.partial").symlink_to("/dev/full")
     log = LogFile(tmp_path / "a.mcap", force=True)
     with pytest.raises(LogWriteError, match="No space left"):

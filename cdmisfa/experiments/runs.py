@@ -37,8 +37,8 @@ from cdmisfa.experiments.resume import (
     set_aside,
 )
 from cdmisfa.features.incsfa import strict
-from recorder.log.folder import folder_here, held, refuse_existing
-from recorder.log.whole import make_folder
+from recorder.log.folder import folder_here, held, logs_in, refuse_existing
+from recorder.log.whole import make_folder, partial_path, refuse_special
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -272,12 +272,16 @@ def _run_log(
         except OSError as error:
             raise _no_folder(out, error) from error
     with held(out):
+        own = (RUN_FILE, partial_path(out / RUN_FILE).name, SET_ASIDE)
+        if others := [path for path in logs_in(out) if path.name not in own]:
+            raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [out / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE)]
         if resume:
             set_aside(out, spec, manifest)
         else:
             stale += [out / RUN_FILE, out / SET_ASIDE, *checkpoints(out)]
         try:
+            refuse_special(*stale)
             for path in stale:
                 path.unlink(missing_ok=True)
         except OSError as error:

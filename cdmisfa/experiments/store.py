@@ -20,7 +20,7 @@ from typing import Any, Protocol, TypeVar
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from recorder.log.folder import held
-from recorder.log.whole import make_folder, to_disk
+from recorder.log.whole import make_folder, refuse_special, to_disk
 
 ROWS = "rows.jsonl"
 """The rows, in a folder."""
@@ -209,6 +209,7 @@ def run_trials(
         UsageError: another process holds the folder, or there is no such engine.
         EngineError: no scheduler answers.
     """
+    refuse_special(folder)
     with contextlib.closing(TrialStore(folder)) as store:
         missing = [t for t in trials if store.needs_computing(t.id, t.log, retry=retry_failed)]
         begin(missing)

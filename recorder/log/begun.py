@@ -23,13 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.log.folder import RECORDING
 from recorder.log.whole import to_disk, whole
-
-RECORDING = "recording.json"
-"""File that says how a recording was begun; gone when every view is finished.
-
-Beside the logs, because these hold the same bytes whatever length was wanted first.
-"""
 
 
 @dataclass(frozen=True, slots=True)

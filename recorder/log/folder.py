@@ -10,7 +10,15 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.log.whole import make_folder
+from recorder.log.whole import make_folder, refuse_special
+
+RECORDING = "recording.json"
+"""File that says how a recording was begun; gone when every view is finished.
+
+Beside the logs, because these hold the same bytes whatever length was wanted first.
+"""
+
+_LOG = re.compile(r".+\.mcap(\.partial(\.kept)?)?")
 
 
 @contextlib.contextmanager
@@ -61,9 +69,15 @@ def part_number(path: Path, view: str) -> int | None:
 
 
 def view_logs(folder: Path, view: str) -> list[Path]:
-    """Files of a view in a folder, finished or not."""
+    """Files of a view in a folder, finished or not.
+
+    Raises:
+        UsageError: one is no file but a device or a pipe.
+    """
     pattern = re.compile(rf"{re.escape(view)}(-\d{{3,}})?\.mcap(\.partial(\.kept)?)?")
-    return sorted(p for p in folder.iterdir() if pattern.fullmatch(p.name))
+    found = sorted(p for p in folder.iterdir() if pattern.fullmatch(p.name))
+    refuse_special(*found)
+    return found
 
 
 def refuse_existing(folder: Path, *, force: bool) -> None:
@@ -72,26 +86,49 @@ def refuse_existing(folder: Path, *, force: bool) -> None:
     Raises:
         UsageError: the folder is not empty, or no folder, and `force` is not set.
     """
+    refuse_special(folder)
     if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(
             f"{folder} exists: choose another folder, go on with --resume or overwrite with --force"
         )
 
 
+def holds_recording(folder: Path) -> bool:
+    """Whether a folder holds what may be of a recording, or nothing yet."""
+    there = list(folder.iterdir()) if folder.is_dir() else []
+    return not there or any(
+        _LOG.fullmatch(path.name) or path.name.startswith(RECORDING) for path in there
+    )
+
+
+def logs_in(folder: Path) -> list[Path]:
+    """The logs in a folder, finished or not."""
+    return sorted(p for p in folder.glob("*.mcap*") if _LOG.fullmatch(p.name) and p.is_file())
+
+
 @contextlib.contextmanager
-def prepared_folder(folder: Path, views: Sequence[str]) -> Iterator[None]:
+def prepared_folder(
+    folder: Path, views: Sequence[str], stale: Sequence[Path] = ()
+) -> Iterator[None]:
     """Make and hold a recording's folder, and remove what it has of some views.
 
+    Args:
+        folder: of the recording.
+        views: whose files are removed.
+        stale: files of other recordings to be removed, with how they were begun.
+
     Raises:
-        UsageError: another process holds it.
+        UsageError: another process holds it, or one of these is no file.
         LogWriteError: it cannot be made, or they cannot be removed.
     """
     with contextlib.ExitStack() as stack:
         try:
             make_folder(folder)
             stack.enter_context(held(folder))
-            for old in (path for view in views for path in view_logs(folder, view)):
-                old.unlink()
+            old = {*stale, *(path for view in views for path in view_logs(folder, view))}
+            old |= {folder / RECORDING} if stale else set()
+            for path in sorted(old):
+                path.unlink(missing_ok=True)
         except OSError as error:
             raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error
         yield

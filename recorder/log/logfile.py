@@ -8,18 +8,19 @@ signal, kill -9, a full disk; after a power cut up to the last `sync`.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import math
 import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
-from recorder.log.whole import partial_path, to_disk
+from recorder.log.whole import partial_path, refuse_special, refuse_taken, to_disk
 
 FLUSH_NS = 1_000_000_000
 """Log time after which the chunk in progress is handed to the operating system, by default.
@@ -66,7 +67,8 @@ class LogFile:
                 too; None leaves that to the operating system until the end. The bytes are the same.
 
         Raises:
-            UsageError: the file or its partial exists and `force` is not set.
+            UsageError: the file or its partial exists and `force` is not set, another process
+                writes it, or it is no file.
             LogWriteError: the file cannot be opened.
         """
         self.path = Path(path)
@@ -78,14 +80,14 @@ class LogFile:
         self._next_sync = time.monotonic() + self._fsync_every
         self._named_on_disk = False
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        if self.path.exists() and not force:
-            raise UsageError(f"{self.path} exists: choose another name or overwrite with --force")
+        refuse_taken(self.path, force=force)
+        refuse_special(self.partial)
         if self.partial.exists() and not force:
             raise UsageError(
                 f"{self.partial} is left from a writing that was cut short: "
                 "recover or remove it, or overwrite with --force"
             )
-        self._stream = _LatchedStream(self.partial, "wb" if force else "xb")
+        self._stream = _LatchedStream(self.partial)
         self._writer = Writer(
             self._stream,  # type: ignore[arg-type]
             chunk_size=chunk_size,
@@ -240,13 +242,40 @@ class _LatchedStream:
     The MCAP writer would go on after a failed write, and the log would have a hole in it.
     """
 
-    def __init__(self, path: Path, mode: Literal["wb", "xb"]) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
         self._error: OSError | None = None
         try:
-            self._file = open(path, mode)  # noqa: SIM115 - open until `close`
+            self._file = open(path, "ab")  # noqa: SIM115 - open until `close`
+            try:
+                self._hold()
+                self._file.seek(0)
+                if self._stat().st_size:
+                    self._file.truncate()
+            except BaseException:
+                self._file.close()
+                raise
         except OSError as error:
             raise _write_error(path, error) from error
+
+    def _hold(self) -> None:
+        """Keep other processes from writing the file, until it is closed, too."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if not isinstance(error, BlockingIOError):
+                return  # a file system without locks: nothing can be held there
+            raise self._in_use() from error
+        if not (self._path.exists() and os.path.samestat(os.stat(self._path), self._stat())):
+            raise self._in_use()
+
+    def _stat(self) -> os.stat_result:
+        return os.fstat(self._file.fileno())
+
+    def _in_use(self) -> UsageError:
+        return UsageError(
+            f"{self._path} is being written by another process: wait for it, or choose another name"
+        )
 
     @property
     def closed(self) -> bool:

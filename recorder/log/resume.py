@@ -11,7 +11,7 @@ import contextlib
 import os
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
-from recorder.log.folder import part_name, part_number
+from recorder.log.folder import logs_in, part_name, part_number
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity, ViewFacts
@@ -157,6 +157,29 @@ def resume_view(
             "part first, or overwrite with --force"
         )
     return place
+
+
+def other_recordings(folder: Path, identity: Identity) -> list[Path]:
+    """Logs in a folder that are of another recording.
+
+    Raises:
+        UsageError: one is readably of something else.
+    """
+    others = []
+    for path in logs_in(folder) if folder.is_dir() else ():
+        record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
+        if record is None:
+            continue
+        if record.name != RECORDING_METADATA:
+            raise UsageError(f"{path} is of no recording: choose another folder")
+        view = record.metadata.get("view", "")
+        facts = identity.facts(view) if view in identity.spec.streams else None
+        mine = {} if facts is None else replace(facts, first_frame=0, versions={}).as_metadata()
+        if not mine or any(
+            record.metadata.get(k) != v for k, v in mine.items() if k != "first_frame"
+        ):
+            others.append(path)
+    return others
 
 
 def set_log_aside(place: Resume) -> Path | None:

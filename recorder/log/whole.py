@@ -1,6 +1,8 @@
 """Files and folders that are there in whole, or not at all.
 
-What is being written is called NAME.partial until it is complete, so a NAME is always whole.
+What is being written has a name of its own until it is complete, so a NAME is always whole. A log
+is called NAME.partial, for it is readable; anything else NAME.<process>.partial, so that two
+processes never write one file.
 """
 
 from __future__ import annotations
@@ -8,18 +10,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from cdmisfa.core.errors import LogWriteError
+from cdmisfa.core.errors import LogWriteError, UsageError
 
 PARTIAL = ".partial"
 """Ending of what is being written, or whose writing was cut short."""
 
 
 def partial_path(path: Path) -> Path:
-    """Where something is written until it is complete."""
+    """Where a log is written until it is complete."""
     return path.with_name(path.name + PARTIAL)
 
 
@@ -46,6 +50,34 @@ def make_folder(folder: Path) -> None:
         to_disk(made.parent)
 
 
+def refuse_taken(path: Path, *, force: bool) -> None:
+    """Refuse to write a file where something is; with `force`, where something else is than a file.
+
+    Raises:
+        UsageError: so it is.
+    """
+    refuse_special(path)
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder: name the file to write")
+    if path.exists() and not force:
+        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+
+
+def refuse_special(*paths: Path) -> None:
+    """Refuse to replace what is no file or folder, as a device, a pipe or a link to one.
+
+    Raises:
+        UsageError: one is.
+    """
+    for path in paths:
+        try:
+            mode = os.stat(path).st_mode
+        except OSError:
+            continue
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise UsageError(f"{path} is no file but a device, pipe or socket: choose another name")
+
+
 @contextlib.contextmanager
 def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
     """A path to write a file or a folder at, which takes its own name once it is complete.
@@ -59,13 +91,17 @@ def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
             a power cut leaves this file or the one before.
 
     Yields:
-        NAME.partial, which does not exist.
+        A path that does not exist.
 
     Raises:
+        UsageError: that name is a device's, or that of something else that is no file.
         LogWriteError: it cannot be written.
     """
-    partial = partial_path(path)
+    refuse_special(path)
+    partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
+        for left in _left(path):
+            _remove(left)
         _remove(partial)
         make_folder(partial.parent)
         yield partial
@@ -81,6 +117,24 @@ def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             _remove(partial)
+
+
+def _left(path: Path) -> Iterator[Path]:
+    """What processes left of a name that are not there any more."""
+    name = re.compile(rf"{re.escape(path.name)}\.(\d+){re.escape(PARTIAL)}")
+    for other in path.parent.iterdir() if path.parent.is_dir() else ():
+        if (found := name.fullmatch(other.name)) and not _lives(int(found[1])):
+            yield other
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def _remove(path: Path) -> None:

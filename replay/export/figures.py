@@ -15,9 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import STATES
-from recorder.log.whole import whole
+from recorder.log.whole import refuse_taken, whole
 from replay.export.history import History, read_history
 from replay.palette import CYCLE, GREY, VERMILLION, Rgb, colour
 from replay.palette import STATES as STATE_COLOURS
@@ -65,8 +64,7 @@ def draw_figures(path: Path, out: Path | None = None, *, force: bool = False) ->
     for name, draw in FIGURES.items():
         targets = [folder / f"{name}{ending}" for ending in (".png", ".svg")]
         for target in targets:
-            if target.exists() and not force:
-                raise UsageError(f"{target} exists: choose another folder or say --force")
+            refuse_taken(target, force=force)
         with matplotlib.rc_context(STYLE):
             if (figure := draw(history)) is not None:
                 for target in targets:

@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from recorder.log.whole import whole
+from recorder.log.whole import refuse_special, whole
 from replay.export.images import write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
@@ -49,6 +49,7 @@ def export(path: Path, out: Path, form: str, *, force: bool = False, lossless: b
         raise UsageError(f"{form} loses nothing: --lossless is for mp4 and lerobot")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    refuse_special(out)
     if form in RECORDINGS:
         return _export_recording(path, out, form, lossless)
     if out.is_dir():

@@ -21,9 +21,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS, Signal
-from recorder.log.whole import whole
+from recorder.log.whole import refuse_taken, whole
 from replay.runs.columns import joined, padded
 from replay.runs.log import RunHeader, read_header
 from replay.runs.stretches import read_columns
@@ -47,8 +46,8 @@ def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> i
         LogWriteError: the file cannot be written.
     """
     header, notes = read_header(run), out.with_name(f"{out.name}-metadata.json")
-    if form == "csv" and notes.exists() and not force:
-        raise UsageError(f"{notes} exists: choose another name or overwrite with --force")
+    if form == "csv":
+        refuse_taken(notes, force=force)
     with whole(out) as partial:
         if form != "csv":
             return _WRITERS[form](run, header, partial)

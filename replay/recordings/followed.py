@@ -76,7 +76,7 @@ class FollowedSource(ClockedSource):
     @property
     def finished(self) -> bool:
         """Whether the recorder has finished every file."""
-        return any(self._path.glob("*.mcap")) and not any(self._path.glob(f"*{PARTIAL}*"))
+        return any(self._path.glob("*.mcap")) and not any(self._path.glob(f"*.mcap{PARTIAL}*"))
 
     @property
     def taken(self) -> str:

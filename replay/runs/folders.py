@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.log.whole import PARTIAL, partial_path
+from recorder.log.whole import partial_path
 from replay.mcap.reader import LogReader
 
 RUN_FILE = "run.mcap"
@@ -86,7 +86,7 @@ def runs_in(folder: Path) -> list[Path]:
     trials = list((folder / "trials").glob("*"))
     if is_sweep(folder):
         wanted = _requested(folder / REQUEST)
-        trials = [trial for trial in trials if trial.name.removesuffix(PARTIAL) in wanted]
+        trials = [trial for trial in trials if trial.name.partition(".")[0] in wanted]
     return sorted(p for p in (*folder.iterdir(), *trials) if p.is_dir() and is_run(p))
 
 

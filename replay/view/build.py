@@ -14,7 +14,7 @@ import rerun as rr
 from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import whole
+from recorder.log.whole import refuse_taken, whole
 from replay.runs.folders import MODULES_FILE, is_run, run_log
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules
@@ -98,8 +98,7 @@ def recording_to(
         UsageError: it exists and `force` is not set, or its folder is not there.
         CdmisfaError: the file cannot be written.
     """
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    refuse_taken(out, force=force)
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
     recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))

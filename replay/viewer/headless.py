@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import whole
+from recorder.log.whole import refuse_taken, whole
 from replay.recordings.source import RecordedSource
 from replay.runs.folders import is_run
 from replay.runs.stretches import read_columns
@@ -52,8 +52,7 @@ def screenshot(
         UsageError: `out` exists and `force` is not set, or there is no frame `at`.
         CdmisfaError: no driver, or the viewer failed.
     """
-    if out.exists() and not force:
-        raise UsageError(f"{out} exists: choose another name or overwrite with --force")
+    refuse_taken(out, force=force)
     if at is not None and path.suffix != ".rrd" and at > (last := _last_frame(path)):
         raise UsageError(f"--at {at}: there is no such frame, the last of {path} is {last}")
     if missing_driver():

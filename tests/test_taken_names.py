@@ -1,0 +1,178 @@
+"""What is written takes only names that are free, a file's, or its own kind's."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+from test_cli import assert_one_line
+
+from cdmisfa.core.errors import UsageError
+from cdmisfa.experiments.documents import write_json
+from recorder.log.logfile import LogFile
+from recorder.log.whole import whole
+from recorder.recording import record_scene
+from recorder.world.oscillatory import OscillatoryConfig
+
+
+def _socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(path))
+
+
+SPECIAL: dict[str, Callable[[Path], None]] = {
+    "link to a device": lambda path: path.symlink_to("/dev/null"),
+    "pipe": os.mkfifo,
+    "socket": _socket,
+}
+
+
+def looks(path: Path) -> tuple[int, int]:
+    return os.lstat(path).st_mode, os.lstat(path).st_ino
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, oscillatory_run: Path) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("made")
+    record_scene("oscillatory", folder / "rec", frames=60)
+    return {"rec": folder / "rec", "run": oscillatory_run}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "export RUN -o OUT.csv",
+        "export RUN -o OUT --to npz",
+        "export REC -o OUT --to images",
+        "view RUN --save OUT.rrd",
+        "view RUN --screenshot OUT.png",
+        "recover REC/x1.mcap -o OUT.mcap",
+        "record icub --scene-picture OUT.png",
+        "record oscillatory --frames 20 -o OUT",
+        "learn oscillatory --no-rerun --max-iterations 2 -o OUT",
+        "sweep oscillatory --seeds 1 --max-iterations 2 -o OUT",
+        "compare RUN RUN --save OUT.rrd",
+    ],
+)
+@pytest.mark.parametrize("kind", SPECIAL)
+def test_force_replaces_files_only(
+    cdmisfa: Cdmisfa, made: dict[str, Path], tmp_path: Path, words: str, kind: str
+) -> None:
+    out = next(word for word in words.split() if word.startswith("OUT"))
+    SPECIAL[kind](tmp_path / out)
+    before = looks(tmp_path / out)
+    places = {"RUN": str(made["run"]), "REC": str(made["rec"]), "OUT": str(tmp_path / "OUT")}
+    for name, place in places.items():
+        words = words.replace(name, place)
+    force = () if words.startswith("sweep") else ("--force",)
+    assert_one_line(cdmisfa(*words.split(), *force), 2, "is no file but a device")
+    assert looks(tmp_path / out) == before
+    assert os.listdir(tmp_path) == [out]
+
+
+@pytest.mark.parametrize("kind", SPECIAL)
+@pytest.mark.parametrize(
+    "name", ["run.json", "run.mcap", "modules.npz", "x1.mcap", "x1.mcap.partial"]
+)
+def test_force_replaces_files_only_in_folders(
+    cdmisfa: Cdmisfa, tmp_path: Path, name: str, kind: str
+) -> None:
+    SPECIAL[kind](tmp_path / name)
+    before = looks(tmp_path / name)
+    command = "record" if name.startswith("x1") else "learn"
+    limits = {"record": "--frames 20", "learn": "--no-rerun --max-iterations 2"}[command]
+    words = (command, "oscillatory", *limits.split(), "-o", tmp_path, "--force")
+    assert_one_line(cdmisfa(*words), 2, str(tmp_path / name))
+    assert looks(tmp_path / name) == before
+
+
+OVERLAP = """
+import sys
+from pathlib import Path
+from recorder.log.whole import whole
+with whole(Path(sys.argv[1])) as partial:
+    partial.write_text(sys.argv[2])
+    print(flush=True)
+    input()
+"""
+
+
+def test_two_processes_write_one_name(tmp_path: Path) -> None:
+    """Each has a file of its own until it is whole, and the one that ends last stands."""
+    path = tmp_path / "a.csv"
+
+    def writer(text: str) -> subprocess.Popen[str]:
+        words = [sys.executable, "-c", OVERLAP, str(path), text]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        process = subprocess.Popen(words, text=True, **pipes)  # type: ignore[call-overload]
+        assert process.stdout.readline()
+        return process  # type: ignore[no-any-return]
+
+    writers = [writer("one"), writer("two")]
+    for process in writers:
+        process.communicate("\n")
+        assert process.returncode == 0
+    assert path.read_text() == "two"
+    killed = writer("three")
+    killed.kill()
+    killed.communicate()
+    assert len(list(tmp_path.iterdir())) == 2
+    write_json(path, {})
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_two_logs_of_one_name_are_not_mixed(tmp_path: Path, force: bool) -> None:
+    with LogFile(tmp_path / "a.mcap") as log:
+        log.flush()
+        with pytest.raises(UsageError, match=r"a\.mcap\.partial"):
+            LogFile(tmp_path / "a.mcap", force=force)
+        assert log.partial.stat().st_size > 0
+    assert (tmp_path / "a.mcap").exists()
+
+
+def test_on_an_error_nothing_is_left(tmp_path: Path) -> None:
+    def write() -> None:
+        with whole(tmp_path / "a") as partial:
+            partial.mkdir()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        write()
+    assert not list(tmp_path.iterdir())
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_force_leaves_nothing_of_another_recording(tmp_path: Path) -> None:
+    made = tmp_path / "a"
+    record_scene("oscillatory", made, frames=60)
+    (made / "x9.mcap").write_bytes((made / "x3.mcap").read_bytes())
+    (made / "x3.mcap").rename(made / "x3.mcap.partial")
+    (made / "notes.mcap").write_text("mine")
+    other = OscillatoryConfig(seed=3)
+    record_scene("oscillatory", made, other, frames=60, views=["x1"], force=True)
+    assert names(made) == {"x1.mcap", "notes.mcap"}
+
+
+def test_a_run_and_a_recording_do_not_share_a_folder(
+    cdmisfa: Cdmisfa, made: dict[str, Path], tmp_path: Path
+) -> None:
+    before = names(made["rec"]), names(made["run"])
+    learn = ("learn", "oscillatory", "--no-rerun", "--max-iterations", 2, "-o", made["rec"])
+    assert_one_line(cdmisfa(*learn, "--force"), 2, "x1.mcap is of no run")
+    record = ("record", "oscillatory", "--frames", 20, "-o")
+    for word in ("--force", "--resume"):
+        assert_one_line(cdmisfa(*record, made["run"], word), 2, "run.mcap is of no recording")
+    assert (names(made["rec"]), names(made["run"])) == before
+    (tmp_path / "letter.txt").write_text("mine")
+    assert_one_line(cdmisfa(*record, tmp_path, "--resume"), 2, "holds no recording to go on with")
+    assert names(tmp_path) == {"letter.txt"}
