@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa, Outcome
+from run_data import VECTOR, write_run
 
 SHORT = ("--max-iterations", "5", "--json")
 
@@ -234,6 +235,14 @@ class TestRuns:
         figures = cdmisfa("plot", oscillatory_run, "-o", tmp_path / "f", "--json").json["figures"]
         assert sorted(figures) == sorted(str(file) for file in (tmp_path / "f").iterdir())
         assert {Path(file).suffix for file in figures} == {".png", ".svg"}
+
+    def test_plot_says_when_there_is_nothing_to_draw(
+        self, cdmisfa: Cdmisfa, tmp_path: Path
+    ) -> None:
+        write_run(tmp_path / "run.mcap", VECTOR, 0)
+        done = cdmisfa("plot", tmp_path, "-o", tmp_path / "f")
+        assert (done.code, done.out) == (0, "")
+        assert done.err == f"nothing is drawn of {tmp_path}: it has no iterations\n"
 
     def test_end_of_a_recording_is_an_error_that_keeps_the_run(
         self, cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path

@@ -11,7 +11,7 @@ from run_data import IMAGE, VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
 from replay.export import figures
-from replay.export.figures import decision, draw_figures, modules, polynomial_fit, streams
+from replay.export.figures import decision, draw_figures, modules, streams
 from replay.export.history import Output, read_history
 
 
@@ -78,23 +78,48 @@ def test_policy_is_drawn_where_it_stays(tmp_path):
     assert len(records) == 30
 
 
+def output_of(y, *truth):
+    return Output(1, 0, np.arange(len(y)), y, np.column_stack(truth))
+
+
 def test_an_output_finds_the_truth_it_follows():
     rng = np.random.default_rng(0)
     truth = rng.standard_normal((500, 3))
     y = -2 * truth[:, 1] + 0.01 * rng.standard_normal(500)
-    output = Output(1, 0, np.arange(500), y, np.column_stack([truth, np.ones(500)]))
-    column, correlation = output.best_truth()
-    assert column == 1
-    assert correlation < -0.99
+    found = output_of(y, truth, np.ones(500)).follows(("a", "b", "c", "constant"))
+    assert (found.column, found.function) == (1, "b")
+    assert found.r > 0.99
+    np.testing.assert_allclose(found(truth[:, 1]), -2 * truth[:, 1], atol=0.01)
+    assert output_of(y, np.ones(500)).follows(("constant",)) is None
 
 
-def test_the_fit_finds_a_cubic_and_survives_two_places():
-    x = np.linspace(-1, 1, 50)
-    fit = polynomial_fit(x, 1 + x - 2 * x**3)
-    np.testing.assert_allclose(fit(x), 1 + x - 2 * x**3, atol=1e-9)
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (lambda x: 2 - x, "angle"),
+        (lambda x: (x - 3) ** 2, "a parabola of angle"),
+        (lambda x: np.sin(x - 1), "sin(angle + c)"),
+        (lambda x: 3 * np.sin(4 * x - np.pi / 4) + 1, "sin(4 angle + c)"),
+    ],
+)
+def test_the_simplest_function_of_a_truth_is_named(function, said):
+    """The oscillatory streams' slow features are sines of a phase, which itself they follow not."""
+    phase = 2 * np.pi * np.arange(1000) / 500 % (2 * np.pi)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(1000)
+    found = output_of(function(phase) + noise, phase).follows(("angle",))
+    assert found.function == said
+    assert found.r > 0.99
+    np.testing.assert_allclose(found(phase), function(phase), atol=0.05)
+
+
+def test_no_phase_is_seen_in_what_does_not_go_round():
+    x = np.linspace(0.4, 0.6, 500)
+    found = output_of(np.sin(200 * x), x).follows(("box_y",))
+    assert found.function in ("box_y", "a parabola of box_y")
     places = np.array([0.4, 0.6, 0.4, 0.6])
-    fit = polynomial_fit(places, np.array([1.0, 3.0, 1.0, 3.0]))
-    np.testing.assert_allclose(fit(np.array([0.4, 0.6])), [1.0, 3.0])
+    found = output_of(np.array([1.0, 3.0, 1.0, 3.0]), places).follows(("box_y",))
+    assert found.function == "box_y"
+    np.testing.assert_allclose(found(np.array([0.4, 0.6])), [1.0, 3.0])
 
 
 def by_progress(signals):

@@ -231,12 +231,12 @@ def draw(trials: Sequence[Trial], folder: Path) -> list[Path]:
             continue
         y, truth = one.arrays[f"y{i + 1}"], one.arrays[f"truth{i + 1}"]
         axes[i, 0].plot(y, color=panels.COLOURS[0], linewidth=0.8)
-        panels.label(axes[i, 0], "f", "frame", f"y, module {i + 1}")
+        panels.label(axes[i, 0], f"f{2 * i + 1}", "frame", f"y, module {i + 1}")
         axes[i, 1].plot(truth, y, ".", color=panels.COLOURS[0], markersize=3)
         x = np.linspace(truth.min(), truth.max(), 100)
         degree = min(3, len(np.unique(np.round(truth, 6))) - 1)
         if degree > 0:
             axes[i, 1].plot(x, np.polynomial.Polynomial.fit(truth, y, degree)(x), color="red")
-        panels.label(axes[i, 1], "f", f"{name}, m", f"y, module {i + 1}")
+        panels.label(axes[i, 1], f"f{2 * i + 2}", f"{name}, m", f"y, module {i + 1}")
         axes[i, 1].locator_params(axis="x", nbins=5)
     return paths + panels.save(outputs, folder, "icub-outputs")

@@ -156,7 +156,7 @@ def policies(axes: Axes, trials: Sequence[Trial], letter: str, y: str) -> None:
 def stay_to_switch(axes: Axes) -> None:
     """Name the two ends of a policy's axis."""
     axes.set_ylim(-0.07, 1.07)
-    axes.set_yticks([0, 0.5, 1], ["stay", "0.5", "switch"])
+    axes.set_yticks([0, 1], ["stay", "switch"])
 
 
 def policy_bars(axes: Axes, policies: Sequence[NDArray[Any]], letter: str, title: str) -> None:

@@ -223,7 +223,7 @@ def modules(history: History) -> Figure | None:
     if not history.outputs:
         return None
     spec = history.outline.header.spec
-    best = [output.best_truth() for output in history.outputs]
+    best = [output.follows(spec.truth) for output in history.outputs]
     ratios = (2, 1) if any(best) else (1,)  # one column where the world tells nothing
     figure = Figure(figsize=(INCHES, 1.7 * len(history.outputs)), layout="constrained")
     grid = figure.subplots(len(best), len(ratios), squeeze=False, width_ratios=ratios)
@@ -236,15 +236,14 @@ def modules(history: History) -> Figure | None:
             for against in row[1:]:
                 against.set_axis_off()
             continue
-        (column, correlation), against = found, row[1]
-        truth = output.truth[:, column]
+        against, truth = row[1], output.truth[:, found.column]
         step = max(len(truth) // MOST_POINTS, 1)
         against.plot(truth[::step], output.y[::step], ".", color=shade, markersize=2, alpha=0.4)
-        if abs(correlation) >= FOLLOWS:
-            line = np.linspace(truth.min(), truth.max(), 100)
-            against.plot(line, polynomial_fit(truth, output.y)(line), color="black")
-        against.set_xlabel(spec.truth[column])
-        against.set_title(f"|r| = {abs(correlation):.2f}", fontsize=8)
+        if found.r >= FOLLOWS:
+            line = np.linspace(truth.min(), truth.max(), 300)
+            against.plot(line, found(line), color="black")
+        against.set_xlabel(spec.truth[found.column])
+        against.set_title(f"|r| = {found.r:.2f} with {found.function}", fontsize=8)
     grid[-1][0].set_xlabel("frame t (its stream only)")
     grid[0][0].set_title("output y", fontsize=8)
     return figure
@@ -284,12 +283,6 @@ FIGURES: dict[str, Callable[[History], Figure | None]] = {
     "contact_sheet": contact_sheet,
 }
 """Name of each figure's files and what draws it."""
-
-
-def polynomial_fit(x: Float, y: Float, degree: int = 3) -> np.polynomial.Polynomial:
-    """The polynomial that fits y at x best; of lower degree where x has few values."""
-    degree = min(degree, len(np.unique(x)) - 1)
-    return np.polynomial.Polynomial.fit(x, y, max(degree, 0))
 
 
 def _panels(*heights: float) -> tuple[Figure, list[Axes]]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,12 @@ Float = NDArray[np.float64]
 
 KEPT = 20_000
 """Last frames of each module's output that are kept."""
+
+BETTER = 0.03
+"""By how much a function must be followed better than a simpler one."""
+
+FREQUENCIES = 12
+"""Sines of an angle that are tried."""
 
 STRIP = 8
 """Pictures of each module."""
@@ -50,14 +57,89 @@ class Output:
     y: Float
     truth: Float
 
-    def best_truth(self) -> tuple[int, float] | None:
-        """The column of truth that the output follows most, and its correlation."""
+    def follows(self, names: Sequence[str]) -> Following | None:
+        """What the world knows that the output follows most; None where it knows nothing.
+
+        Args:
+            names: of the columns of truth.
+        """
         found = [
-            (column, float(np.corrcoef(values, self.y)[0, 1]))
-            for column, values in enumerate(self.truth.T)
-            if len(values) > 2 and np.std(values) > 0 and np.std(self.y) > 0
+            fit
+            for column, name in enumerate(names[: self.truth.shape[1]])
+            if (fit := follow(self.truth[:, column], self.y, column, name)) is not None
         ]
-        return max(found, key=lambda one: (abs(one[1]), one[0]), default=None)
+        return max(found, key=lambda fit: fit.r, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Following:
+    """A function of something true that an output follows.
+
+    Attributes:
+        column: of the truth.
+        function: in words, of the truth's name.
+        r: correlation of the output with the function, 0 to 1.
+        weights: (K,) of the terms.
+        terms: (n,) truth -> (n, K).
+    """
+
+    column: int
+    function: str
+    r: float
+    weights: Float
+    terms: Callable[[Float], Float]
+
+    def __call__(self, truth: Float) -> Float:
+        """The function's values."""
+        return np.asarray(self.terms(truth) @ self.weights)
+
+
+def follow(truth: Float, y: Float, column: int, name: str) -> Following | None:
+    """The simplest function of a true quantity that an output follows.
+
+    Of an angle that goes round these are its sines, of all others a straight line or, where
+    that is better by `BETTER`, a parabola: a slow feature need not be the quantity itself.
+
+    Args:
+        truth: (n,) its values.
+        y: (n,) the output.
+        column: number of the quantity.
+        name: its name.
+    """
+    if len(truth) < 3 or np.std(truth) == 0 or np.std(y) == 0:
+        return None
+    powers = range(1, min(len(np.unique(truth)), 3))
+    tried = [
+        (name if k == 1 else f"a parabola of {name}", partial(_powers, degree=k)) for k in powers
+    ]
+    if _goes_round(truth):
+        tried += [
+            (f"sin({name if k == 1 else f'{k} {name}'} + c)", partial(_sines, frequency=k))
+            for k in range(1, FREQUENCIES + 1)
+        ]
+    best: Following | None = None
+    for function, terms in tried:
+        table = terms(truth)
+        weights: Float = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
+        fit = table @ weights
+        r = float(np.corrcoef(fit, y)[0, 1]) if np.std(fit) > 0 else 0.0
+        if best is None or r > best.r + BETTER:
+            best = Following(column, function, r, weights, terms)
+    return best
+
+
+def _powers(x: Float, degree: int) -> Float:
+    return np.stack([x**k for k in range(degree + 1)], axis=1)
+
+
+def _sines(x: Float, frequency: int) -> Float:
+    return np.stack([np.ones_like(x), np.sin(frequency * x), np.cos(frequency * x)], axis=1)
+
+
+def _goes_round(x: Float) -> bool:
+    """Whether these are angles of all around a circle, in radians."""
+    turn = 2 * np.pi
+    return bool(x.min() >= 0 and x.max() <= turn and np.ptp(x) > 0.9 * turn)
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,6 +87,8 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
         return
     for file in files:
         click.echo(file)
+    if not files:
+        click.echo(f"nothing is drawn of {run}: it has no iterations", err=True)
 
 
 @click.command("export")
