@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-CAMPAIGNS = ("kills", "damage")
+CAMPAIGNS = ("kills", "children", "disks", "descriptors", "races", "damage")
 """Modules of this folder, in the order of the page."""
 
 

@@ -7,23 +7,20 @@ that were never stopped. What is asked to end does so within 5 s, and at the sec
 
 from __future__ import annotations
 
-import shutil
 import signal
 import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from camera_files import write_pictures
-
 from replay.mcap.reader import LogReader
 from replay.runs.log import SIGNALS_TOPIC
 
-from .commands import ERRORS, LIMIT, UNCLEAR, Fork, Process, Ran, here, must, until
+from .commands import ERRORS, LIMIT, UNCLEAR, Fork, Process, Ran, here, until
 from .outcomes import HANG, LOST, MIXED, RIGHT, TRACEBACK, WRONG, Defect, Job, Limits, Outcome
 from .processes import descendants, wait_gone
 from .witness import due, witnessing
-from .works import FRAMES, WORKS, Work
+from .works import WORKS, Work, prepared
 
 LIMITS = Limits(seconds=150, share=3)
 
@@ -45,20 +42,7 @@ REAL = 0.1
 
 def prepare(folder: Path) -> dict[str, Any]:
     """Results of commands that nobody stops, and how long each takes."""
-    must(folder, "record", "oscillatory", "-o", folder / "recording", "--frames", FRAMES)
-    (folder / "png").mkdir()
-    for name in ("left", "right"):
-        write_pictures(folder / "png" / name, 400)
-    results, seconds = {}, {}
-    for name, work in WORKS.items():
-        place = folder / "done" / name
-        for _ in range(2):  # the first time, things are imported and compiled
-            shutil.rmtree(place, ignore_errors=True)
-            ran = here(*work.words(place, folder))
-        if ran.code != 0:
-            raise Defect(WRONG, "setup", f"{ran.line}: exit {ran.code}: {ran.told()}")
-        results[name], seconds[name] = work.result(place), ran.seconds
-    return {"folder": folder, "results": results, "seconds": seconds}
+    return prepared(folder)
 
 
 def case(job: Job) -> Outcome:
@@ -75,7 +59,7 @@ def case(job: Job) -> Outcome:
         kills[group] += 1
         if _killed(job, (*words, *again), work, SIGNALS[how], group, job.given["seconds"][name]):
             break
-    _finish(place, words, work, group)
+    finish(place, words, work, group)
     if (found := work.result(place)) != job.given["results"][name]:
         raise Defect(MIXED, group, f"{name}, {dict(kills)}: gone on with, it gives {found}")
     return Outcome(RIGHT, group, count=kills.total())
@@ -105,7 +89,7 @@ def _killed(
     _check_end(ran, how, group)
     if left := wait_gone(children, LIMIT):
         raise Defect(HANG, group, f"{ran.line}: after it its processes {left} live on")
-    _check_disk(place, due(witness, killed, work.log_fps), group, ran)
+    check_disk(place, due(witness, killed, work.log_fps), group, ran)
     return over
 
 
@@ -125,7 +109,7 @@ def _begun(place: Path) -> bool:
     return place.exists() and any(place.iterdir())
 
 
-def _finish(place: Path, words: tuple[object, ...], work: Work, group: str) -> None:
+def finish(place: Path, words: tuple[object, ...], work: Work, group: str) -> None:
     """Go on to the end, or begin anew where nothing was there yet; that must be said clearly."""
     ran = here(*words, *(work.again if _begun(place) else ()))
     if ran.code == 2 and work.again and "no run to resume" in ran.err:
@@ -135,7 +119,7 @@ def _finish(place: Path, words: tuple[object, ...], work: Work, group: str) -> N
         raise Defect(kind, group, f"{ran.line}: after a kill: exit {ran.code}: {ran.told()}")
 
 
-def _check_disk(place: Path, wanted: dict[str, int], group: str, ran: Ran) -> None:
+def check_disk(place: Path, wanted: dict[str, int], group: str, ran: Ran) -> None:
     """Read everything that a killed command left, and count it."""
     there: Counter[str] = Counter()
     for path in sorted(place.rglob("*.mcap*")) if place.exists() else ():

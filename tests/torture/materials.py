@@ -84,6 +84,13 @@ def png(folder: Path) -> None:
         write_pictures(folder / name, 30)
 
 
+def images(folder: Path) -> None:
+    """A recording of images."""
+    png(folder.with_name("pictures"))
+    sources = sorted(folder.with_name("pictures").iterdir())
+    must(folder.parent, "convert", *sources, "--rate", 25, "--size", "16x12", "-o", folder)
+
+
 def jpg(folder: Path) -> None:
     """Two folders of JPEG files."""
     for seed, name in enumerate(("left", "right")):
@@ -121,6 +128,7 @@ def video(folder: Path, suffix: str = "mp4") -> None:
 
 MAKERS: dict[str, Callable[[Path], None]] = {
     "recording": recording,
+    "recording of images": images,
     "recording in parts": parts,
     "recording begun": begun_recording,
     "run": run,
