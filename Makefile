@@ -22,7 +22,10 @@ bench: $(INSTALLED)
 fuzz: $(INSTALLED)
 	$(BIN)/python tests/fuzz.py --cases 1000000 --jobs 2
 
+# The streams of the arena take minutes to make: they are kept.
 torture: $(INSTALLED)
+	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
+	    --seeds 0:2 --frames 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
 	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),30) --seed $(or $(SEED),0)
 
 install: $(INSTALLED)

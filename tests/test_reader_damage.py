@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import resource
+import shutil
 import struct
 import subprocess
 import sys
@@ -20,6 +22,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MAX_CHUNK
+from replay.recordings.source import RecordedSource
 
 MESSAGES = 40
 
@@ -313,3 +316,16 @@ def test_a_bomb_costs_neither_memory_nor_time(tmp_path: Path, name: str) -> None
     assert "bomb.mcap" in message
     assert int(megabytes) < 512
     assert used < 5
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_a_recording_cut_off_while_it_is_read_is_damage(
+    tmp_path: Path, oscillatory_recording: Path, share: float
+) -> None:
+    copy = Path(shutil.copytree(oscillatory_recording, tmp_path / "copy"))
+    with contextlib.closing(RecordedSource(sorted(copy.glob("*.mcap")))) as source:
+        source.take(0, 40)
+        os.truncate(copy / "x1.mcap", int(share * (copy / "x1.mcap").stat().st_size))
+        with contextlib.suppress(LogDamagedError):
+            while source.t < 2000:
+                source.take(0, 40)

@@ -97,7 +97,10 @@ KINDS: Mapping[str, Kind] = {
     "recording begun": Kind(
         (
             lambda place, out: ("info", place),
-            lambda place, out: ("record", "-o", place, "--resume"),
+            lambda place, out: (
+                *("record", "oscillatory", "-o", place, "--resume"),
+                *("--frames", 300, "--seed", 5),
+            ),
             lambda place, out: ("learn", place, "--salvage", *QUICK),
         ),
         proven=True,

@@ -86,18 +86,17 @@ class Results:
 
 
 def run(
-    campaigns: Sequence[Campaign], results: Results, minutes: float, jobs: int, say: TextIO
+    campaigns: Sequence[Campaign], results: Results, deadline: float, jobs: int, say: TextIO
 ) -> None:
     """Run cases until the time is over; those that run then are ended in peace.
 
     Args:
         campaigns: with what `prepare` gave.
         results: each case is written there as it ends.
-        minutes: how long.
+        deadline: until when, by the monotonic clock.
         jobs: cases at a time.
         say: where found defects are told.
     """
-    deadline = time.monotonic() + 60 * minutes
     running: dict[int, Running] = {}
     while running or time.monotonic() < deadline:
         while len(running) < jobs and time.monotonic() < deadline:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -114,6 +115,7 @@ def ros2(folder: Path) -> None:
     folder.mkdir()
     path = ros2_database(folder)
     path.rename(folder / "cameras.db3")
+    shutil.rmtree(path.parent)
 
 
 def video(folder: Path, suffix: str = "mp4") -> None:
