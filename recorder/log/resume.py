@@ -114,6 +114,7 @@ def resume_view(
             "use the same, or overwrite with --force"
         )
     parts: list[tuple[Path, int]] = []
+    copied: list[Path] = []
     first = 0
     while True:
         path = folder / part_name(view, None if split is None else len(parts))
@@ -127,7 +128,7 @@ def resume_view(
                 raise UsageError(
                     f"{path} holds no frames of {view} from {first} on: overwrite with --force"
                 )
-            place = Resume(path, tuple(parts), first, stale=(*found, *later))
+            place = Resume(path, tuple(parts), first, stale=(*copied, *found, *later))
             break
         _refuse_other(best, identity.facts(view, first))
         follows = best == path and bool(later)
@@ -137,17 +138,18 @@ def resume_view(
                 "use the same, or overwrite with --force"
             )
         if best == path and stop == frames and not follows:
-            aside = tuple(p for p in found if p == aside_path(path))
+            copied += [p for p in found if p == aside_path(path)]
             parts.append((path, stop - first))
-            return Resume(path, tuple(parts), stop, stale=aside, complete=True)
+            return Resume(path, tuple(parts), stop, stale=tuple(copied), complete=True)
         if not follows:
-            place = Resume(path, tuple(parts), first, best, stop, tuple(later))
+            place = Resume(path, tuple(parts), first, best, stop, (*copied, *later))
             break
         if stop >= frames:
             raise UsageError(
                 f"{path} ends at frame {stop}, and more follow: ask for more frames, "
                 "or overwrite with --force"
             )
+        copied += [p for p in found if p == aside_path(path)]
         parts.append((path, stop - first))
         first = stop
     finished = next((p for p in later if p.suffix == ".mcap"), None)

@@ -23,7 +23,6 @@ KINDS = ("open", "write", "fsync", "rename", "unlink", "mkdir")
 """What can be refused; rmdir counts as unlink, truncate as write."""
 
 DELETED = " (deleted)"
-BUFFER = 8192
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +147,7 @@ class _Watch:
         if buffering == 0:
             return raw
         kind = io.BufferedRandom if "+" in mode else io.BufferedWriter
-        buffered = kind(raw, buffering if buffering > 1 else BUFFER)
+        buffered = kind(raw, buffering if buffering > 1 else os.fstat(raw.fileno()).st_blksize)
         if "b" in mode:
             return buffered
         text = io.TextIOWrapper(buffered, encoding, errors, newline)
