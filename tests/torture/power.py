@@ -56,6 +56,7 @@ class Disk:
             for path, data in tree.items()
         }
         self._durable = dict(self._names)
+        self._moved: dict[Path, Path] = {}
 
     def do(self, call: Call) -> None:
         """Follow a call."""
@@ -71,6 +72,8 @@ class Disk:
                 assert call.target is not None
                 for old in [p for p in names if p == path or path in p.parents]:
                     names[call.target / old.relative_to(path)] = names.pop(old)
+                if names[call.target] is None:
+                    self._moved[call.target] = path
             case "truncate":
                 file = self._file(path)
                 file.data[:] = file.data[: call.at].ljust(call.at, b"\0")
@@ -79,6 +82,8 @@ class Disk:
                 file.data[:] = file.data.ljust(call.at, b"\0")
                 file.data[call.at : call.at + len(call.data)] = call.data
             case "fsync" if names.get(path) is None:  # a folder
+                for new in [p for p in self._moved if p.parent == path]:
+                    self._move(self._moved.pop(new), new)
                 for old in [p for p in self._durable if p.parent == path and p not in names]:
                     del self._durable[old]
                 for new in [p for p in names if p.parent == path]:
@@ -96,6 +101,11 @@ class Disk:
             if all(above in names for above in path.parents[:-1])
         }
         return {p: None if file is None else file.left(data) for p, file in reachable.items()}
+
+    def _move(self, old: Path, new: Path) -> None:
+        """Let the disk have a folder's new name, with all that it has of it."""
+        for path in [p for p in self._durable if old in p.parents]:
+            self._durable[new / path.relative_to(old)] = self._durable.pop(path)
 
     def _file(self, path: Path) -> _File:
         file = self._names[path]
