@@ -261,6 +261,39 @@ def test_a_candidate_tests_before_it_learns() -> None:
     assert (black.alive, hopeless(black, ProgressConfig())) == (False, "it is constant")
 
 
+@pytest.mark.parametrize("tau", [3, 40, 100])
+def test_noise_is_as_fast_on_new_frames_as_it_is_however_short_a_block(tau: int) -> None:
+    """What was learned by heart is in no step that is tested, not even from block to block."""
+    rng = np.random.default_rng(1)
+    candidate = Candidate(768, 8, 1, 8000, 100)
+    for k in range(-(-2400 // tau)):
+        candidate.learn(rng.standard_normal((tau, 768)), gap=k == 0)
+    assert candidate.fitted < 0.98 * WHITE_NOISE
+    assert candidate.tested[0] == pytest.approx(WHITE_NOISE, rel=0.03)
+
+
+def test_a_test_is_of_weights_that_have_not_learned_from_its_frames() -> None:
+    rng = np.random.default_rng(2)
+    frames = np.cumsum(rng.standard_normal((100, 12)), axis=0)
+    candidate = Candidate(12, 6, 2, 8000, 20)
+    first, second, third = frames[:70], frames[70:80], frames[80:]
+    candidate.learn(first, gap=True)
+    assert np.isnan(candidate.y).all()
+    phi, mean = candidate.sfa.phi, candidate.sfa.mean.copy()
+    candidate.learn(second, gap=False)
+    assert candidate.y == pytest.approx((second - mean) @ phi.T, abs=1e-9)
+    later, mean = candidate.sfa.phi, candidate.sfa.mean.copy()
+    between = phi @ (third[0] - second[-1])  # neither frame was known to these weights
+    candidate.learn(third, gap=False)
+    y = (third - mean) @ later.T
+    steps = [
+        (np.diff((second - mean) @ phi.T, axis=0) ** 2).mean(axis=0),
+        (np.vstack([between, np.diff(y, axis=0)]) ** 2).mean(axis=0),
+    ]
+    variances = [candidate.variance, candidate.tested**2]
+    assert variances[1] * (2 * np.pi) ** 2 * variances[0] == pytest.approx(np.mean(steps, axis=0))
+
+
 def test_progress_is_the_relative_fall_of_the_error() -> None:
     assert relative_progress(np.r_[np.full(8, 2.0), np.full(8, 1.0)]) == pytest.approx(0.501)
     assert relative_progress(np.full(RECENT, 0.5)) == pytest.approx(0.002)

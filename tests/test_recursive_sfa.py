@@ -130,15 +130,6 @@ def test_any_rank_and_any_block_length(rank: int, n: int, seed: int) -> None:
     assert np.isfinite(sfa.phi).all()
 
 
-def test_outputs_are_tested_before_they_are_learned_from() -> None:
-    frames = mixture(5, 600, 4, 15)
-    sfa = RecursiveSFA(15, 6)
-    sfa.update(frames[:500])
-    phi, mean = sfa.phi, sfa.mean.copy()
-    sfa.update(frames[500:560])
-    assert sfa.tested == pytest.approx((frames[500:560] - mean) @ phi.T, rel=1e-9, abs=1e-9)
-
-
 def test_other_outputs_are_judged_without_frames() -> None:
     frames = mixture(6, 3000, 4, 15)
     sfa = learned(frames, [700, 2100], components=8)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.learning import overwrite
+from cdmisfa.features.projection import mean_output, project
 from cdmisfa.features.recursive.recursive import RecursiveSFA, State
 from cdmisfa.features.slowness import slowness, window_rate
 
@@ -23,6 +24,10 @@ FEWEST = 4
 
 ERRORS = 90
 """Blocks whose learning error is kept."""
+
+OF_ALL = 0.5
+"""Share of all tests that a window of tests is at least: what is learned from more and more
+frames is tested on more and more of them."""
 
 _TINY = 1e-12
 
@@ -56,10 +61,11 @@ class Candidate:
         components: K.
         outputs: J.
         window: frames of the exponential window of its SFA.
-        test_window: blocks of that of its tests.
+        test_window: blocks of that of its tests, which is longer from twice as many tests on.
 
     Attributes:
         sfa: the recursive SFA.
+        y: (n, J) outputs on the last block, before any of it was learned from; NaN without.
         blocks: blocks learned from.
         tests: blocks tested before they were learned from.
         change: mean change of the outputs with a block, see `RecursiveSFA.update`.
@@ -77,7 +83,10 @@ class Candidate:
         self.blocks = self.tests = self._reference_age = 0
         self.change = self.regret = math.nan
         self.errors = np.full(ERRORS, np.nan)
+        self.y = np.zeros((0, n_outputs))
         self._moments = np.zeros((3, n_outputs))
+        self._phi = np.zeros((n_outputs, n_inputs))
+        self._last = np.zeros(n_outputs)
         self._reference = np.zeros((1, n_inputs))
 
     def learn(self, frames: NDArray[Any], gap: bool) -> None:
@@ -87,11 +96,11 @@ class Candidate:
             frames: (n, I) consecutive frames.
             gap: they do not follow those before.
         """
-        begun = self.alive
+        self.y = np.full((len(frames), len(self._last)), np.nan)
+        if self.alive:
+            self._test(frames, gap)
         changes = self.sfa.update(frames, gap)
         self.blocks += 1
-        if begun:
-            self._test(gap)
         changes = changes[np.isfinite(changes)]
         if len(changes):
             change = min(float(changes.sum()), math.sqrt(2.0))
@@ -107,13 +116,23 @@ class Candidate:
         if self._reference_age >= self.test_window:
             self._look_back()
 
-    def _test(self, gap: bool) -> None:
-        """Take the outputs on a block in, and the difference to the frame before it."""
+    def _test(self, frames: NDArray[Any], gap: bool) -> None:
+        """Take in the outputs on a block and their steps from frame to frame.
+
+        The step from the block before is that of the weights that block was tested with: they
+        have learned from neither of its frames.
+        """
         self.tests += 1
-        rate = window_rate(self.test_window, self.tests)
-        y = np.concatenate([self.sfa.before[None], self.sfa.tested])
-        steps = np.diff(y[1:] if gap else y, axis=0)
-        now = np.stack([y[1:].mean(axis=0), (y[1:] ** 2).mean(axis=0), (steps**2).mean(axis=0)])
+        rate = window_rate(max(self.test_window, OF_ALL * self.tests), self.tests)
+        phi = self.sfa.phi
+        offset = mean_output(phi, self.sfa.mean)
+        y = self.y = project(phi, offset, frames)
+        steps = np.diff(y, axis=0)
+        if self._phi.any() and not gap:
+            first = project(self._phi, np.zeros(len(phi)), frames[:1])
+            steps = np.concatenate([first - self._last, steps])
+        self._phi[:], self._last[:] = phi, y[-1] + offset
+        now = np.stack([y.mean(axis=0), (y**2).mean(axis=0), (steps**2).mean(axis=0)])
         self._moments += rate * (now - self._moments)
 
     def _look_back(self) -> None:
@@ -178,6 +197,8 @@ class Candidate:
             "measures": np.array([self.change, self.regret]),
             "errors": self.errors,
             "moments": self._moments,
+            "phi": self._phi,
+            "last": self._last,
             "reference": self._reference,
         }
         sfa = zip(State._fields, self.sfa.state, strict=True)

@@ -92,7 +92,7 @@ class ProgressLearner:
         self._n_inputs = count_inputs(self._expansion, spec)
         self._n_outputs = min(config.outputs, self._n_inputs)
         self._scale = PIXEL if spec.dtype == "uint8" else 1.0
-        size = 8 * self._n_inputs * (2 * config.components + 4)
+        size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
         self._held = max(2, min(HELD, MEMORY // size))
         self._window = max(FEWEST_BLOCKS, -(-config.test_frames // config.tau))
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
@@ -193,7 +193,7 @@ class ProgressLearner:
         learning = self._streams["state"] == LEARNING
         counts["idle"] = 0 if learning.any() else counts["idle"] + 1
         values, explored = self._choose(self._rng.random(2))
-        y = candidate.sfa.tested
+        y = candidate.y
         tested = candidate.tested
         y_frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
         none, shape = np.full(len(tested), np.nan), (count, self._n_outputs)
@@ -208,12 +208,12 @@ class ProgressLearner:
             saved=len(self.modules) > count,
             share=math.nan,
             novel_blocks=candidate.blocks,
-            y=y if candidate.tests else np.full(y.shape, np.nan),
+            y=y,
             y_frozen=np.ascontiguousarray(y_frozen),
             eta=tested,
             eta_dot=none,
             variance=candidate.variance if candidate.tests else none,
-            eta_inst=_each(y) if candidate.tests else none,
+            eta_inst=_each(y),
             gate_mean=none,
             gate_sd=none,
             eta_inst_frozen=np.array([_each(module) for module in y_frozen]).reshape(shape),

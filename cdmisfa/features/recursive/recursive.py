@@ -65,9 +65,9 @@ class State(NamedTuple):
 
 @compiled
 def advance(
-    state: State, frames: NDArray[Any], scale: float, gap: bool, window: int, y: Float
+    state: State, frames: NDArray[Any], scale: float, gap: bool, window: int
 ) -> float:
-    """Test the outputs on a piece of a block, then learn from it.
+    """Learn from a piece of a block.
 
     Args:
         state: changed in place.
@@ -75,7 +75,6 @@ def advance(
         scale: 1 for values, 1/255 for pixels.
         gap: they do not follow the frames before.
         window: frames of the exponential window.
-        y: (m + 1, J) receives the outputs before learning, of the frame before the piece first.
 
     Returns:
         Change of the outputs, see `RecursiveSFA.update`.
@@ -88,7 +87,6 @@ def advance(
     n = (m + ROWS) // ROWS * ROWS
     e, g = np.zeros((size, n)), np.zeros((n, n))
     measure(state.basis, rank, frames, scale, state.last, state.mean, e, g)
-    _outputs(state.weights, e, y)
     floor = 0.0
     for i in range(len(state.mean)):
         floor += (ROUNDING * state.mean[i]) ** 2
@@ -131,16 +129,6 @@ def advance(
     )
     _slowest(state)
     return _align(state, before)
-
-
-@compiled
-def _outputs(weights: Float, e: Float, y: Float) -> None:
-    """Outputs on the frame before a piece and on its own, from inner products with the basis."""
-    y[:] = 0.0
-    for t in range(len(y)):
-        for o in range(weights.shape[0]):
-            for j in range(weights.shape[1]):
-                y[t, o] += weights[o, j] * e[j, t]
 
 
 @compiled
@@ -216,8 +204,6 @@ class RecursiveSFA:
 
     Attributes:
         state: every array it consists of.
-        tested: (n, J) outputs on the last call's frames, each before it was learned from.
-        before: (J,) output on the frame before these, with the weights of then.
 
     Example:
         >>> t = np.arange(2000.0)
@@ -238,8 +224,6 @@ class RecursiveSFA:
         size = min(2 * components, n_inputs)
         components = min(components, n_inputs)
         self.window = window
-        self.tested = np.zeros((0, min(outputs, components)))
-        self.before = np.zeros(min(outputs, components))
         self.state = State(
             mean=np.zeros(n_inputs),
             basis=np.zeros((size, n_inputs)),
@@ -269,16 +253,10 @@ class RecursiveSFA:
         rows = as_frames(frames, len(self.state.mean))
         scale = PIXEL if rows.dtype == UINT8 else 1.0
         change = np.full(len(rows), np.nan)
-        outputs = len(self.state.weights)
-        self.tested = np.zeros((len(rows), outputs))
         for start in range(0, len(rows), PIECE):
             piece = slice(start, min(start + PIECE, len(rows)))
             first = gap and start == 0
-            y = np.zeros((piece.stop - start + 1, outputs))
-            change[piece.stop - 1] = advance(self.state, rows[piece], scale, first, self.window, y)
-            self.tested[piece] = y[1:]
-            if start == 0:
-                self.before = y[0]
+            change[piece.stop - 1] = advance(self.state, rows[piece], scale, first, self.window)
         return change
 
     @property
