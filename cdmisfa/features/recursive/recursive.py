@@ -64,9 +64,7 @@ class State(NamedTuple):
 
 
 @compiled
-def advance(
-    state: State, frames: NDArray[Any], scale: float, gap: bool, window: int
-) -> float:
+def advance(state: State, frames: NDArray[Any], scale: float, gap: bool, window: int) -> float:
     """Learn from a piece of a block.
 
     Args:
