@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import http.client
 import socket
 import sys
+import threading
+import time
 from pathlib import Path
+from urllib.error import URLError
+from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 import rerun as rr
 from PIL import Image
+from rerun.chunk import RrdReader
 from run_data import IMAGE, VECTOR, having, read_signals, run_of
 
 from cdmisfa.core.config import LearnerConfig
@@ -20,6 +27,7 @@ from recorder.world.oscillatory import OscillatorySource
 from replay.recordings import kernels as scan
 from replay.viewer import display, headless, live
 from replay.viewer.live import LiveView
+from replay.viewer.stream import Stream
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
 
@@ -76,14 +84,95 @@ def test_the_progress_learner_is_shown_by_its_streams(monkeypatch):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_it_listens_on_this_machine_only():
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
-        assert "127.0.0.1" in view.address
-        port = int(view.address.split(":")[2].split("/")[0])
+        port = urlsplit(view.address).port
         with socket.create_connection(("127.0.0.1", port), timeout=5):
             pass
         listening = Path("/proc/net/tcp").read_text("utf-8")
         rows = [row.split() for row in listening.splitlines()[1:]]
         places = {row[1] for row in rows if row[3] == "0A" and row[1].endswith(f":{port:04X}")}
         assert places == {f"0100007F:{port:04X}"}
+
+
+def test_only_who_has_the_address_is_given_the_run(tmp_path):
+    """All of it, until its end; nothing to another name that leads here, nor without the token."""
+    with LiveView(VECTOR, MANIFEST, 40, 1) as view:
+        feed(view, VECTOR)
+        port = urlsplit(view.address).port
+        for path, host, status in (
+            ("/live.rrd", f"127.0.0.1:{port}", 403),
+            (urlsplit(view.address).path, f"example.org:{port}", 403),
+            (urlsplit(view.address).path, "example.org", 403),
+            (urlsplit(view.address).path.replace("live", "other"), f"127.0.0.1:{port}", 404),
+        ):
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            connection.request("GET", path, headers={"Host": host})
+            assert connection.getresponse().status == status, (path, host)
+            connection.close()
+        taken = []
+        reader = threading.Thread(target=lambda: taken.append(urlopen(view.address).read()))
+        reader.start()
+    reader.join()
+    pieces = list(view._stream.read())
+    assert taken == [b"".join(pieces)]
+    (tmp_path / "a.rrd").write_bytes(pieces[-1])
+    paths = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()}
+    assert {"/signals/epsilon", "/events"} <= paths
+    with pytest.raises(URLError):
+        urlopen(view.address, timeout=10)
+
+
+def test_what_does_not_fit_goes_from_behind_the_beginning():
+    stream = Stream(50)
+    early, late = stream.read(), stream.read()
+    for number in range(4):
+        stream.add(bytes([number]) * 10)
+    assert [next(early)[0] for _ in range(4)] == [0, 1, 2, 3]
+    for number in range(4, 9):
+        stream.add(bytes([number]) * 10)
+    stream.end(0)
+    assert [piece[0] for piece in early] == [6, 7, 8]
+    assert [piece[0] for piece in late] == [0, 1, 6, 7, 8]
+
+
+def test_a_viewer_is_given_the_rest_before_the_end():
+    stream = Stream(1000)
+    taken = []
+
+    def slowly():
+        for piece in stream.read():
+            time.sleep(0.1)
+            taken.append(piece)
+
+    reader = threading.Thread(target=slowly)
+    stream.add(b"a")
+    reader.start()
+    stream.add(b"b")
+    time.sleep(0.02)
+    stream.end(5)
+    assert taken == [b"a", b"b"]
+    reader.join()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a program of sh")
+def test_a_window_is_given_the_run_and_shows_nobody_the_address(tmp_path, monkeypatch):
+    program = tmp_path / "program"
+    program.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\ncat > {tmp_path}/a.rrd\n')
+    program.chmod(0o755)
+    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: program)
+    with LiveView(VECTOR, MANIFEST, 40, 1) as view:
+        view.open_window()
+        feed(view, VECTOR)
+        with urlopen(view.address, timeout=10) as answer:
+            view._stream.end(0)
+            whole = answer.read()
+    end = time.monotonic() + 10
+    while (tmp_path / "a.rrd").stat().st_size < len(whole):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert (tmp_path / "a.rrd").read_bytes() == whole
+    words = (tmp_path / "words").read_text()
+    assert words.startswith("- --bind 127.")
+    assert urlsplit(view.address).path.split("/")[1] not in words
 
 
 def test_a_run_gives_the_same_with_and_without(tmp_path):

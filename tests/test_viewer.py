@@ -20,7 +20,13 @@ from replay.view.bindings import viewer_program
 from replay.view.build import build_view
 from replay.view.layouts import panels
 from replay.viewer import display, headless, window
-from replay.viewer.program import check_limit, environment, run_program
+from replay.viewer.program import (
+    check_limit,
+    environment,
+    free_port,
+    private_host,
+    run_program,
+)
 
 ITERATIONS = 24
 
@@ -186,12 +192,29 @@ def test_the_view_that_is_opened_has_no_name_to_be_left_behind(tmp_path, monkeyp
     write_run(tmp_path / "run.mcap", VECTOR, 2)
     given = []
 
-    def program(arguments, view):
+    def program(arguments, view=None):
         assert list((tmp_path / "temporary").iterdir()) == []
-        given.append((arguments, view.read(4)))
+        given.append((arguments, view and view.read(4)))
 
     monkeypatch.setattr(window, "run_program", program)
     monkeypatch.setattr(window, "has_display", lambda: True)
     window.open_window(tmp_path)
     window.serve(tmp_path)
-    assert [("-" in arguments, head) for arguments, head in given] == [(True, b"RRF2")] * 2
+    heads = [("-" in arguments, head) for arguments, head in given]
+    assert heads == [(True, b"RRF2"), (False, None)]  # the second serves it itself
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux has a whole network")
+def test_ports_that_ask_nobody_are_where_no_page_finds_them(tmp_path, monkeypatch):
+    hosts = {private_host() for _ in range(20)}
+    assert len(hosts) == 20
+    assert all(host.startswith("127.") and free_port(host) for host in hosts)
+    given = []
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    monkeypatch.setattr(window, "run_program", lambda arguments, view: given.append(arguments))
+    monkeypatch.setattr(window, "has_display", lambda: True)
+    for _ in range(2):
+        window.open_window(tmp_path)
+    places = {arguments[arguments.index("--bind") + 1] for arguments in given}
+    assert len(places) == 2
+    assert all(place.startswith("127.") and place != "127.0.0.1" for place in places)

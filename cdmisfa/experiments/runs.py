@@ -42,6 +42,7 @@ from recorder.log.whole import make_folder, partial_path, refuse_special
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
+    from replay.viewer.live import LiveView
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +119,7 @@ def run(
     checkpoint_every: int = 200,
     fsync_every: float | None = None,
     live: bool = False,
-    announce: Callable[[str], None] | None = None,
+    announce: Callable[[LiveView], None] | None = None,
     command: Mapping[str, Any] | None = None,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
@@ -141,7 +142,7 @@ def run(
         fsync_every: seconds after which the disk has the log and a checkpoint, so that a power cut
             takes no more; None leaves it to the operating system until the run is finished.
         live: also show the run in Rerun while it learns, to viewers on this machine.
-        announce: called with the address of the live view.
+        announce: called with the live view.
         command: how the run is begun, kept with it; see `resume.command_of`.
 
     Raises:
@@ -190,7 +191,7 @@ def run(
             shown = LiveView(source.spec, manifest, learner.tau, len(learner.phi))
             told.append(opened.enter_context(shown))
             if announce is not None:
-                announce(shown.address)
+                announce(shown)
         if log is not None and resume:
             _restore(log, learner, source, digest)
             if shown is not None:

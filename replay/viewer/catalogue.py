@@ -24,7 +24,7 @@ from replay.runs.folders import VIEW_FILE, run_log, runs_in
 from replay.view.bindings import CatalogueClient, RrdReader
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
 from replay.viewer.display import has_display
-from replay.viewer.program import Program, free_port, open_address, running
+from replay.viewer.program import Program, free_port, open_address, private_host, running
 
 ROWS = "base"
 """Name of the layer of rows."""
@@ -87,11 +87,12 @@ def serve_catalogue(
     runs = runs_in(folder)
     if not runs:
         raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
-    port, ended = port or free_port(), threading.Event()
-    address = f"rerun+http://127.0.0.1:{port}"
+    host, ended = private_host(), threading.Event()
+    port = port or free_port(host)
+    address = f"rerun+http://{host}:{port}"
     with (
         tempfile.TemporaryDirectory(prefix="cdmisfa-runs-") as place,
-        running(["server", "--host", "127.0.0.1", "--port", str(port)]) as server,
+        running(["server", "--host", host, "--port", str(port)]) as server,
     ):
         files = write_rows(runs, Path(place))  # while the server starts
         dataset = _created(address, _dataset_name(folder), server)

@@ -17,7 +17,7 @@ from replay.view.bindings import viewer_client
 from replay.view.build import view_of
 from replay.view.columns import FRAME
 from replay.viewer.display import missing_driver
-from replay.viewer.program import Program, free_port, running
+from replay.viewer.program import Program, free_port, private_host, running
 
 WINDOW = "1600x1000"
 SETTLE = 6.0
@@ -92,18 +92,18 @@ class HeadlessViewer:
 
     Args:
         process: the viewer.
-        port: where it listens, on this machine.
+        place: where it listens, on this machine, as host:port.
 
     Raises:
         CdmisfaError: it does not start.
     """
 
-    def __init__(self, process: Program, port: int) -> None:
+    def __init__(self, process: Program, place: str) -> None:
         self._process = process
         self._client: Any = None
 
         def connect(_: Any) -> Any:
-            client = viewer_client().connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client = viewer_client().connect(f"rerun+http://{place}/proxy")
             client.get_state()
             return client
 
@@ -147,7 +147,8 @@ def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
     Raises:
         CdmisfaError: it does not start.
     """
-    port = free_port()
-    place = ["--port", str(port), "--bind", "127.0.0.1", "--window-size", window]
+    host = private_host()
+    port = free_port(host)
+    place = ["--port", str(port), "--bind", host, "--window-size", window]
     with running(["--headless", "--hide-welcome-screen", *place]) as process:
-        yield HeadlessViewer(process, port)
+        yield HeadlessViewer(process, f"{host}:{port}")

@@ -1,7 +1,7 @@
 """A run in the viewer while it learns.
 
 What the learner thinks is kept in memory and handed over in large pieces, so that the
-learner hardly waits for it. Only programs on this machine can connect.
+learner hardly waits for it. Only who was given the address can connect, from this machine.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import contextlib
 import os
 import time
 from collections.abc import Mapping
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,7 +31,9 @@ from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
-from replay.viewer.program import free_port
+from replay.viewer.guarded import served
+from replay.viewer.program import opened_on
+from replay.viewer.stream import Stream
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
@@ -44,8 +47,10 @@ PIECE = 10
 LAST_SECONDS = 5.0
 """Longest wait for viewers to take the last piece."""
 
-MEMORY = "1GiB"
-"""Most that is kept for viewers that connect later; the oldest goes first."""
+MEMORY = 1 << 30
+"""Most bytes that are kept for viewers that connect later; the oldest go first."""
+
+NAME = "live.rrd"
 
 
 class LiveView(Sink):
@@ -76,14 +81,14 @@ class LiveView(Sink):
         self._recording.set_log_time_enabled(False)
         if not rr.is_enabled(self._recording):
             raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
-        server = rr.GrpcServerSink(
-            bind_ip="127.0.0.1", port=port or free_port(), server_memory_limit=MEMORY
-        )
+        self._encoded = rr.binary_stream(self._recording)
+        self._stream = Stream(MEMORY)
+        self._serving = contextlib.ExitStack()
         try:
-            self._recording.set_sinks(server)
-        except RuntimeError as error:
-            raise CdmisfaError(f"no live view at port {port}: {error}") from error
-        self.address = str(server.uri)
+            address = self._serving.enter_context(served(self._answer, port))
+        except OSError as error:
+            raise CdmisfaError(f"no live view at port {port}: {error.strerror}") from error
+        self.address = f"{address}{NAME}"
         self._recording.send_recording_name("live")
         self._recording.send_blueprint(run_layout(outline))
         # No image is left out here: of each block only the first is taken.
@@ -93,7 +98,27 @@ class LiveView(Sink):
         self._tau = tau
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
+        self._hand_over()
         self._forget()
+
+    def _answer(self, request: BaseHTTPRequestHandler, path: str) -> None:
+        if path != NAME:
+            request.send_error(404)
+            return
+        request.send_response(200)
+        request.send_header("Content-Type", "application/octet-stream")
+        request.send_header("Cache-Control", "no-store")
+        request.end_headers()
+        for piece in self._stream.read():
+            request.wfile.write(piece)
+
+    def open_window(self) -> None:
+        """Open a viewer; it stays open when we have ended."""
+        opened_on(self._stream.read())
+
+    def _hand_over(self) -> None:
+        if piece := self._encoded.read(flush=True):
+            self._stream.add(piece)
 
     def _forget(self) -> None:
         self._records: list[BlockSignals] = []
@@ -158,12 +183,14 @@ class LiveView(Sink):
                 if t in weights:
                     self._view.weights(f"modules/{module}/weights", t, weights[t])
         self._view.flush()
+        self._hand_over()
 
     def close(self) -> None:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
         self.flush()
-        with contextlib.suppress(RuntimeError):
-            self._recording.flush(timeout_sec=LAST_SECONDS)
+        self._hand_over()
+        self._stream.end(LAST_SECONDS)
+        self._serving.close()
         self._recording.disconnect()
 
     def __enter__(self) -> Self:

@@ -6,11 +6,13 @@ import contextlib
 import ctypes
 import os
 import re
+import secrets
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import BinaryIO
 
@@ -138,8 +140,43 @@ def open_address(address: str, memory_limit: str = "2GB") -> None:
     )
 
 
-def free_port() -> int:
+def opened_on(pieces: Iterator[bytes], memory_limit: str = "2GB") -> None:
+    """Open a viewer on a recording that grows; it stays open when we have ended.
+
+    It is given the recording as its standard input: others can see a program's arguments.
+    """
+    host = private_host()
+    place = ["--bind", host, "--port", str(free_port(host))]
+    viewer = subprocess.Popen(
+        [str(viewer_program()), "-", *place, "--memory-limit", memory_limit],
+        env=environment(),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+    def hand_over() -> None:
+        with contextlib.suppress(OSError), viewer:  # the window may be closed before the end
+            for piece in pieces:
+                viewer.stdin.write(piece)  # type: ignore[union-attr]
+
+    threading.Thread(target=hand_over, daemon=True).start()
+
+
+def private_host() -> str:
+    """An address of this machine for a port that asks nobody who he is.
+
+    On Linux all of 127.0.0.0/8 is this machine; by chance one is taken that no page of somebody
+    else's can guess and have its name lead to.
+    """
+    if not sys.platform.startswith("linux"):
+        return "127.0.0.1"
+    return ".".join(str(part) for part in (127, *(1 + secrets.randbelow(254) for _ in range(3))))
+
+
+def free_port(host: str = "127.0.0.1") -> int:
     """A port of this machine that nothing listens at."""
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.bind((host, 0))
         return int(probe.getsockname()[1])

@@ -1,4 +1,4 @@
-"""The viewer's web page, served so that a browser asks nobody but this machine for anything.
+"""The viewer's web page and the run that it shows, for a browser that asks nobody else.
 
 Rerun's page asks other hosts for fonts, a newer version and examples, and reports to its
 makers. A content security policy makes the browser refuse all of that.
@@ -6,15 +6,21 @@ makers. A content security policy makes the browser refuse all of that.
 
 from __future__ import annotations
 
-import contextlib
 import http.client
 import shutil
 import threading
 import time
-from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
+from typing import BinaryIO
+from urllib.parse import quote, urlsplit
 
-HOST = "127.0.0.1"
+from replay.viewer.guarded import HOST, Answer
+
+DATA = "run.rrd"
+"""Where the run is, beside the page."""
+
+PIECE = 1 << 20
+
 SECONDS = 60.0
 """Longest wait for an answer of the viewer's own server."""
 
@@ -24,42 +30,76 @@ START_SECONDS = 20.0
 KEPT = ("Content-Type", "Content-Length", "Cache-Control", "ETag")
 """What is passed on of what the viewer's server says about a file."""
 
+POLICY = "; ".join(
+    (
+        "default-src 'self'",
+        "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data: blob:",
+        "worker-src 'self' blob:",
+        "connect-src 'self' data: blob:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+"""The content security policy: this page, and what is beside it."""
 
-def policy(data_port: int) -> str:
-    """The content security policy: this page, and the run's data at `data_port`."""
-    rules = {
-        "default-src": "'self'",
-        "script-src": "'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:",
-        "style-src": "'self' 'unsafe-inline'",
-        "img-src": "'self' data: blob:",
-        "worker-src": "'self' blob:",
-        "connect-src": f"'self' data: blob: http://{HOST}:{data_port}",
-        "base-uri": "'none'",
-        "form-action": "'none'",
-    }
-    return "; ".join(f"{name} {value}" for name, value in rules.items())
+
+def shown_at(address: str) -> str:
+    """The address of the page that shows the run beside it."""
+    return f"{address}?url={quote(address + DATA, safe='')}"
 
 
-@contextlib.contextmanager
-def serve_page(viewer_port: int, data_port: int, port: int) -> Iterator[None]:
-    """Serve the page of a viewer's own server, with the policy.
+def page_of(view: BinaryIO, viewer_port: int) -> Answer:
+    """What is served: a run, and the files of the page, with the policy.
 
     Args:
-        viewer_port: where that server listens, on this machine.
-        data_port: where the run's data are served.
-        port: where to listen, on this machine.
-
-    Raises:
-        OSError: the port is taken.
+        view: of the run, an .rrd file; it may have no name any more.
+        viewer_port: where the viewer's own server has the page, on this machine.
     """
-    server = ThreadingHTTPServer((HOST, port), _handler(viewer_port, policy(data_port)))
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    reading = threading.Lock()
+
+    def piece(at: int) -> bytes:
+        with reading:
+            view.seek(at)
+            return view.read(PIECE)
+
+    def answer(request: BaseHTTPRequestHandler, path: str) -> None:
+        if urlsplit(path).path != DATA:
+            _pass_on(request, path, viewer_port)
+            return
+        request.send_response(200)
+        request.send_header("Content-Type", "application/octet-stream")
+        request.send_header("Cache-Control", "no-store")
+        request.end_headers()
+        at = 0
+        while data := piece(at):
+            request.wfile.write(data)
+            at += len(data)
+
+    return answer
+
+
+def _pass_on(request: BaseHTTPRequestHandler, path: str, viewer_port: int) -> None:
+    """Answer with what the viewer's own server has, which is the same for every run."""
+    source = http.client.HTTPConnection(HOST, viewer_port, timeout=SECONDS)
     try:
-        yield
+        _connect(source)
+        source.request("GET", f"/{urlsplit(path).path}")
+        answer = source.getresponse()
+        request.send_response(answer.status)
+        for name in KEPT:
+            if value := answer.headers.get(name):
+                request.send_header(name, value)
+        request.send_header("Content-Security-Policy", POLICY)
+        request.send_header("Referrer-Policy", "no-referrer")
+        request.end_headers()
+        shutil.copyfileobj(answer, request.wfile)
+    except (OSError, http.client.HTTPException):
+        request.send_error(502, "the viewer does not answer yet: load the page again")
     finally:
-        server.shutdown()
-        server.server_close()
+        source.close()
 
 
 def _connect(source: http.client.HTTPConnection) -> None:
@@ -73,34 +113,3 @@ def _connect(source: http.client.HTTPConnection) -> None:
             if time.monotonic() > end:
                 raise
             time.sleep(0.05)
-
-
-def _handler(viewer_port: int, rules: str) -> type[BaseHTTPRequestHandler]:
-    class Page(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            names = {f"{name}:{self.server.server_port}" for name in (HOST, "localhost")}  # type: ignore[attr-defined]
-            if self.headers.get("Host") not in names:  # a name of somebody else's that leads here
-                self.send_error(403)
-                return
-            source = http.client.HTTPConnection(HOST, viewer_port, timeout=SECONDS)
-            try:
-                _connect(source)
-                source.request("GET", self.path)
-                answer = source.getresponse()
-                self.send_response(answer.status)
-                for name in KEPT:
-                    if value := answer.headers.get(name):
-                        self.send_header(name, value)
-                self.send_header("Content-Security-Policy", rules)
-                self.end_headers()
-                with contextlib.suppress(ConnectionError):  # the browser has gone
-                    shutil.copyfileobj(answer, self.wfile)
-            except (OSError, http.client.HTTPException):
-                self.send_error(502, "the viewer does not answer yet: load the page again")
-            finally:
-                source.close()
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Say nothing: stderr is for the user."""
-
-    return Page

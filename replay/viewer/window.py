@@ -12,8 +12,9 @@ from typing import BinaryIO
 from cdmisfa.core.errors import CdmisfaError
 from replay.view.build import view_of
 from replay.viewer.display import has_display
-from replay.viewer.program import check_limit, free_port, run_program
-from replay.viewer.webpage import serve_page
+from replay.viewer.guarded import HOST, served
+from replay.viewer.program import check_limit, free_port, private_host, run_program
+from replay.viewer.webpage import page_of, shown_at
 
 
 def open_window(
@@ -32,10 +33,9 @@ def open_window(
             "--screenshot"
         )
     with _opened(path, every, all_views) as (name, view):
-        port = str(free_port())
-        run_program(
-            [name, "--bind", "127.0.0.1", "--port", port, "--memory-limit", memory_limit], view
-        )
+        host = private_host()
+        place = ("--bind", host, "--port", str(free_port(host)))
+        run_program([name, *place, "--memory-limit", memory_limit], view)
 
 
 def serve(
@@ -55,23 +55,21 @@ def serve(
         CdmisfaError: the server ended with an error.
     """
     check_limit(memory_limit)
-    data_port, viewer_port, page_port = free_port(), free_port(), port or free_port()
-    with (
-        _opened(path, every, all_views) as (name, view),
-        serve_page(viewer_port, data_port, page_port),
-    ):
-        proxy = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{data_port}%2Fproxy"
-        print(f"http://127.0.0.1:{page_port}/?url={proxy}", file=sys.stderr, flush=True)
+    viewer_port = free_port()
+    with contextlib.ExitStack() as opened:
+        name, file = opened.enter_context(_opened(path, every, all_views))
+        view = file or opened.enter_context(open(name, "rb"))
+        address = opened.enter_context(served(page_of(view, viewer_port), port))
+        print(shown_at(address), file=sys.stderr, flush=True)
         run_program(
             [
                 "--serve-web",
-                *("--bind", "127.0.0.1"),
-                *("--port", str(data_port)),
+                *("--bind", HOST),
                 *("--web-viewer-port", str(viewer_port)),
-                *("--server-memory-limit", memory_limit),
-                name,
-            ],
-            view,
+                # With an address to show it serves the page alone, and no data at a port of its
+                # own; this one is without the token, as others can see the arguments.
+                f"http://{HOST}:{viewer_port}/",
+            ]
         )
 
 
