@@ -118,7 +118,7 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
         while found is None:
             line = process.stderr.readline()
             assert line, "the command ended"
-            found = re.search(r"3 runs at (rerun\+http://127\.0\.0\.1:\d+)/entry/(\w+)", line)
+            found = re.search(r"3 runs at (rerun\+http://127\.[\d.]+:\d+)/entry/(\w+)", line)
         (dataset,) = CatalogClientInternal(found[1]).datasets(include_hidden=False)
         assert str(dataset.entry_details().id) == found[2]
         assert set(dataset.segment_ids()) == {run_identity(run) for run in runs_in(sweep)}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
+import os
+import signal
 import socket
 import sys
 import threading
@@ -25,8 +28,10 @@ from cdmisfa.experiments import runs
 from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.recordings import kernels as scan
+from replay.view.bindings import viewer_client, viewer_program
 from replay.viewer import display, headless, live
 from replay.viewer.live import LiveView
+from replay.viewer.program import open_privately
 from replay.viewer.stream import Stream
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
@@ -153,26 +158,32 @@ def test_a_viewer_is_given_the_rest_before_the_end():
     reader.join()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a program of sh")
-def test_a_window_is_given_the_run_and_shows_nobody_the_address(tmp_path, monkeypatch):
-    program = tmp_path / "program"
-    program.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\ncat > {tmp_path}/a.rrd\n')
-    program.chmod(0o755)
-    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: program)
+@pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
+def test_a_window_shows_the_run_and_nobody_the_address(tmp_path, monkeypatch):
+    """The window is one without a screen here."""
+    real, words = viewer_program(), tmp_path / "words"
+    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: tmp_path / "viewer")
+    script = f"""#!/bin/sh
+    echo $$ "$@" > {words}
+    exec {real} --headless --window-size 300x200 "$@"
+    """
+    (tmp_path / "viewer").write_text(script)
+    (tmp_path / "viewer").chmod(0o755)
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
-        view.open_window()
         feed(view, VECTOR)
-        with urlopen(view.address, timeout=10) as answer:
-            view._stream.end(0)
-            whole = answer.read()
-    end = time.monotonic() + 10
-    while (tmp_path / "a.rrd").stat().st_size < len(whole):
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    assert (tmp_path / "a.rrd").read_bytes() == whole
-    words = (tmp_path / "words").read_text()
-    assert words.startswith("- --bind 127.")
-    assert urlsplit(view.address).path.split("/")[1] not in words
+        open_privately(view.address)
+        recordings, end = [], time.monotonic() + 60
+        while not recordings:
+            assert time.monotonic() < end
+            time.sleep(0.2)
+            with contextlib.suppress(OSError, RuntimeError):
+                given = words.read_text().split()
+                place = f"{given[given.index('--bind') + 1]}:{given[given.index('--port') + 1]}"
+                client = viewer_client().connect(f"rerun+http://{place}/proxy")
+                recordings = client.get_state().recordings
+    os.kill(int(given[0]), signal.SIGTERM)
+    assert place.startswith("127.")
+    assert urlsplit(view.address).path.split("/")[1] not in words.read_text()
 
 
 def test_a_run_gives_the_same_with_and_without(tmp_path):

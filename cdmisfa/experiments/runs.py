@@ -42,7 +42,6 @@ from recorder.log.whole import make_folder, partial_path, refuse_special
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
-    from replay.viewer.live import LiveView
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +118,7 @@ def run(
     checkpoint_every: int = 200,
     fsync_every: float | None = None,
     live: bool = False,
-    announce: Callable[[LiveView], None] | None = None,
+    announce: Callable[[str], None] | None = None,
     command: Mapping[str, Any] | None = None,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
@@ -142,7 +141,7 @@ def run(
         fsync_every: seconds after which the disk has the log and a checkpoint, so that a power cut
             takes no more; None leaves it to the operating system until the run is finished.
         live: also show the run in Rerun while it learns, to viewers on this machine.
-        announce: called with the live view.
+        announce: called with the address of the live view.
         command: how the run is begun, kept with it; see `resume.command_of`.
 
     Raises:
@@ -191,7 +190,7 @@ def run(
             shown = LiveView(source.spec, manifest, learner.tau, len(learner.phi))
             told.append(opened.enter_context(shown))
             if announce is not None:
-                announce(shown)
+                announce(shown.address)
         if log is not None and resume:
             _restore(log, learner, source, digest)
             if shown is not None:

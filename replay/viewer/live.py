@@ -32,7 +32,6 @@ from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
 from replay.viewer.guarded import served
-from replay.viewer.program import opened_on
 from replay.viewer.stream import Stream
 
 EVERY_SECONDS = 1.5
@@ -111,10 +110,6 @@ class LiveView(Sink):
         request.end_headers()
         for piece in self._stream.read():
             request.wfile.write(piece)
-
-    def open_window(self) -> None:
-        """Open a viewer; it stays open when we have ended."""
-        opened_on(self._stream.read())
 
     def _hand_over(self) -> None:
         if piece := self._encoded.read(flush=True):

@@ -13,14 +13,18 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from replay.view.bindings import viewer_program
+from replay.view.bindings import viewer_client, viewer_program
 
 LIMIT = re.compile(r"\d+(%|B|[kMGT]B|[KMGT]iB)")
 """What Rerun takes for a limit of memory; another makes it panic."""
+
+TOLD_SECONDS = 30.0
+"""Longest wait for a viewer that is starting to take an address."""
 
 
 def environment() -> dict[str, str]:
@@ -129,39 +133,40 @@ def ends_with_parent() -> Callable[[], None] | None:
 
 def open_address(address: str, memory_limit: str = "2GB") -> None:
     """Open a viewer on what is served at an address; it stays open when we have ended."""
-    command = [str(viewer_program()), "--connect", address, "--memory-limit", memory_limit]
-    subprocess.Popen(
-        command,
+    _detached(["--connect", address, "--memory-limit", memory_limit])
+
+
+def open_privately(address: str, memory_limit: str = "2GB") -> None:
+    """Open a viewer on what is served at a secret address; it stays open when we have ended.
+
+    It is told the address once it runs: others can see a program's arguments.
+    """
+    host = private_host()
+    port = str(free_port(host))
+    place = ["--bind", host, "--port", port, "--expect-data-soon"]
+    viewer = _detached([*place, "--memory-limit", memory_limit])
+
+    def tell() -> None:
+        end = time.monotonic() + TOLD_SECONDS
+        while viewer.poll() is None and time.monotonic() < end:
+            with contextlib.suppress(OSError, RuntimeError, ValueError):  # it is starting
+                viewer_client().connect(f"rerun+http://{host}:{port}/proxy").open(address)
+                break
+            time.sleep(0.1)
+        viewer.wait()
+
+    threading.Thread(target=tell, daemon=True).start()
+
+
+def _detached(arguments: Sequence[str]) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [str(viewer_program()), *arguments],
         env=environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-
-
-def opened_on(pieces: Iterator[bytes], memory_limit: str = "2GB") -> None:
-    """Open a viewer on a recording that grows; it stays open when we have ended.
-
-    It is given the recording as its standard input: others can see a program's arguments.
-    """
-    host = private_host()
-    place = ["--bind", host, "--port", str(free_port(host))]
-    viewer = subprocess.Popen(
-        [str(viewer_program()), "-", *place, "--memory-limit", memory_limit],
-        env=environment(),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-
-    def hand_over() -> None:
-        with contextlib.suppress(OSError), viewer:  # the window may be closed before the end
-            for piece in pieces:
-                viewer.stdin.write(piece)  # type: ignore[union-attr]
-
-    threading.Thread(target=hand_over, daemon=True).start()
 
 
 def private_host() -> str:

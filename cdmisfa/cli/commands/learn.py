@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.runs import RunResult
-    from replay.viewer.live import LiveView
 
 TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
@@ -171,13 +170,14 @@ def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
     ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
 
 
-def announce(view: LiveView) -> None:
+def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
     from replay.viewer.display import has_display
+    from replay.viewer.program import open_privately
 
-    click.echo(f"live view {view.address}    look at it: rerun {view.address}", err=True)
+    click.echo(f"live view {address}    look at it: rerun {address}", err=True)
     if has_display():
-        view.open_window()
+        open_privately(address)
 
 
 class Reporter(Sink):
