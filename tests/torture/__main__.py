@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
+import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -78,7 +81,10 @@ def _unprepared(name: str, error: Exception) -> dict[str, Any]:
 
 def _alone(opened: harness.Campaign, seed: int) -> int:
     folder = Path(tempfile.mkdtemp(prefix=f"torture-{opened.name}-{seed}-"))
-    line = harness.end(harness.begin(opened, seed, folder), keep=True)
+    case = harness.begin(opened, seed, folder)
+    if not select.select([case.pidfd], [], [], opened.limits.seconds)[0]:
+        os.kill(case.pid, signal.SIGKILL)
+    line = harness.end(case, keep=True)
     print(json.dumps({**line, "folder": str(folder)}, indent=1))
     return 1 if "defect" in line else 0
 

@@ -5,7 +5,19 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-CAMPAIGNS = (*("kills", "children", "power", "failing", "disks", "descriptors", "races", "damage"),)
+CAMPAIGNS = (
+    *(
+        "kills",
+        "children",
+        "follows",
+        "power",
+        "failing",
+        "disks",
+        "descriptors",
+        "races",
+        "damage",
+    ),
+)
 """Modules of this folder, in the order of the page."""
 
 

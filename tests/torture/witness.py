@@ -49,8 +49,8 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
         after(ViewParts, "write", lambda log, block: (log._view, log.t))
         after(RunWriter, "block", lambda log, block, signals, learner: ("run", learner.iteration))
         kept = runs.Checkpoints
-        runs.Checkpoints = lambda folder, source, learner, every, flush: kept(  # type: ignore
-            folder, source, learner, CHECKPOINT_EVERY, flush
+        runs.Checkpoints = lambda folder, source, learner, every, *more: kept(  # type: ignore
+            folder, source, learner, CHECKPOINT_EVERY, *more
         )
 
     return tweak
