@@ -89,6 +89,55 @@ def test_an_array_that_says_it_is_larger_than_its_file_is_refused(
         load_modules(tmp_path)
 
 
+def test_fields_of_a_later_version_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "modules.npz"
+    save_modules(path, [with_width(2)])
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **arrays, module1_later=np.zeros(3))
+    assert load_modules(path)[0].phi.tobytes() == arrays["module1_phi"].tobytes()
+    counts = arrays.pop("module1_counts")
+    np.savez(path, **arrays, module1_countt=counts)
+    with pytest.raises(LogDamagedError, match="countt"):
+        load_modules(path)
+
+
+def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
+    """A file that is cut, or of which something was flipped, zeroed, doubled or left out."""
+    at, n = sorted(rng.integers(0, len(whole) + 1, 2))
+    data = bytearray(whole)
+    match rng.integers(6):
+        case 0:
+            return bytes(data[:at])
+        case 1:
+            data[at : at + 8] = bytes(len(data[at : at + 8]))
+        case 2:
+            data[at:at] = data[at:n]
+        case 3:
+            del data[at : at + (n - at) % 64 + 1]
+        case _:
+            for place in rng.integers(0, len(data) * 8, rng.integers(1, 4)):
+                data[place // 8] ^= 1 << place % 8
+    return bytes(data)
+
+
+def test_damaged_modules_are_the_same_or_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "modules.npz"
+    save_modules(path, [replace(with_width(2), index=index) for index in (1, 2, 3)])
+    whole, rng = path.read_bytes(), np.random.default_rng(1)
+    first = [(m.index, m.phi.tobytes(), m.mean.tobytes()) for m in load_modules(path)]
+    loaded = 0
+    for number in range(1500):
+        path.write_bytes(damaged(whole, rng))
+        try:
+            found = load_modules(path)
+        except LogDamagedError:
+            continue
+        loaded += 1
+        assert [(m.index, m.phi.tobytes(), m.mean.tobytes()) for m in found] == first, number
+    assert loaded < 750
+
+
 def test_no_flipped_bit_makes_other_modules(tmp_path: Path) -> None:
     path = tmp_path / "modules.npz"
     numbers = (1, 2)

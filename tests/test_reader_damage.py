@@ -20,6 +20,7 @@ import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.integrity.recover import recover_log
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MAX_CHUNK
 from replay.recordings.source import RecordedSource
@@ -237,6 +238,23 @@ def test_a_lying_file_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(LogDamagedError, match=r"log\.mcap"):
         read_all(path)
     assert len(read_all(path, salvage=True)) <= 1
+
+
+def test_nothing_is_lost_with_the_summary_alone(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    whole = KINDS["zstd"]
+    path.write_bytes(whole)
+    with LogReader(path) as reader:
+        end = reader._structure.data_end + 13
+    flipped = bytearray(whole)
+    flipped[end + 20] ^= 8
+    for number, damaged in enumerate((whole[: end + 40], whole[:-20], bytes(flipped))):
+        path.write_bytes(damaged)
+        found = recover_log(path, tmp_path / f"{number}.mcap")
+        assert found.complete, (number, found.lost)
+        assert len(read_all(tmp_path / f"{number}.mcap")) == MESSAGES
+    path.write_bytes(whole[: end // 2])
+    assert not recover_log(path, tmp_path / "half.mcap").complete
 
 
 @pytest.mark.parametrize("places", [[(5, 0)], [(5, 2**50)], [(6, 42)], [(5, 42), (5, 42)], []])

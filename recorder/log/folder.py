@@ -127,7 +127,7 @@ def prepared_folder(
             stack.enter_context(held(folder))
             old = {*stale, *(path for view in views for path in view_logs(folder, view))}
             old |= {folder / RECORDING} if stale else set()
-            for path in sorted(old):
+            for path in sorted(old, reverse=True):  # what is left by a kill has its first parts
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise LogWriteError(f"{folder} cannot be used: {error.strerror}") from error

@@ -130,7 +130,16 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             )
             for number, tally in sorted(tallies.items())
         ]
-        return Recovery(str(dst), tuple(channels), problems_of(reader), unverified)
+        return Recovery(str(dst), tuple(channels), _lost(reader), unverified)
+
+
+def _lost(reader: LogReader) -> tuple[Problem, ...]:
+    """What is wrong with a log, but for its summary where every message is there."""
+    found = problems_of(reader)
+    if not reader.data_complete:
+        return found
+    index = {str(reader.path), *(f"{reader.path}: {part}" for part in ("summary", "footer"))}
+    return tuple(problem for problem in found if problem.where not in index)
 
 
 def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:

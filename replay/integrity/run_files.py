@@ -18,6 +18,9 @@ from replay.runs.modules import load_modules
 from replay.runs.stretches import read_columns
 from replay.storage.checksum import sha256
 
+MAKE_AGAIN = "make it again with cdmisfa view {run} --save {run}/run.rrd --force"
+"""How a view comes back; it holds nothing that the log does not."""
+
 
 def read_final(log: Path) -> Mapping[str, str] | None:
     """The final record of a run's log, None where it holds none."""
@@ -48,7 +51,7 @@ def check_run(log: Path, *, beside: bool) -> Iterator[Problem]:
     yield from _check_modules(folder / MODULES_FILE, final.get("modules_sha256"))
     view = folder / VIEW_FILE
     if final.get("view") == json.dumps(True) and not view.is_file():
-        yield Problem(str(view), "is missing; make it again with cdmisfa convert")
+        yield Problem(str(view), f"is missing; {MAKE_AGAIN.format(run=folder)}")
 
 
 def _check_signals(

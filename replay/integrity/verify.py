@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.integrity.run_files import check_run, read_final
+from replay.integrity.run_files import MAKE_AGAIN, check_run, read_final
 from replay.integrity.survey import SCHEMA, Crc, Kind, moved, survey
 from replay.mcap.reader import LogReader
 from replay.mcap.segments import Problem
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
+from replay.runs.folders import VIEW_FILE
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched
@@ -72,7 +73,10 @@ def check_log(path: str | Location) -> LogCheck:
             if kind == "recording":
                 views.append(file)
             if kind == "run" and not found and isinstance(file, Path):
-                problems += check_run(file, beside=isinstance(place, Path) and place.is_dir())
+                beside = isinstance(place, Path) and place.is_dir()
+                problems += check_run(file, beside=beside)
+                if beside and (view := file.parent / VIEW_FILE).is_file():
+                    notes.append(f"{view} is not checked: {MAKE_AGAIN.format(run=file.parent)}")
                 if read_final(file) is None:
                     notes.append(f"{file} holds no final record: nothing proves what is beside it")
         if views:

@@ -347,7 +347,7 @@ class LogStructure:
             found["messages"] = (stated.messages, total)
         for what, (said, there) in found.items():
             if said != there:
-                self._refuse("summary", f"it states {said} {what}, there are {there}")
+                self._refuse("statistics of the summary", f"{said} {what} stated, {there} there")
 
 
 def _fitting(chunk: Segment, end: int) -> Segment:

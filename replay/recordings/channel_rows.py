@@ -149,8 +149,7 @@ class ChannelRows:
             raise LogDamagedError(
                 f"{self._reader.path}: {self.channel.topic}: after frame "
                 f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
-                f"{frames[at]}: frames are missing or doubled; run cdmisfa verify; "
-                "cdmisfa learn --salvage leaves out what is missing"
+                f"{frames[at]}: frames are missing or doubled; {self._remedy()}"
             )
         edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
         for low, high in itertools.pairwise(edges):
@@ -159,6 +158,11 @@ class ChannelRows:
                 found[-1] = Span(found[-1].start, start + high - low, found[-1].row)
             else:
                 found.append(Span(start, start + high - low, row + low))
+
+    def _remedy(self) -> str:
+        if self._reader.salvage:
+            return "save what can be read with cdmisfa recover, and learn from that"
+        return "run cdmisfa verify; cdmisfa learn --salvage leaves out what is missing"
 
     def _times(self, number: int) -> NDArray[np.uint64]:
         """Log times of the messages in the `number`th chunk that holds any."""

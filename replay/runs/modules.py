@@ -98,12 +98,14 @@ def _module(stored: Arrays, index: int) -> Module:
 def _indices(stored: Arrays) -> list[int]:
     """The modules' indices, of a file in which every name is that of a module's field.
 
-    A checksum protects what the arrays hold, but nothing their names and number.
+    A checksum protects what the arrays hold, but nothing their names and number. A later version
+    may add fields to those of this one; one that is unknown in place of one that is not there is
+    a damaged name.
     """
     fields: dict[int, set[str]] = {}
     for name in stored:
         found = _NAME.fullmatch(name)
-        if found is None or found[2] not in _FIELDS:
+        if found is None:
             raise ValueError(f"{name[:40]!r} is nothing of a module")
         fields.setdefault(int(found[1]), set()).add(found[2])
     indices = sorted(fields)
@@ -111,6 +113,9 @@ def _indices(stored: Arrays) -> list[int]:
         raise ValueError(f"there are modules {indices}, one is missing")
     if any(fields[index] != fields[1] for index in indices):
         raise ValueError("a module lacks what another has")
+    unknown = sorted(fields[1] - _FIELDS) if indices else []
+    if unknown and not fields[1] > _FIELDS:
+        raise ValueError(f"{unknown[0][:40]!r} is nothing of a module")
     if any(int(stored[_key(index, "index")]) != index for index in indices):
         raise ValueError("the numbers of modules are mixed up")
     return indices
