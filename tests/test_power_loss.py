@@ -4,12 +4,26 @@ from __future__ import annotations
 
 import itertools
 import random
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from torture.calls import Call
-from torture.power import NAMES, OLD_NAMES, SYNCED, WRITTEN, ZEROS, Cut, Disk, cuts, go_on, record
-from torture.stories import STORIES
+from torture.power import (
+    NAMES,
+    OLD_NAMES,
+    SYNCED,
+    WRITTEN,
+    ZEROS,
+    Cut,
+    Disk,
+    cuts,
+    go_on,
+    record,
+    write_tree,
+)
+from torture.stories import FRAMES, OUT, STORIES, frames, iterations
 
 OLDER = ("run.before.mcap.partial", "x1.mcap.partial.kept")
 """Logs that are gone on with, until the new ones hold what they do."""
@@ -46,6 +60,34 @@ def test_what_was_there_before_is_not_given_up_for_what_the_disk_has_not(
     ]
     left = itertools.product(gone, (SYNCED, ZEROS), (NAMES, OLD_NAMES))
     goes_on([Cut(recorded, *how) for how in left], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "progress", "least"),
+    [
+        ("record", "x1.mcap.partial", frames, 3 * (FRAMES - 100)),
+        ("learn", "checkpoint-000000000450", iterations, 400),
+    ],
+)
+def test_fsync_every_bounds_what_a_power_cut_takes(
+    tmp_path: Path, name: str, before: str, progress: Callable[[Path], int], least: int
+) -> None:
+    """Before the last of a file is written, all but what was written since is on the disk."""
+    found = []
+    for number, option in enumerate(("", " --fsync-every 0")):
+        (tmp_path / f"recorded{number}").mkdir()
+        story = replace(STORIES[name], words=f"{STORIES[name].words}{option}")
+        recorded = record(story, tmp_path / f"recorded{number}")
+        about = enumerate(recorded.calls)
+        writes = [n for n, c in about if c.kind == "write" and c.path.name.startswith(before)]
+        cut = Cut(recorded, writes[0 if name == "learn" else -2], SYNCED, OLD_NAMES)
+        (tmp_path / f"left{number}").mkdir()
+        write_tree(cut.tree, tmp_path / f"left{number}")
+        found.append((recorded.result, progress(tmp_path / f"left{number}" / OUT)))
+    (result, kept), (same, more) = found
+    assert result == same
+    assert kept == 0
+    assert more >= least
 
 
 def test_a_disk_has_what_was_synced() -> None:
