@@ -25,10 +25,6 @@ FEWEST = 4
 ERRORS = 90
 """Blocks whose learning error is kept."""
 
-OF_ALL = 0.5
-"""Share of all tests that a window of tests is at least: what is learned from more and more
-frames is tested on more and more of them."""
-
 _TINY = 1e-12
 
 UNTESTED = 3.0
@@ -61,7 +57,7 @@ class Candidate:
         components: K.
         outputs: J.
         window: frames of the exponential window of its SFA.
-        test_window: blocks of that of its tests, which is longer from twice as many tests on.
+        test_window: blocks of that of its tests.
 
     Attributes:
         sfa: the recursive SFA.
@@ -123,7 +119,7 @@ class Candidate:
         have learned from neither of its frames.
         """
         self.tests += 1
-        rate = window_rate(max(self.test_window, OF_ALL * self.tests), self.tests)
+        rate = window_rate(self.test_window, self.tests)
         phi = self.sfa.phi
         offset = mean_output(phi, self.sfa.mean)
         y = self.y = project(phi, offset, frames)
