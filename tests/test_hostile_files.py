@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import zipfile
@@ -16,9 +15,9 @@ from camera_files import write_pictures
 from test_modules import learned, with_width
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.results import results
-from cdmisfa.experiments.resume import Checkpoint, checkpoints, load_checkpoint, save_checkpoint
 from cdmisfa.experiments.store import DONE, ROWS, read_rows
 from recorder.log.logfile import LogFile
 from replay.camera_logs import picture_folder
@@ -26,7 +25,9 @@ from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
 from replay.runs.folders import REQUEST, RUN_METADATA, runs_in
 from replay.runs.log import read_header
+from replay.runs.messages import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
+from replay.storage.arrays import stored_arrays
 
 
 @pytest.mark.parametrize(
@@ -163,19 +164,43 @@ def test_no_flipped_bit_makes_other_modules(tmp_path: Path) -> None:
             assert module.counts.tobytes() == before.counts.tobytes(), place
 
 
-def test_no_flipped_flag_of_a_checkpoint_is_unexpected(tmp_path: Path) -> None:
+def test_no_flipped_bit_of_a_keyframe_is_unexpected() -> None:
     learner, _ = learned("uint8", "none")
-    save_checkpoint(tmp_path, Checkpoint(learner.iteration, 0, learner.state, {}))
-    (path,) = checkpoints(tmp_path)
-    whole = path.read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        directory = archive.start_dir
-    for place in range(directory * 8 + 64, directory * 8 + 112):  # its version, flags and method
+    whole = encode_keyframe(Keyframe(learner.iteration, 0, learner.state, {"python": "3"}))
+    text = whole.index(b"{"), whole.rindex(b"}") + 1
+    refused = 0
+    for place in range(text[0] * 8, text[1] * 8, 3):
         damaged = bytearray(whole)
         damaged[place // 8] ^= 1 << place % 8
-        path.write_bytes(damaged)
-        with contextlib.suppress(LogDamagedError):
-            load_checkpoint(path)
+        try:
+            decode_keyframe(bytes(damaged))
+        except LogDamagedError:
+            refused += 1
+    assert refused > 1000
+
+
+@pytest.mark.parametrize(
+    ("listed", "why"),
+    [
+        ([["a", "<f8", [10**9, 10**9]]], "no array of it"),
+        ([["a", "<f8", [-1]]], "no array of it"),
+        ([["a", "|O", [1]]], "no plain type"),
+        ([["a", [["b", "|O"]], [1]]], "no plain type"),
+        ([["a", [["b", [["c", "|O"]]]], [1]]], "impossible"),
+        ([["a", [[]], [1]]], "impossible"),
+        ([["a", "<f8", [0.5]]], "impossible"),
+        ([["a", "<f8", ["x"]]], "impossible"),
+        ([["a", "<f8", [1] * 99]], "maximum supported dimension"),
+        ([["a", "(" * 3000, [1]]], "no plain type"),
+        ([["a", "<f8", [1]]], "have 8 bytes, and it has 16"),
+        ([["a", None, 3]], "impossible"),
+        ([3], "impossible"),
+        (3, "impossible"),
+    ],
+)
+def test_arrays_that_are_not_in_their_bytes_are_refused(listed: object, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        stored_arrays(listed, bytes(16))
 
 
 DEEP = "[" * 100_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, learn
-from cdmisfa.experiments.resume import Checkpoints, checkpoints
+from cdmisfa.experiments.resume import Keyframes
 from cdmisfa.paper.demo import Shown
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
@@ -66,9 +67,15 @@ class TestRunWriter(SinkContract):
         return RunWriter(folder / "run.mcap", source.spec, {})
 
 
-class TestCheckpoints(SinkContract):
+class TestKeyframes(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        return Checkpoints(folder, source, learner, 7, lambda: None, lambda: None)
+        self.log = RunWriter(folder / "run.mcap", source.spec, {})
+        return Keyframes(self.log, source, learner, 7)
+
+    @pytest.fixture(autouse=True)
+    def abandoned(self) -> Iterator[None]:
+        yield
+        self.log.abandon()
 
 
 class TestLiveView(SinkContract):
@@ -134,13 +141,8 @@ def test_a_sink_that_fails_ends_the_run_and_finishes_nothing() -> None:
 def test_a_learner_learns_on_from_where_it_is(tmp_path: Path) -> None:
     source = OscillatorySource()
     learner, digest = learner_for(source), Digest()
-    keep = Checkpoints(tmp_path, source, learner, 4, lambda: None, lambda: None)
     for iterations in (3, 11):
-        learn(source, learner, (digest, keep), max_iterations=iterations, max_modules=9)
+        learn(source, learner, (digest,), max_iterations=iterations, max_modules=9)
     whole, straight = OscillatorySource(), Digest()
     learn(whole, learner_for(whole), (straight,), max_iterations=11, max_modules=9)
     assert digest.hexdigest() == straight.hexdigest()
-    assert [path.name for path in checkpoints(tmp_path)] == [
-        "checkpoint-000000000011.npz",
-        "checkpoint-000000000008.npz",
-    ]

@@ -12,8 +12,9 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.resume import Checkpoint, checkpoints, load_checkpoint, save_checkpoint
+from replay.runs.messages import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
 from replay.runs.transformer import SlowFeatures
 
@@ -108,18 +109,11 @@ def test_a_file_with_other_things_in_their_place_is_damaged(
         load_modules(tmp_path / "bad.npz")
 
 
-def test_checkpoints_keep_both_and_are_read_without(tmp_path: Path) -> None:
+def test_keyframes_keep_both() -> None:
     learner, _ = learned("uint8", "none")
-    save_checkpoint(tmp_path, Checkpoint(learner.iteration, 0, learner.state, {}))
-    (path,) = checkpoints(tmp_path)
-    modules = load_checkpoint(path).state.modules
+    keyframe = Keyframe(learner.iteration, 0, learner.state, {})
+    modules = decode_keyframe(encode_keyframe(keyframe)).state.modules
     assert {(module.expansion, module.scale) for module in modules} == {("none", 1 / 255)}
-    with np.load(path) as stored:
-        old = {k: v for k, v in stored.items() if k not in ("modules.expansion", "modules.scale")}
-    assert len(old) == len(stored.files) - 2
-    np.savez(path, **old)
-    learner.restore(load_checkpoint(path).state)
-    assert {(m.expansion, m.scale) for m in learner.modules} == {("none", 1 / 255)}
 
 
 def test_a_write_that_fails_leaves_the_earlier_modules_and_nothing_else(

@@ -131,9 +131,7 @@ def test_live_recorded_and_resumed_are_the_same_bit_for_bit(tmp_path: Path) -> N
     record(MovingPictures(*names), tmp_path / "log", frames=live.frames)
     recorded = run(RecordedSource([tmp_path / "log"]), CONFIG, tmp_path / "recorded", rerun=False)
     assert recorded.signals_sha256 == live.signals_sha256
-    stopped = run(
-        MovingPictures(*names), CONFIG, tmp_path / "run", max_iterations=37, checkpoint_every=10
-    )
+    stopped = run(MovingPictures(*names), CONFIG, tmp_path / "run", max_iterations=37, keyframes=10)
     assert stopped.iterations == 37
     resumed = run(MovingPictures(*names), CONFIG, tmp_path / "run", resume=True)
     assert (resumed.signals_sha256, resumed.iterations) == (live.signals_sha256, live.iterations)

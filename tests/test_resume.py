@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,23 +20,21 @@ from run_data import parts_of, read_signals
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
-from cdmisfa.core.learning import Learner, LearnerState, Sink
+from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.core.learning import Keyframe, Learner, LearnerState, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.resume import (
-    SET_ASIDE,
-    checkpoints,
-    differences,
-    load_checkpoint,
-    newest_covered,
-)
+from cdmisfa.experiments.resume import SET_ASIDE, Keyframes, differences
 from cdmisfa.experiments.runs import RunResult, run
 from recorder.config import RecordConfig
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
+from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
+from replay.runs.folders import run_log
+from replay.runs.log import KEYFRAME_TOPIC, read_keyframe
+from replay.runs.writer import RunWriter
 
 CONFIG = LearnerConfig(
     tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
@@ -67,10 +64,16 @@ class Told(Sink):
         self.tell(learner)
 
 
+def keyframes(out: Path) -> list[int]:
+    """Iterations after which a run's log holds keyframes."""
+    with LogReader(run_log(out)) as reader:
+        return [m.sequence for m in reader.messages([KEYFRAME_TOPIC])]
+
+
 def go(
     source: FrameSource, out: Path | None, iterations: int, config: LearnerConfig = CONFIG, **more
 ) -> RunResult:
-    more = {"max_modules": 99, "seed": 3, "rerun": False, "checkpoint_every": EVERY} | more
+    more = {"max_modules": 99, "seed": 3, "rerun": False, "keyframes": EVERY} | more
     return run(source, config, out, max_iterations=iterations, **more)
 
 
@@ -91,7 +94,8 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped:
     assert first_difference(whole, out) is None
     assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
     assert not list(out.glob("*.partial"))
-    assert len(checkpoints(out)) <= 2
+    kept = keyframes(out)
+    assert kept == sorted({*range(EVERY, LENGTH + 1, EVERY), stopped, LENGTH})
 
 
 def test_a_run_says_that_it_was_resumed(tmp_path: Path) -> None:
@@ -141,7 +145,7 @@ def test_a_simulator_goes_on(tmp_path: Path) -> None:
     source.close()
     for iterations, resume in ((6, False), (10, True)):
         source = live()
-        result = go(source, tmp_path / "run", iterations, config, checkpoint_every=4, resume=resume)
+        result = go(source, tmp_path / "run", iterations, config, keyframes=4, resume=resume)
         source.close()
     assert result.signals_sha256 == straight.signals_sha256
 
@@ -175,7 +179,13 @@ def test_kill_9_anywhere_loses_nothing(whole: Path, tmp_path: Path) -> None:
     partial = out / "run.mcap.partial"
 
     def reached(iteration: int) -> Callable[[], bool]:
-        return lambda: any(load_checkpoint(p).iteration >= iteration for p in checkpoints(out)[:1])
+        def has() -> bool:
+            with contextlib.suppress(CdmisfaError):  # the log is just being begun
+                found = read_keyframe(out)
+                return found is not None and found.iteration >= iteration
+            return False
+
+        return has
 
     killed_when(out, False, lambda: partial.exists() and partial.stat().st_size > 20_000)
     killed_when(out, True, reached(2 * EVERY))
@@ -194,30 +204,34 @@ def test_a_kill_while_resuming_loses_nothing(whole: Path, tmp_path: Path) -> Non
     assert first_difference(whole, out) is None
 
 
-def test_a_log_that_lost_its_end_goes_on_from_the_older_checkpoint(
-    whole: Path, tmp_path: Path
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.8, 0.95])
+def test_a_log_that_lost_its_end_goes_on_from_an_older_keyframe(
+    whole: Path, tmp_path: Path, part: float
 ) -> None:
-    out, short = tmp_path / "run", tmp_path / "short"
-    go(OscillatorySource(), out, 57)
-    go(OscillatorySource(), short, 50)
-    shutil.copy(short / "run.mcap", out / "run.mcap")
-    go(OscillatorySource(), out, LENGTH, resume=True)
-    assert first_difference(whole, out) is None
-    assert "resumed at iteration 40" in [event.text for event in parts_of(out, "events")]
-
-
-@pytest.mark.parametrize("damaged", [1, 2])
-def test_damaged_checkpoints_are_passed_over(whole: Path, tmp_path: Path, damaged: int) -> None:
     out = tmp_path / "run"
     go(OscillatorySource(), out, 57)
-    for path in checkpoints(out)[:damaged]:
-        data = bytearray(path.read_bytes())
-        data[len(data) // 2] ^= 1
-        path.write_bytes(data)
-        with pytest.raises(LogDamagedError, match=path.name):
-            load_checkpoint(path)
+    log = (out / "run.mcap").read_bytes()
+    (out / "run.mcap").unlink()
+    (out / "run.mcap.partial").write_bytes(log[: int(len(log) * part)])
+    found = read_keyframe(out)
     go(OscillatorySource(), out, LENGTH, resume=True)
     assert first_difference(whole, out) is None
+    texts = [event.text for event in parts_of(out, "events")]
+    assert (found is not None) == (part > 0.2)
+    assert found is None or f"resumed at iteration {found.iteration}" in texts
+
+
+def test_a_run_from_before_keyframes_goes_on_from_its_beginning(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    with monkeypatch.context() as before:
+        before.setattr(RunWriter, "keyframe", lambda *_: None)
+        go(OscillatorySource(), out, 57)
+    (out / "checkpoint-000000000057.npz").write_bytes(b"")
+    go(OscillatorySource(), out, LENGTH, resume=True)
+    assert first_difference(whole, out) is None
+    assert not list(out.glob("checkpoint*"))
 
 
 def test_a_kill_before_the_log_says_anything_starts_anew(whole: Path, tmp_path: Path) -> None:
@@ -287,28 +301,17 @@ def test_a_forced_run_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:
     out = tmp_path / "run"
     go(OscillatorySource(), out, 60)
     go(OscillatorySource(), out, 20, seed=4, force=True)
-    assert [load_checkpoint(path).iteration for path in checkpoints(out)] == [20]
+    assert keyframes(out) == [20]
 
 
-def test_checkpoints_hold_no_code(tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint-000000000001.npz"
-    np.savez(path, checkpoint=np.array([object()], dtype=object))
-    with pytest.raises(LogDamagedError, match="not a whole checkpoint"):
-        load_checkpoint(path)
-    np.savez_compressed(path, checkpoint=np.zeros(10_000_000, np.uint8))
-    with pytest.raises(LogDamagedError, match="compressed"):
-        load_checkpoint(path)
-    path.write_bytes(b"")
-    with pytest.raises(LogDamagedError):
-        load_checkpoint(path)
-    assert newest_covered(tmp_path, 10) is None
-
-
-def test_a_checkpoint_gives_the_state_back(tmp_path: Path) -> None:
+def test_a_keyframe_gives_the_state_back(tmp_path: Path) -> None:
     source = OscillatorySource()
     out = tmp_path / "run"
     go(source, out, 60)
-    state = load_checkpoint(checkpoints(out)[0]).state
+    found = read_keyframe(out)
+    assert found is not None
+    assert (found.iteration, found.t) == (60, 60 * CONFIG.tau)
+    state = found.state
     learner = CuriousLearner(CONFIG, source.spec, 3)
     learner.restore(state)
     again = learner.state
@@ -316,7 +319,53 @@ def test_a_checkpoint_gives_the_state_back(tmp_path: Path) -> None:
     assert len(again.modules) == len(state.modules) > 0
     for name, array in state.arrays.items():
         assert again.arrays[name].tobytes() == array.tobytes()
-    assert not zipfile.ZipFile(checkpoints(out)[0]).testzip()
+
+
+@pytest.mark.parametrize(("last", "expected"), [(19, None), (20, 20), (59, 40), (10**6, 60)])
+def test_the_keyframe_at_or_before_an_iteration(
+    tmp_path: Path, last: int, expected: int | None
+) -> None:
+    go(OscillatorySource(), tmp_path / "run", 60)
+    found = read_keyframe(tmp_path / "run", last)
+    assert (None if found is None else found.iteration) == expected
+
+
+class RoomyLog:
+    """Grows by so many bytes a block, and by so many a keyframe."""
+
+    def __init__(self, block: int, keyframe: int) -> None:
+        self.size, self.each, self.kept = 0, (block, keyframe), list[tuple[int, int]]()
+
+    def keyframe(self, keyframe: Keyframe) -> None:
+        self.size += self.each[1]
+        self.kept.append((keyframe.iteration, self.size))
+
+    def flush(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("block", "size", "every", "expected"),
+    [
+        (10**6, 10, None, [100, 200, 300]),
+        (1000, 30_000, None, [100, 300]),
+        (1, 30_000, None, []),
+        (1, 30_000, 150, [150, 300]),
+        (1, 30_000, 0, []),
+    ],
+)
+def test_keyframes_wait_until_the_log_has_room_for_them(
+    block: int, size: int, every: int | None, expected: list[int]
+) -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    log = RoomyLog(block, size)
+    keep = Keyframes(log, source, learner, every)
+    for _ in range(300):
+        shown = source.take(learner.stream, learner.tau)
+        signals = learner.step(shown)
+        log.size += block
+        keep.block(shown, signals, learner)
+    assert [iteration for iteration, _ in log.kept] == expected
 
 
 def test_a_state_of_another_shape_is_refused() -> None:

@@ -64,6 +64,14 @@ preset = click.option(
     help="Preset (icub, oscillatory) or a .toml file; by default the one of the source.",
 )
 
+keyframes = click.option(
+    "--keyframes",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Keep the learner's state every N iterations; by default every 100, or less often so "
+    "that they stay a small part of the log.",
+)
+
 fsync_every = click.option(
     "--fsync-every",
     type=click.FloatRange(0.0, 1e6),

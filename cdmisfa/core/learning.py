@@ -34,6 +34,26 @@ class LearnerState:
     policy_rng: Mapping[str, Any]
 
 
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """Where a run stood after some iterations, from which it can go on.
+
+    Attributes:
+        iteration: iterations done.
+        t: the source's next frame.
+        state: of the learner.
+        versions: of the packages that computed it.
+        taken: the SHA-256 of the frames before it, of a source that says so; see
+            `FollowedSource`.
+    """
+
+    iteration: int
+    t: int
+    state: LearnerState
+    versions: Mapping[str, str]
+    taken: str | None = None
+
+
 @runtime_checkable
 class Learner(Protocol):
     """Blocks in, signals out. The same blocks give the same signals, bit for bit."""

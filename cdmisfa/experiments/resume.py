@@ -1,35 +1,29 @@
-"""What a run is resumed from: the command that began it, its log, and its checkpoints.
+"""What a run is resumed from: the command that began it, and its log with its keyframes.
 
-A checkpoint is a learner's state in one file of plain arrays and a JSON text, written whole or
-not at all. It holds no signals: those are in the run's log, which is always flushed first. So a
-run that was stopped anywhere is resumed from the newest checkpoint that its log covers.
+A keyframe is a learner's state, which stands in the log after the iterations that led to it. So a
+run that was stopped anywhere is resumed from the newest keyframe that can be read.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import math
 import os
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
-from cdmisfa.core.learning import Learner, LearnerState, Sink
-from cdmisfa.core.modules import Module
+from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import versions
 from recorder.log.begun import Begun, found_path, relative_path
-from recorder.log.whole import partial_path, whole
+from recorder.log.whole import partial_path
 from recorder.world.scenes import SCENES
+
+if TYPE_CHECKING:
+    from replay.runs.writer import RunWriter
 
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
@@ -48,24 +42,18 @@ OPTIONS = (
     "rate",
     "max_iterations",
     "max_modules",
+    "keyframes",
 )
 """What of a command makes a run what it is, and where it ends, besides its source."""
 
 SET_ASIDE = "run.before.mcap.partial"
 """The log of a run that is being resumed, until the new one has taken over what counts."""
 
-SCHEMA = 2
-"""Version of a checkpoint; rises when the state of a learner changes its meaning."""
+EVERY = 100
+"""Iterations between two keyframes, where nothing else is said and the log has room for them."""
 
-KEPT = 2
-"""Newest checkpoints that a run's folder keeps: one more in case the log of the last was lost."""
-
-SETTLED_SECONDS = 60.0
-"""Time after which the operating system has written a file by itself; Linux does within 35."""
-
-_HEAD = "checkpoint"
-_MODULES = "modules."
-_PLAIN = ("index", "stream", "stream_index", "iteration")
+SHARE = 5
+"""A keyframe waits until the log has grown by so many times the size of the one before."""
 
 
 def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
@@ -103,197 +91,60 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     return begun.source, options
 
 
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """Where a run stood after some iteration.
+class Keyframes(Sink):
+    """Writes where a run stands into its log, every so many iterations and at its end.
 
-    Attributes:
-        iteration: iterations done.
-        t: the source's next frame.
-        state: of the learner.
-        versions: of the packages that computed it.
-        taken: the SHA-256 of the frames before it, of a source that says so; see
-            `FollowedSource`.
-    """
-
-    iteration: int
-    t: int
-    state: LearnerState
-    versions: Mapping[str, str]
-    taken: str | None = None
-
-
-def save_checkpoint(run: Path, checkpoint: Checkpoint, *, sync: bool = False) -> Path:
-    """Write a checkpoint into a run's folder.
-
-    The run's log must already hold every iteration before it; with `sync`, on disk.
-    """
-    path = checkpoint_path(run, checkpoint.iteration)
-    head = {
-        "schema": SCHEMA,
-        "iteration": checkpoint.iteration,
-        "t": checkpoint.t,
-        "policy_rng": checkpoint.state.policy_rng,
-        "versions": checkpoint.versions,
-        "taken": checkpoint.taken,
-    }
-    arrays: dict[str, NDArray[Any]] = {_HEAD: np.frombuffer(json.dumps(head).encode(), np.uint8)}
-    for field in dataclasses.fields(Module):
-        values = [getattr(module, field.name) for module in checkpoint.state.modules]
-        arrays[_MODULES + field.name] = np.array(values)
-    arrays.update(checkpoint.state.arrays)
-    # One that is not synced and cut by a power cut is passed over as damaged.
-    with whole(path, sync=sync) as partial, open(partial, "wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
-    return path
-
-
-def checkpoint_path(run: Path, iteration: int) -> Path:
-    """Where a checkpoint lies in a run's folder."""
-    return run / f"checkpoint-{iteration:012d}.npz"
-
-
-def drop(paths: Iterable[Path]) -> None:
-    """Remove files of a run that nothing needs any more.
-
-    Raises:
-        LogWriteError: one cannot be removed.
-    """
-    for path in paths:
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            raise LogWriteError(f"{path} cannot be removed: {error.strerror}") from error
-
-
-def checkpoints(run: Path) -> list[Path]:
-    """The checkpoints in a run's folder, newest first."""
-    return sorted(run.glob("checkpoint-*.npz"), reverse=True)
-
-
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint.
-
-    Raises:
-        LogDamagedError: the file is damaged, or not a checkpoint of this version.
-    """
-    from replay.storage.arrays import read_arrays
-
-    try:
-        arrays = read_arrays(path)
-        head = json.loads(arrays.pop(_HEAD).tobytes())
-        if head["schema"] != SCHEMA:
-            raise LogDamagedError(f"{path}: a checkpoint of version {head['schema']}, not {SCHEMA}")
-        columns = {
-            name.removeprefix(_MODULES): arrays.pop(name)
-            for name in list(arrays)
-            if name.startswith(_MODULES)
-        }
-        state = LearnerState(arrays, _modules(columns), head["policy_rng"])
-        at, t = int(head["iteration"]), int(head["t"])
-        return Checkpoint(at, t, state, head["versions"], head.get("taken"))
-    except (OSError, LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise LogDamagedError(
-            f"{path}: not a whole checkpoint ({one_line(error)}); remove it"
-        ) from error
-
-
-def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
-    values: Any = {
-        name: column.tolist() if name in _PLAIN else list(column)
-        for name, column in columns.items()
-    }
-    rows = zip(*values.values(), strict=True)
-    return tuple(Module(**dict(zip(values, row, strict=True))) for row in rows)
-
-
-def newest_covered(run: Path, iterations: int) -> Checkpoint | None:
-    """The newest readable checkpoint whose past a log of so many iterations holds.
-
-    None starts from the beginning.
-    """
-    for path in checkpoints(run):
-        with contextlib.suppress(LogDamagedError):
-            checkpoint = load_checkpoint(path)
-            if checkpoint.iteration <= iterations:
-                return checkpoint
-    return None
-
-
-class Checkpoints(Sink):
-    """Saves where a run stands, every so many iterations and at its end.
-
-    It comes after the run's log, which must hold every iteration before a checkpoint.
+    It comes after the log, which then holds every iteration before.
 
     Args:
-        run: the run's folder.
+        log: of the run.
         source: what it learns from.
         learner: what learns.
-        every: iterations between two; 0 saves one at the end only.
-        flush: hands all of the log to the operating system.
-        sync: lets the disk have all of it.
-        fsync_every: seconds after which the disk is to have a checkpoint, too.
+        every: iterations between two, 0 writes one at the end only; None for as often as
+            `EVERY` iterations, where they stay below a part in `SHARE` of the log before them.
     """
 
     def __init__(
-        self,
-        run: Path,
-        source: FrameSource,
-        learner: Learner,
-        every: int,
-        flush: Callable[[], None],
-        sync: Callable[[], None],
-        fsync_every: float | None = None,
+        self, log: RunWriter, source: FrameSource, learner: Learner, every: int | None = None
     ) -> None:
-        self._run, self._source, self._learner = run, source, learner
-        self._every, self._flush, self._sync = every, flush, sync
-        self._fsync_every = math.inf if fsync_every is None else fsync_every
-        self._synced = time.monotonic()
-        self._settled: Path | None = None
-        self._settling: tuple[Path, float] | None = None
+        self._log, self._source, self._learner = log, source, learner
+        self._every = EVERY if every is None else every
+        self._share = SHARE if every is None else 0
+        self._due = 0
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
-        if self._every and learner.iteration % self._every == 0:
-            if time.monotonic() - self._synced >= self._fsync_every:
-                self._sync()
-                self._save(sync=True)
-                self._synced = time.monotonic()
-            else:
-                self._flush()
-                self._save(sync=False)
+        if not self._every or learner.iteration % self._every:
+            return
+        self._log.flush()
+        before = self._log.size
+        if before < self._due:
+            return
+        keyframe = self._keyframe()
+        if not self._due:  # the first, of which nobody knows yet how small it is compressed
+            self._due = self._share * sum(a.nbytes for a in keyframe.state.arrays.values())
+            if before < self._due:
+                return
+        self._log.keyframe(keyframe)
+        self._due = self._log.size + self._share * (self._log.size - before)
 
     def finish(self) -> None:
         """See `Sink`."""
-        self._sync()
-        self._save(sync=True)
+        self._log.keyframe(self._keyframe())
+        self._log.sync()
 
-    def _save(self, *, sync: bool) -> None:
-        """Save a checkpoint, and drop all but the newest and one that the disk has."""
-        if self._settled is None and self._settling is None:
-            self._settled = next(iter(checkpoints(self._run)), None)  # from which it was resumed
-        learner, now = self._learner, time.monotonic()
-        at, t, taken = learner.iteration, self._source.t, getattr(self._source, "taken", None)
-        checkpoint = Checkpoint(at, t, learner.state, versions(), taken)
-        path = save_checkpoint(self._run, checkpoint, sync=sync)
-        if sync:
-            self._settled, self._settling = path, None
-        elif self._settling is None:
-            self._settling = path, now
-        elif now - self._settling[1] >= SETTLED_SECONDS:
-            self._settled, self._settling = self._settling[0], (path, now)
-        kept = {self._settled, self._settling and self._settling[0]}
-        drop(p for p in checkpoints(self._run)[KEPT:] if p not in kept)
+    def _keyframe(self) -> Keyframe:
+        learner, taken = self._learner, getattr(self._source, "taken", None)
+        return Keyframe(learner.iteration, self._source.t, learner.state, versions(), taken)
 
 
-def restore(learner: Learner, checkpoint: Checkpoint) -> None:
-    """Put a learner where a checkpoint of this configuration stands."""
+def restore(learner: Learner, keyframe: Keyframe) -> None:
+    """Put a learner where a keyframe of this configuration stands."""
     try:
-        learner.restore(checkpoint.state)
-    except (KeyError, TypeError, ValueError) as error:
-        raise LogDamagedError(
-            f"checkpoint at iteration {checkpoint.iteration}: {error}; remove it"
-        ) from error
+        learner.restore(keyframe.state)
+    except (LookupError, TypeError, ValueError) as error:
+        what = f"the keyframe after {keyframe.iteration} iterations is of another learner"
+        raise LogDamagedError(f"{what} ({one_line(error)})") from error
 
 
 def log_to_resume(run: Path) -> Path:
@@ -318,7 +169,7 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
     from replay.runs.folders import RUN_FILE
 
     found = log_to_resume(run)
-    if found == partial_path(run / RUN_FILE) and not checkpoints(run) and not _has_header(found):
+    if found == partial_path(run / RUN_FILE) and not _has_header(found):
         return
     refuse_difference(run, found, spec, manifest)
     try:

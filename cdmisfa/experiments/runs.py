@@ -1,7 +1,7 @@
 """One run: a source, a learner, and the folder that keeps what happened.
 
 RUN/run.mcap signals, RUN/modules.npz frozen modules, RUN/run.json manifest and result,
-RUN/run.rrd the view, RUN/checkpoint-*.npz to resume from. The loop itself is in `loop`.
+RUN/run.rrd the view. The loop itself is in `loop`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.compiled import needs_compiling
 from cdmisfa.core.config import as_table
-from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
@@ -28,11 +28,7 @@ from cdmisfa.experiments.loop import Digest, learn
 from cdmisfa.experiments.resume import (
     COMMAND,
     SET_ASIDE,
-    Checkpoints,
-    checkpoint_path,
-    checkpoints,
-    drop,
-    newest_covered,
+    Keyframes,
     restore,
     set_aside,
 )
@@ -115,7 +111,7 @@ def run(
     sinks: Sequence[Sink] = (),
     stop: Callable[[], bool] = lambda: False,
     resume: bool = False,
-    checkpoint_every: int = 200,
+    keyframes: int | None = None,
     fsync_every: float | None = None,
     live: bool = False,
     announce: Callable[[str], None] | None = None,
@@ -137,9 +133,9 @@ def run(
         stop: asked before every iteration; true ends the run cleanly.
         resume: resume the run in `folder` where it was stopped, in whatever way; its
             signals become those of a run that was never stopped.
-        checkpoint_every: iterations between checkpoints; 0 writes one at the end only.
-        fsync_every: seconds after which the disk has the log and a checkpoint, so that a power cut
-            takes no more; None leaves it to the operating system until the run is finished.
+        keyframes: iterations between keyframes, see `Keyframes`.
+        fsync_every: seconds after which the disk has the log, so that a power cut takes no more;
+            None leaves it to the operating system until the run is finished.
         live: also show the run in Rerun while it learns, to viewers on this machine.
         announce: called with the address of the live view.
         command: how the run is begun, kept with it; see `resume.command_of`.
@@ -178,9 +174,7 @@ def run(
             )
             told += [
                 _Unfinished(log),
-                Checkpoints(
-                    folder, source, learner, checkpoint_every, log.flush, log.sync, fsync_every
-                ),
+                Keyframes(log, source, learner, keyframes),
             ]
         elif resume:
             raise UsageError("which run to resume? name its folder")
@@ -276,10 +270,11 @@ def _run_log(
         if others := [path for path in logs_in(out) if path.name not in own]:
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [out / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE)]
+        stale += out.glob("checkpoint-*.npz")  # of runs from before keyframes
         if resume:
             set_aside(out, spec, manifest)
         else:
-            stale += [out / RUN_FILE, out / SET_ASIDE, *checkpoints(out)]
+            stale += [out / RUN_FILE, out / SET_ASIDE]
         try:
             refuse_special(*stale)
             for path in stale:
@@ -302,38 +297,40 @@ def _no_folder(out: Path, error: OSError) -> UsageError:
 
 
 def _restore(log: Any, learner: Learner, source: Any, digest: Digest) -> None:
-    """Bring log, learner, source and digest to where the run's newest checkpoint stands."""
-    from replay.runs.log import count_iterations
+    """Bring log, learner, source and digest to where the run's newest keyframe stands."""
+    from replay.runs.log import read_keyframe
 
     folder = log.path.parent
     before = folder / SET_ASIDE
     if not before.exists():
         return
-    checkpoint = newest_covered(folder, count_iterations(before))
-    if checkpoint is not None:
-        restore(learner, checkpoint)
-        for signals in log.take_over(before, checkpoint.iteration):
+    keyframe = read_keyframe(before)
+    if keyframe is not None:
+        restore(learner, keyframe)
+        for signals in log.take_over(before, keyframe.iteration):
             digest.add(signals)
-            if checkpoint.taken is not None:
+            if keyframe.taken is not None:
                 source.take(signals.stream, learner.tau)
-        if checkpoint.taken is not None and source.taken != checkpoint.taken:
+        if keyframe.taken is not None and source.taken != keyframe.taken:
             raise LogDamagedError(
                 f"{folder}: what it learned from is not there any more: begin anew with --force, "
                 "or choose another folder"
             )
-        source.seek(checkpoint.t)
-        last = max(checkpoint.iteration - 1, 0)
-        log.event(source.t, last, f"resumed at iteration {checkpoint.iteration}")
+        source.seek(keyframe.t)
+        last = max(keyframe.iteration - 1, 0)
+        log.event(source.t, last, f"resumed at iteration {keyframe.iteration}")
         changed = [
-            f"{name} is {now}, was {checkpoint.versions.get(name)}"
+            f"{name} is {now}, was {keyframe.versions.get(name)}"
             for name, now in versions().items()
-            if checkpoint.versions.get(name) != now
+            if keyframe.versions.get(name) != now
         ]
         if changed:
             log.event(source.t, last, "; ".join(changed), "WARNING")
     log.sync()
-    covered = checkpoint_path(folder, 0 if checkpoint is None else checkpoint.iteration)
-    drop([*(path for path in checkpoints(folder) if path > covered), before])
+    try:
+        before.unlink()
+    except OSError as error:
+        raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
 
 
 def _say_if_compiling() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,16 +13,18 @@ import numpy as np
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
 from replay.mcap.reader import LogReader
 from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
-from replay.runs.messages import missing
+from replay.runs.messages import decode_keyframe, missing
 
 SIGNALS_TOPIC = "/signals"
 WATCHED_TOPIC = "/watched"
 PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
+KEYFRAME_TOPIC = "/keyframe"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,12 +115,30 @@ def read_header(path: Path) -> RunHeader:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
 
-def count_iterations(path: Path) -> int:
-    """How many iterations' records a run's log holds, without decoding them."""
-    with LogReader(run_log(path)) as reader:
-        numbers = [n for n, channel in reader.channels.items() if channel.topic == SIGNALS_TOPIC]
-        tables = (table for _, table in reader.tables(ordered=False))
-        return sum(int(np.isin(table.channel, numbers).sum()) for table in tables)
+def read_keyframe(path: Path, last: int | None = None) -> Keyframe | None:
+    """The newest keyframe of a run's log at or before so many iterations, None where there is none.
+
+    Only the chunks that hold keyframes are read. What is no keyframe of this version is passed
+    over.
+    """
+    log = run_log(path)
+    with LogReader(log) as reader:
+        own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
+        for segment in reversed(reader.segments):
+            counts = segment.channel_counts()
+            if counts is not None and not own & counts.keys():
+                continue
+            table = reader.table(segment)
+            if table is None:
+                continue
+            for row in np.flatnonzero(np.isin(table.channel, list(own)))[::-1].tolist():
+                if last is not None and int(table.headers["sequence"][row]) > last:
+                    continue
+                with contextlib.suppress(LogDamagedError):
+                    keyframe = decode_keyframe(table.payload(row), f"{log} {KEYFRAME_TOPIC}")
+                    if last is None or keyframe.iteration <= last:
+                        return keyframe
+    return None
 
 
 def record_version(metadata: Mapping[str, str]) -> int:

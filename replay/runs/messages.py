@@ -7,12 +7,17 @@ version of the record follow all of the versions before.
 `cdmisfa.Matrix` holds rows of float64 from frame t on: a block's vectors, its ground truth, or
 the abstraction's weights.
 
+`cdmisfa.Keyframe` holds a learner's state after some iterations: the arrays one after the other
+in `values`, and in the JSON text `facts` what each one is, and all else.
+
 Every number has a fixed width, so what is read is, bit for bit, what was written. And messages
 whose sizes are the same differ in their values alone: one says where the values of all stand.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,13 +27,20 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import LogDamagedError, one_line
+from cdmisfa.core.learning import Keyframe, LearnerState
+from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import MISSING, SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
 from recorder.log.messages import varint
 from replay.mcap.records import MalformedRecord
+from replay.storage.arrays import contents, stored_arrays
 
 SIGNALS_SCHEMA = "cdmisfa.BlockSignals"
 MATRIX_SCHEMA = "cdmisfa.Matrix"
+KEYFRAME_SCHEMA = "cdmisfa.Keyframe"
+
+KEYFRAME_VERSION = 1
+"""Version of a keyframe; rises when the state of a learner changes its meaning."""
 
 Span = tuple[int, int]
 """Where a value begins and ends in a message."""
@@ -44,6 +56,7 @@ _TYPES = {"float64": _FIELD.TYPE_DOUBLE, "int64": _FIELD.TYPE_SFIXED64, "bool": 
 _CODES = {"float64": "d", "int64": "q", "bool": "?"}
 _WIRE = {"float64": 1, "int64": 1, "bool": 0}
 _VARINT, _LENGTH_DELIMITED = 0, 2
+_MODULES = "modules."
 _WIDTHS = {1: 8, 5: 4}
 _LONGEST = 10  # bytes of a varint
 
@@ -114,6 +127,52 @@ def decode_matrices(
         return
     frames = column(table, (1, 9), "<i8") + np.arange(len(first))
     yield frames.reshape(-1), column(table, values, "<f8").reshape(frames.size, first.shape[1])
+
+
+def encode_keyframe(keyframe: Keyframe) -> bytes:
+    """A keyframe as the bytes of a message."""
+    state = keyframe.state
+    arrays = dict(state.arrays)
+    for field in dataclasses.fields(Module):
+        arrays[_MODULES + field.name] = np.array([getattr(m, field.name) for m in state.modules])
+    facts = {
+        "version": KEYFRAME_VERSION,
+        "versions": keyframe.versions,
+        "taken": keyframe.taken,
+        "policy_rng": state.policy_rng,
+        "arrays": contents(arrays),
+    }
+    encoded: bytes = _KEYFRAME(
+        iteration=keyframe.iteration,
+        t=keyframe.t,
+        facts=json.dumps(facts),
+        values=b"".join(array.tobytes() for array in arrays.values()),
+    ).SerializeToString()
+    return encoded
+
+
+def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
+    """The keyframe in the bytes of a message, whose arrays are no larger than these.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message, or one of another version.
+    """
+    decoded = parsed(_KEYFRAME, data, where)
+    try:
+        facts = json.loads(decoded.facts)
+        if facts["version"] != KEYFRAME_VERSION:
+            raise LogDamagedError(f"{where}: a keyframe of version {facts['version']!r}")
+        arrays = stored_arrays(facts["arrays"], decoded.values)
+        columns = {
+            name.removeprefix(_MODULES): arrays.pop(name)
+            for name in list(arrays)
+            if name.startswith(_MODULES)
+        }
+        state = LearnerState(arrays, _modules(columns), dict(facts["policy_rng"]))
+        taken = facts["taken"] if isinstance(facts["taken"], str) else None
+        return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]), taken)
+    except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise LogDamagedError(f"{where}: not a keyframe ({one_line(error)})") from error
 
 
 def missing(version: int) -> tuple[str, ...]:
@@ -232,6 +291,15 @@ def _array(values: Any, shape: tuple[int, ...], signal: Signal, where: str) -> N
     return np.array(values, dtype=signal.dtype).reshape(shape)
 
 
+def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
+    values: Any = {
+        name: column.tolist() if column.ndim == 1 else list(column)
+        for name, column in columns.items()
+    }
+    rows = zip(*values.values(), strict=True)
+    return tuple(Module(**dict(zip(values, row, strict=True))) for row in rows)
+
+
 def _file(name: str, stem: str, fields: Sequence[_Field]) -> descriptor_pb2.FileDescriptorProto:
     """The definition of a message of our own, in a file of its own."""
     file = descriptor_pb2.FileDescriptorProto(
@@ -278,11 +346,18 @@ _MATRIX_FIELDS: list[_Field] = [
     ("columns", 2, _FIELD.TYPE_FIXED32, False, ""),
     ("values", 3, _FIELD.TYPE_DOUBLE, True, ""),
 ]
+_KEYFRAME_FIELDS: list[_Field] = [
+    ("iteration", 1, _FIELD.TYPE_SFIXED64, False, "Iterations done"),
+    ("t", 2, _FIELD.TYPE_SFIXED64, False, "Next frame"),
+    ("facts", 3, _FIELD.TYPE_STRING, False, "JSON: name, type and shape of each array, and more"),
+    ("values", 4, _FIELD.TYPE_BYTES, False, "The arrays, one after the other"),
+]
 _FILES = {
     SIGNALS_SCHEMA: _file("BlockSignals", "block_signals", _SIGNAL_FIELDS),
     MATRIX_SCHEMA: _file("Matrix", "matrix", _MATRIX_FIELDS),
+    KEYFRAME_SCHEMA: _file("Keyframe", "keyframe", _KEYFRAME_FIELDS),
 }
-_SIGNALS, _MATRIX = (_message_class(file, name) for name, file in _FILES.items())
+_SIGNALS, _MATRIX, _KEYFRAME = (_message_class(file, name) for name, file in _FILES.items())
 
 SCHEMAS: Mapping[str, bytes] = {
     name: descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(deterministic=True)

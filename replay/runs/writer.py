@@ -12,7 +12,7 @@ from typing import Any
 from foxglove_schemas_protobuf import Log_pb2
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from cdmisfa.core.learning import Learner, Sink, weights_after
+from cdmisfa.core.learning import Keyframe, Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
@@ -21,6 +21,7 @@ from replay.runs.columns import columns_of_messages
 from replay.runs.folders import FINAL_METADATA, RUN_METADATA
 from replay.runs.log import (
     EVENT_TOPIC,
+    KEYFRAME_TOPIC,
     PHI_TOPIC,
     SIGNALS_TOPIC,
     TRUTH_TOPIC,
@@ -28,10 +29,12 @@ from replay.runs.log import (
     RunHeader,
 )
 from replay.runs.messages import (
+    KEYFRAME_SCHEMA,
     MATRIX_SCHEMA,
     SCHEMAS,
     SIGNALS_SCHEMA,
     decode_signals,
+    encode_keyframe,
     encode_matrix,
     encode_signals,
     iteration_of,
@@ -102,10 +105,12 @@ class RunWriter(Sink):
                 "watched_every": str(self._watched_every),
             },
         )
+        self._last_keyframe = -1
         self._channels: dict[str, int] = {}
         self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA)
         self._add_channel(PHI_TOPIC, MATRIX_SCHEMA)
         self._add_channel(TRUTH_TOPIC, MATRIX_SCHEMA)
+        self._add_channel(KEYFRAME_TOPIC, KEYFRAME_SCHEMA)
         self._add_channel(EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
         self._images: list[ImageEncoder] = []
         if spec.images:
@@ -146,6 +151,24 @@ class RunWriter(Sink):
         entry.timestamp.FromNanoseconds(at)
         self._write(EVENT_TOPIC, at, iteration, entry.SerializeToString())
 
+    @property
+    def size(self) -> int:
+        """Bytes written so far, as stored; what waits for a flush is not among them."""
+        return self._log.size
+
+    def keyframe(self, keyframe: Keyframe) -> None:
+        """Write where the run stands, once for each iteration, in a chunk of its own.
+
+        All before it, and it, are handed to the operating system.
+        """
+        at = keyframe.iteration
+        if at != self._last_keyframe:
+            self.flush()
+            time_ns = self.spec.time_ns(keyframe.t)
+            self._write(KEYFRAME_TOPIC, time_ns, at, encode_keyframe(keyframe))
+            self._last_keyframe = at
+            self.flush()
+
     def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
         """Copy the first iterations of another log of the same run, and yield their signals.
 
@@ -159,6 +182,8 @@ class RunWriter(Sink):
                     if iteration_of(entry.data, where) >= iterations:
                         break
                     taken.append(entry.data)
+                elif topic == KEYFRAME_TOPIC:
+                    self._last_keyframe = entry.sequence
                 self._log.write(self._channels[topic], entry.log_time, entry.data, entry.sequence)
                 if len(taken) >= ITERATIONS:
                     yield from _records(taken, where)

@@ -1,11 +1,14 @@
-"""Files of plain arrays on this machine (.npz), of which nothing is believed."""
+"""Plain arrays in files (.npz) and in bytes, of which nothing is believed."""
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -16,6 +19,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import one_line
 
 _END = struct.Struct("<4s4H2LH")
+_PLAIN = re.compile(r"[<|][bifuU]\d{1,6}")
 _IMPOSSIBLE = (MemoryError, OverflowError, RecursionError, SyntaxError, TokenError)
 _DAMAGED = (
     *(OSError, EOFError, KeyError, TypeError, ValueError, AttributeError, RuntimeError),
@@ -44,6 +48,46 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise ValueError("not all of it are arrays")
     return arrays
+
+
+def contents(arrays: Mapping[str, NDArray[Any]]) -> list[tuple[str, Any, tuple[int, ...]]]:
+    """Name, type and shape of each array, as JSON values, for `stored_arrays`."""
+    return [(n, np.lib.format.dtype_to_descr(a.dtype), a.shape) for n, a in arrays.items()]
+
+
+def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
+    """Arrays whose bytes lie one after the other and are all of some data.
+
+    Args:
+        listed: what `contents` says of them, after JSON.
+        data: their bytes.
+
+    Raises:
+        ValueError: it is something else; it says what in one short line.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    at = 0
+    try:
+        for name, kind, shape in listed:
+            dtype = _plain_type(kind)
+            size = dtype.itemsize * math.prod(shape)
+            if min(shape, default=0) < 0 or at + size > len(data):
+                raise ValueError(f"{str(name)[:40]!r} is no array of it")
+            arrays[str(name)] = np.ndarray(shape, dtype, data, at).copy()
+            at += size
+    except (*_IMPOSSIBLE, TypeError, LookupError) as error:
+        raise ValueError("an impossible array") from error
+    if at != len(data):
+        raise ValueError(f"its arrays have {at} bytes, and it has {len(data)}")
+    return arrays
+
+
+def _plain_type(kind: Any) -> np.dtype[Any]:
+    """The type that numpy describes so: numbers or text, or a record of such."""
+    fields = [("", kind)] if isinstance(kind, str) else [tuple(field) for field in kind]
+    if not all(_PLAIN.fullmatch(field[1]) for field in fields):
+        raise ValueError(f"{str(kind)[:40]!r} is no plain type")
+    return np.dtype(kind if isinstance(kind, str) else fields)
 
 
 def _refuse_packed(archive: zipfile.ZipFile) -> None:

@@ -110,8 +110,6 @@ KINDS: Mapping[str, Kind] = {
     "run.json": Kind(RUNS, "run.json", proven=True),
     "run begun": Kind(RUNS[:1], learn=_going_on),
     "progress run begun": Kind(RUNS[:1], learn=_going_on),
-    "checkpoint": Kind((), "checkpoint*", learn=_going_on),
-    "progress checkpoint": Kind((), "checkpoint*", learn=_going_on),
     "preset": Kind(
         (
             lambda place, out: ("learn", "oscillatory", "--preset", _first(place), *QUICK),
@@ -135,8 +133,6 @@ KINDS: Mapping[str, Kind] = {
 OF = {
     "modules.npz": "run",
     "run.json": "run",
-    "checkpoint": "run begun",
-    "progress checkpoint": "progress run begun",
 }
 """Kinds of files that are of other materials."""
 

@@ -47,7 +47,7 @@ def run(folder: Path) -> None:
 
 
 def begun_run(folder: Path) -> None:
-    """A run that may go on, with its checkpoint."""
+    """A run that may go on, with its keyframes."""
     words = ("oscillatory", "-o", folder, "--seed", 1, *EASY, "--no-rerun")
     must(folder.parent, "learn", *words, "--max-iterations", 60)
 

@@ -20,10 +20,12 @@ from camera_files import write_cameras
 
 from cdmisfa.cli import run
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments.resume import log_to_resume, newest_covered
+from cdmisfa.experiments.resume import log_to_resume
 from cdmisfa.experiments.store import read_rows
 from recorder.log.resume import frames_held
-from replay.runs.log import count_iterations
+from replay.mcap.reader import LogReader
+from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON
+from replay.runs.log import read_keyframe
 from replay.runs.modules import load_modules
 
 from .calls import Refusal, watched
@@ -31,7 +33,7 @@ from .outcomes import LOST, MIXED, TRACEBACK, WRONG, Defect
 
 FRAMES = 400
 ITERATIONS = 450
-"""Of a run: checkpoints at 200, 400 and 450."""
+"""Of a run: its last keyframes are at 400 and 450."""
 
 OUT, GIVEN = "out", "given"
 """In a story's folder: what it writes, and what it is given."""
@@ -212,10 +214,10 @@ def frames(out: Path) -> int:
 def iterations(out: Path) -> int:
     """Iterations from which a run would go on."""
     try:
-        checkpoint = newest_covered(out, count_iterations(log_to_resume(out)))
+        keyframe = read_keyframe(log_to_resume(out))
     except CdmisfaError:
         return 0
-    return checkpoint.iteration if checkpoint else 0
+    return keyframe.iteration if keyframe else 0
 
 
 def done(out: Path) -> int:
@@ -247,9 +249,14 @@ def _learned(folder: Path, words: str) -> None:
 
 
 def _learning(folder: Path) -> None:
-    _recording(folder)
-    cut_short(folder, LONG, "checkpoint-000000000450", 0)
-    assert iterations(folder / OUT) == 400
+    _learned(folder, LONG)
+    run = folder / OUT
+    with LogReader(run / RUN_FILE) as reader:
+        end = reader.segments[-1].offset  # of the last keyframe
+    (run / f"{RUN_FILE}.partial").write_bytes((run / RUN_FILE).read_bytes()[:end])
+    for name in (RUN_FILE, RUN_JSON, MODULES_FILE):
+        (run / name).unlink()
+    assert iterations(run) == 400
 
 
 def _cameras(folder: Path) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-CHECKPOINT_EVERY = 25
+KEYFRAMES = 25
 SECOND = 1.0
 
 
@@ -48,9 +48,9 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
 
         after(ViewParts, "write", lambda log, block: (log._view, log.t))
         after(RunWriter, "block", lambda log, block, signals, learner: ("run", learner.iteration))
-        kept = runs.Checkpoints
-        runs.Checkpoints = lambda folder, source, learner, every, *more: kept(  # type: ignore
-            folder, source, learner, CHECKPOINT_EVERY, *more
+        kept = runs.Keyframes
+        runs.Keyframes = lambda log, source, learner, every: kept(  # type: ignore
+            log, source, learner, KEYFRAMES
         )
 
     return tweak

@@ -58,6 +58,7 @@ TICK = 0.1
     metavar="SECONDS",
     help="With --follow, give up when no frame came for so long.",
 )
+@options.keyframes
 @options.fsync_every
 @camera_options
 @options.server_limits
@@ -82,6 +83,7 @@ def learn_command(
     no_rerun: bool,
     follow: bool,
     follow_timeout: float,
+    keyframes: int | None,
     fsync_every: float | None,
     force: bool,
     as_json: bool,
@@ -137,6 +139,7 @@ def learn_command(
                 sinks=(reporter,),
                 stop=stop,
                 resume=resume,
+                keyframes=keyframes,
                 fsync_every=fsync_every,
                 live=live_view,
                 announce=announce,
