@@ -16,6 +16,7 @@ CAMPAIGNS = (
         "descriptors",
         "races",
         "damage",
+        "servers",
     ),
 )
 """Modules of this folder, in the order of the page."""
