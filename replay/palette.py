@@ -35,14 +35,20 @@ ROSE: Rgb = (214, 170, 165)
 LILAC: Rgb = (175, 160, 205)
 MOSS: Rgb = (135, 155, 115)
 KHAKI: Rgb = (150, 140, 95)
-SILVER: Rgb = (200, 205, 210)
+STEEL: Rgb = (140, 150, 160)
+PLUM: Rgb = (155, 130, 185)
+CLAY: Rgb = (195, 140, 130)
+BRICK: Rgb = (190, 95, 90)
 BROWN: Rgb = (140, 115, 95)
 
 STATES: tuple[Rgb, ...] = (SAND, WHITE, MIST, DARK)
 """Colours of what became of a stream: learning, learned, known, given up; none is a stream's."""
 
-PALE: tuple[Rgb, ...] = (SILVER, SAND, LILAC, MOSS, ROSE, MIST, BROWN)
-"""Colours of lines that belong to no stream: a full colour is a stream's, and its module's."""
+PALE: tuple[Rgb, ...] = (STEEL, KHAKI, PLUM, MOSS, CLAY, BROWN)
+"""Colours of lines that belong to no stream: a full colour is a stream's, and its module's.
+
+They are seen on black, and on the white on which browsers show the viewer.
+"""
 
 STEPS = 255
 """Shades between white and a full colour: as many as eight bits can tell apart."""

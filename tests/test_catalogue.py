@@ -10,7 +10,9 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import Chunk, ChunkStore, RrdReader
 from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
@@ -37,7 +39,7 @@ from replay.viewer.catalogue import (
     set_layout,
 )
 from replay.viewer.display import missing_driver
-from replay.viewer.headless import headless_viewer
+from replay.viewer.headless import draw_table, headless_viewer
 from replay.viewer.program import free_port, running
 
 
@@ -132,6 +134,14 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
     finally:
         process.kill()
         process.communicate()
+
+
+@pytest.mark.skipif(bool(missing_driver()), reason=missing_driver())
+def test_the_table_of_a_sweep_is_drawn(sweep, tmp_path):
+    draw_table(sweep, tmp_path / "table.png", window="800x500")
+    with Image.open(tmp_path / "table.png") as picture:
+        assert picture.size in ((800, 500), (1600, 1000))
+        assert len(np.unique(np.asarray(picture.convert("L")))) > 20
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import socket
 import subprocess
 import sys
 import time
@@ -12,14 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
+from conftest import Cdmisfa
 from PIL import Image
 from run_data import IMAGE, VECTOR, read_signals, run_of, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.view.bindings import viewer_program
-from replay.view.build import build_view
+from replay.view.build import build_view, view_of
 from replay.view.layouts import panels
 from replay.viewer import display, headless, window
+from replay.viewer.moments import frame_at
 from replay.viewer.program import (
     check_limit,
     environment,
@@ -121,6 +124,77 @@ def test_a_screenshot_is_a_picture(tmp_path):
         assert len(np.unique(np.asarray(picture.convert("L")))) > 20
     with pytest.raises(UsageError, match="--force"):
         headless.screenshot(tmp_path, tmp_path / "s.png")
+
+
+@needs_driver
+def test_a_screenshot_of_a_tab_at_an_event(tmp_path, monkeypatch):
+    """The cursor stands where module 2 was saved, in the tab that was asked for."""
+    records = write_run(tmp_path / "run.mcap", VECTOR, 12, saves=True)
+    seen = []
+    ask = headless.HeadlessViewer.ask
+
+    def look(viewer, question, *args, **kwargs):
+        client = viewer._client
+        state = client and ask(viewer, lambda client: client.get_state())
+        if state and state.recordings and state.views:
+            opened = ask(viewer, lambda client: client.get_blueprint()).blueprint
+            seen.append((state.recordings[0].current_time, opened))
+        return ask(viewer, question, *args, **kwargs)
+
+    monkeypatch.setattr(headless.HeadlessViewer, "ask", look)
+    monkeypatch.setattr(headless, "SETTLE", 0.5)
+    headless.screenshot(tmp_path, tmp_path / "s.png", at="iteration 5", tab="gate")
+    time_then, blueprint = seen[-1]
+    (tabs,) = [
+        part["ContainerBlueprint"]
+        for part in blueprint.values()
+        if part.get("ContainerBlueprint", {}).get("container_kind") == "Tabs"
+    ]
+    opened = blueprint[f"/{tabs['active_tab']}"]["ContainerBlueprint"]["display_name"]
+    assert (time_then, opened) == (records[5].t, "Gate")
+
+
+def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path):
+    words = ["learn", "oscillatory", "--algorithm", "progress", "-o", tmp_path, "--no-rerun"]
+    assert cdmisfa(*words, "--max-modules", 2).code == 0
+    first, second = (s.t for s in read_signals(tmp_path) if s.saved)
+    assert frame_at(tmp_path, "123") == 123
+    assert frame_at(tmp_path, "iteration 7") == 7 * 40
+    assert (frame_at(tmp_path, "module 1"), frame_at(tmp_path, "Module 2")) == (first, second)
+    for wrong, said in (
+        ("999999", "the last of"),
+        ("iteration 999999", "the last of"),
+        ("module 7", "there are stream x"),
+        ("odule 1", "no frame, iteration or event"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            frame_at(tmp_path, wrong)
+    with pytest.raises(UsageError, match="only a run"):
+        frame_at(tmp_path / "v.rrd", "module 1")
+
+
+def test_tabs_and_sizes_that_are_not_there_are_refused(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 3)
+    with pytest.raises(UsageError, match="no tab 'Bridge': there are Overview, Abstraction, Gate"):
+        build_view(tmp_path, tmp_path / "run.rrd", tab="Bridge")
+    build_view(tmp_path, tmp_path / "run.rrd", tab="MODULES")
+    with (
+        pytest.raises(UsageError, match="is built already"),
+        view_of(tmp_path / "run.rrd", 10, None, "Gate"),
+    ):
+        pass
+    for size in ("big", "10x10", "1600", "1600x-2"):
+        with pytest.raises(UsageError, match="say 1600x1000"):
+            headless.screenshot(tmp_path, tmp_path / "s.png", window=size)
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line(tmp_path):
+    write_run(tmp_path / "run.mcap", VECTOR, 2)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(CdmisfaError, match=r"--port \d+: .*choose another"):
+            window.serve(tmp_path, port=taken.getsockname()[1])
 
 
 def test_without_a_driver_the_remedy_is_said(tmp_path, monkeypatch):

@@ -31,7 +31,7 @@ DRIVER = shutil.which("chromedriver")
 SECONDS = 240
 """Longest wait for a page that is drawn without a graphics card on a busy machine."""
 
-LANES = {"stream watched": (124, 195, 238), "novel": (60, 178, 146)}
+LANES = {"stream watched": (124, 195, 238), "novel": (193, 181, 216)}
 """Colours of lanes that are on the first page, as the browser shows them."""
 
 FLAGS = (

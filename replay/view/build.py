@@ -38,6 +38,7 @@ def build_view(
     every: int = 10,
     force: bool = True,
     all_views: Path | None = None,
+    tab: str | None = None,
 ) -> None:
     """Write the view of a run or a recording as an .rrd file, whole or not at all.
 
@@ -47,10 +48,12 @@ def build_view(
         every: show every so many watched frames, of those that were kept.
         force: replace an existing file.
         all_views: the recording that the run learned from, to show what was not watched too.
+        tab: name of the tab that is open; by default the first.
 
     Raises:
         UsageError: there is no such run or recording, `every` is below 1, `out` exists and
-            `force` is not set, or the run did not learn from the recording `all_views`.
+            `force` is not set, the run did not learn from the recording `all_views`, or there is
+            no such tab.
         LogDamagedError: it cannot be read.
         CdmisfaError: the view cannot be written.
     """
@@ -60,25 +63,29 @@ def build_view(
     if is_run(path):
         log = run_log(path)
         with recording_to(out, _name(log), log, force=force) as recording:
-            _write_run(recording, log, every, all_views)
+            _write_run(recording, log, every, all_views, tab)
     elif all_views is not None:
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path, force=force) as recording:
-            write_recording(recording, path, every)
+            write_recording(recording, path, every, tab)
 
 
 @contextlib.contextmanager
-def view_of(path: Path, every: int, all_views: Path | None) -> Iterator[Path]:
+def view_of(
+    path: Path, every: int, all_views: Path | None, tab: str | None = None
+) -> Iterator[Path]:
     """The view of a run, a recording or an .rrd file, there for as long as it is looked at."""
     if path.suffix == ".rrd":
         if not path.is_file():
             raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")
+        if tab is not None:
+            raise UsageError(f"--tab {tab}: {path} is built already, name its run or recording")
         yield path
         return
     with tempfile.TemporaryDirectory(prefix="cdmisfa-view-") as folder:
         view = Path(folder) / f"{path.resolve().stem}.rrd"
-        build_view(path, view, every=every, all_views=all_views)
+        build_view(path, view, every=every, all_views=all_views, tab=tab)
         yield view
 
 
@@ -118,7 +125,7 @@ def recording_to(
 
 
 def _write_run(
-    recording: rr.RecordingStream, log: Path, every: int, all_views: Path | None
+    recording: rr.RecordingStream, log: Path, every: int, all_views: Path | None, tab: str | None
 ) -> None:
     header, folder = read_header(log), log.parent
     streams = list(range(len(header.spec.streams)))
@@ -138,7 +145,9 @@ def _write_run(
     text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, every)
-    recording.send_blueprint(run_layout(outline, all_views=all_views is not None, head=head))
+    recording.send_blueprint(
+        run_layout(outline, all_views=all_views is not None, head=head, tab=tab)
+    )
 
 
 def _name(log: Path) -> str:

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cdmisfa.core.blocks import HeadPose
-from replay.palette import WHITE, colour, packed_all
+from replay.palette import colour, packed_all, pale
 from replay.recordings.poses import yaw_of
 from replay.runs.outline import Outline
 from replay.runs.stretches import read_columns
@@ -62,7 +62,7 @@ def write_gaze(
     watched = [poses[name] for name in spec.streams]
     yaws = np.array([yaw_of(pose) for pose in watched])
     names = ["head turned to the left [degrees]"]
-    column = line_column(recording, spec, YAW, names, [WHITE], steps=True)
+    column = line_column(recording, spec, YAW, names, [pale(0)], steps=True)
     for columns in read_columns(log, outline.header):
         streams = columns["stream"].astype(np.int64)
         column.add(*columns.times(), yaws[streams][:, None])

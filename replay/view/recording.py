@@ -25,16 +25,19 @@ BLOCK = 500
 """Frames that are read at once."""
 
 
-def write_recording(recording: rr.RecordingStream, path: Path, every: int) -> None:
+def write_recording(
+    recording: rr.RecordingStream, path: Path, every: int, tab: str | None = None
+) -> None:
     """Write a recording's views and ground truth, and the layout for them.
 
     Args:
         recording: where they go.
         path: the recording's folder, or a file of one view.
         every: show images of every this many frames; values are all shown.
+        tab: name of the tab that is open.
 
     Raises:
-        UsageError: there is no such recording.
+        UsageError: there is no such recording or tab.
         LogDamagedError: it cannot be read.
     """
     with contextlib.closing(RecordedSource(path)) as source:
@@ -50,7 +53,7 @@ def write_recording(recording: rr.RecordingStream, path: Path, every: int) -> No
     }
     recording.send_property("recording", rr.AnyValues(**properties))
     head = write_heads(recording, spec.streams, head_poses(path))
-    recording.send_blueprint(_layout(spec, first + count, head))
+    recording.send_blueprint(_layout(spec, first + count, head, tab))
 
 
 def write_views(
@@ -127,7 +130,7 @@ def _views(spec: SourceSpec) -> list[str]:
     return [f"views/{part(spec.streams, s)}" for s in range(len(spec.streams))]
 
 
-def _layout(spec: SourceSpec, frames: int, head: bool) -> rrb.Blueprint:
+def _layout(spec: SourceSpec, frames: int, head: bool, tab: str | None) -> rrb.Blueprint:
     axis = time_axis(frames)
     shown = [
         rrb.Spatial2DView(origin=f"/{view}", name=label(name))
@@ -142,4 +145,6 @@ def _layout(spec: SourceSpec, frames: int, head: bool) -> rrb.Blueprint:
     looks = [gaze("Where the head looks")] if head else []
     beside = [*known, *looks]
     below = [rrb.Horizontal(*beside, column_shares=[3, 1][: len(beside)])] if beside else []
-    return blueprint(rrb.Vertical(grid, *below, name="Views"), name="Recording", length=frames)
+    return blueprint(
+        rrb.Vertical(grid, *below, name="Views"), name="Recording", length=frames, tab=tab
+    )

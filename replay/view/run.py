@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, Signal
-from replay.palette import GREY, MIST, WHITE, Rgb, colour, dim, packed, packed_all, pale, shade
+from replay.palette import BRICK, GREY, MIST, Rgb, colour, dim, packed, packed_all, pale, shade
 from replay.runs.columns import SignalColumns, told
 from replay.runs.log import RunHeader
 from replay.runs.outline import Outline
@@ -310,7 +310,7 @@ class RunView:
         edges = np.concatenate([mean - width, mean + width], axis=2)
         for i in range(edges.shape[1]):
             labels = [f"band of module {i + 1}"] * edges.shape[2]
-            self._line(f"gate/band/{i + 1}", labels, rgbs=[WHITE] * len(labels), width=1.0).add(
+            self._line(f"gate/band/{i + 1}", labels, rgbs=[GREY] * len(labels), width=1.0).add(
                 *columns.times(), edges[:, i]
             )
 
@@ -370,7 +370,7 @@ class RunView:
 def _marks(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column:
     """A column that is drawn as marks where a module was saved."""
     style = rr.SeriesPoints(
-        colors=[packed(WHITE)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
+        colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
     )
     return Column(recording, spec, path, style)
 

@@ -14,17 +14,20 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import VIEW_FILE, run_log, runs_in
 from replay.view.bindings import CatalogueClient, RrdReader
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
 from replay.viewer.display import has_display
+from replay.viewer.guarded import served_at
 from replay.viewer.program import Program, free_port, open_address, private_host, running
+from replay.viewer.webpage import page_for, page_server
 
 ROWS = "base"
 """Name of the layer of rows."""
@@ -66,18 +69,36 @@ def ready_view(run: Path) -> Path:
     return view
 
 
-def serve_catalogue(
-    folder: Path, *, port: int | None = None, progress: Progress | None = None
-) -> None:
-    """Serve a folder of runs until interrupted, and open it where there is a display.
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of runs that is served.
 
-    Prints the address of their table on stderr as soon as it is there; the views that the
-    rows lead to follow. A run whose view cannot be made is named on stderr.
+    Attributes:
+        server: the program.
+        runs: folders of runs.
+        rows: how many of them have a row.
+        dataset: the server's, with the rows.
+        place: folder for files.
+        address: of the table.
+    """
+
+    server: Program
+    runs: Sequence[Path]
+    rows: int
+    dataset: Any
+    place: Path
+    address: str
+
+
+@contextlib.contextmanager
+def served_table(folder: Path, port: int | None = None) -> Iterator[Table | None]:
+    """Serve the table of a folder of runs while the body runs; None where the server has ended.
+
+    A run that the server refuses is named on stderr.
 
     Args:
         folder: of a sweep that kept its logs, or any folder of runs.
         port: to listen at; by default a free one.
-        progress: called with the views that are ready, and all.
 
     Raises:
         UsageError: there is no run in it.
@@ -87,7 +108,7 @@ def serve_catalogue(
     runs = runs_in(folder)
     if not runs:
         raise UsageError(f"{folder} holds no runs: sweep with --keep-logs")
-    host, ended = private_host(), threading.Event()
+    host = private_host()
     port = port or free_port(host)
     address = f"rerun+http://{host}:{port}"
     with (
@@ -97,22 +118,70 @@ def serve_catalogue(
         files = write_rows(runs, Path(place))  # while the server starts
         dataset = _created(address, _dataset_name(folder), server)
         if dataset is None:
+            yield None
             return
         refused = _register(dataset, files, ROWS)
         for file, reason in refused.items():
             print(f"{runs[files.index(file)]} has no row: {reason}", file=sys.stderr, flush=True)
         table = f"{address}/entry/{dataset.entry_details().id}"
-        shown = f"{len(runs) - len(refused)} runs at {table}    look at them: rerun {table}"
+        yield Table(server, runs, len(runs) - len(refused), dataset, Path(place), table)
+
+
+def serve_catalogue(
+    folder: Path,
+    *,
+    port: int | None = None,
+    tab: str | None = None,
+    web: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Serve a folder of runs until interrupted, and open it where there is a display.
+
+    Prints the address of their table on stderr as soon as it is there; the views that the
+    rows lead to follow. A run whose view cannot be made is named on stderr.
+
+    Args:
+        folder: of a sweep that kept its logs, or any folder of runs.
+        port: to listen at; by default a free one.
+        tab: name of the tab in which a run opens; by default the first.
+        web: serve the viewer, too, to a browser on this machine, at `port`.
+        progress: called with the views that are ready, and all.
+
+    Raises:
+        UsageError: there is no run in it.
+        LogDamagedError: a run without a run.json cannot be read.
+        CdmisfaError: the server ended with an error.
+    """
+    ended = threading.Event()
+    with contextlib.ExitStack() as opened:
+        table = opened.enter_context(served_table(folder, None if web else port))
+        if table is None:
+            return
+        shown = f"{table.rows} runs at {table.address}    look at them: rerun {table.address}"
+        if web:
+            page = opened.enter_context(_served_page(table.address, port))
+            shown = f"{table.rows} runs at {page}"
         print(shown, file=sys.stderr, flush=True)
-        follow = threading.Thread(
-            target=_follow, args=(runs, dataset, Path(place), table, progress, ended), daemon=True
-        )
+        if has_display() and not web:
+            open_address(table.address)
+        follow = threading.Thread(target=_follow, args=(table, tab, progress, ended), daemon=True)
         follow.start()
         try:
-            server.wait()
+            table.server.wait()
         finally:
             ended.set()
             follow.join(LAST_SECONDS)
+
+
+@contextlib.contextmanager
+def _served_page(table: str, port: int | None) -> Iterator[str]:
+    """Serve the viewer's page to show a table in it, and give its address."""
+    viewer_port, place = free_port(), table.removeprefix("rerun+").partition("/entry/")[0]
+    with (
+        running(page_server(viewer_port)),
+        served_at(page_for(place, viewer_port), port) as address,
+    ):
+        yield f"{address}?url={quote(table, safe='')}"
 
 
 def _created(address: str, name: str, server: Program) -> Any:
@@ -134,36 +203,31 @@ def _created(address: str, name: str, server: Program) -> Any:
 
 
 def _follow(
-    runs: Sequence[Path],
-    dataset: Any,
-    place: Path,
-    table: str,
-    progress: Progress | None,
-    ended: threading.Event,
+    table: Table, tab: str | None, progress: Progress | None, ended: threading.Event
 ) -> None:
-    """Open the table of runs, and add the views to it."""
-    if has_display():
-        open_address(table)
+    """Lay the runs of a table out, and add their views."""
     try:
-        set_layout(runs, dataset, place)
+        set_layout(table.runs, table.dataset, table.place, tab)
     except (CdmisfaError, *REFUSALS) as error:
         print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
     try:
-        add_views(runs, dataset, place, progress, ended)
+        add_views(table.runs, table.dataset, table.place, progress, ended)
     except REFUSALS as error:
         if not ended.wait(1.0):  # when interrupted the server may die before us; that is no error
             print(f"views are not served: {error}", file=sys.stderr, flush=True)
 
 
-def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
+def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None = None) -> None:
     """Make the layout of the run that learned most the one in which every run opens.
 
     Args:
         runs: folders of runs.
         dataset: the server's.
         place: folder of the layout's file.
+        tab: name of the tab that is open; by default the first.
 
     Raises:
+        UsageError: there is no such tab.
         LogDamagedError: that run cannot be read.
     """
     from replay.runs.outline import read_outline
@@ -181,7 +245,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path) -> None:
         lines={name: values[:0] for name, values in outline.lines.items()},
     )
     file = place / "layout.rbl"
-    run_layout(outline).save(APPLICATION, str(file))
+    run_layout(outline, tab=tab).save(APPLICATION, str(file))
     layouts = dataset.blueprint_dataset()
     (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
     dataset.set_default_blueprint_segment_id(segment)

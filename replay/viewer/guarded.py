@@ -13,6 +13,8 @@ import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+from cdmisfa.core.errors import CdmisfaError
+
 HOST = "127.0.0.1"
 
 TOKEN_BYTES = 24
@@ -50,6 +52,21 @@ def served(answer: Answer, port: int | None = None) -> Iterator[str]:
     finally:
         server.shutdown()
         server.server_close()
+
+
+@contextlib.contextmanager
+def served_at(answer: Answer, port: int | None) -> Iterator[str]:
+    """The same, at a port that a user has chosen.
+
+    Raises:
+        CdmisfaError: it is taken.
+    """
+    with contextlib.ExitStack() as opened:
+        try:
+            address = opened.enter_context(served(answer, port))
+        except OSError as error:
+            raise CdmisfaError(f"--port {port}: {error.strerror}, choose another one") from error
+        yield address
 
 
 def _guard(answer: Answer, token: str) -> type[BaseHTTPRequestHandler]:

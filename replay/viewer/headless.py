@@ -8,16 +8,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError
 from recorder.log.whole import refuse_taken, whole
-from replay.recordings.source import RecordedSource
-from replay.runs.folders import is_run
-from replay.runs.stretches import read_columns
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
 from replay.view.columns import FRAME
+from replay.viewer.catalogue import served_table
 from replay.viewer.display import missing_driver
-from replay.viewer.program import Program, free_port, private_host, running
+from replay.viewer.moments import frame_at
+from replay.viewer.program import Program, check_size, free_port, private_host, running
 
 WINDOW = "1600x1000"
 SETTLE = 6.0
@@ -31,9 +30,10 @@ def screenshot(
     path: Path,
     out: Path,
     *,
-    at: int | None = None,
+    at: int | str | None = None,
     every: int = 10,
     all_views: Path | None = None,
+    tab: str | None = None,
     force: bool = False,
     window: str = WINDOW,
 ) -> None:
@@ -42,33 +42,27 @@ def screenshot(
     Args:
         path: a run or recording, or an .rrd file.
         out: the PNG file.
-        at: frame at which the time cursor stands; by default the last.
+        at: where the time cursor stands, see `frame_at`; by default at the end.
         every: show every so many watched frames.
         all_views: see `build_view`.
+        tab: name of the tab that is shown; by default the first.
         force: replace an existing file.
         window: size, as "1600x1000".
 
     Raises:
-        UsageError: `out` exists and `force` is not set, or there is no frame `at`.
+        UsageError: `out` exists and `force` is not set, there is no such moment or tab, or no
+            such size.
         CdmisfaError: no driver, or the viewer failed.
     """
     refuse_taken(out, force=force)
-    if at is not None and path.suffix != ".rrd" and at > (last := _last_frame(path)):
-        raise UsageError(f"--at {at}: there is no such frame, the last of {path} is {last}")
+    check_size(window)
+    frame = None if at is None else frame_at(path, str(at))
     if missing_driver():
         raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
-    with view_of(path, every, all_views) as view:
-        png = _draw(view, at, window)
+    with view_of(path, every, all_views, tab) as view:
+        png = _draw(view, frame, window)
     with whole(out) as partial:
         partial.write_bytes(png)
-
-
-def _last_frame(path: Path) -> int:
-    if is_run(path):
-        ends = (int(piece.frames[-1]) + piece.tau - 1 for piece in read_columns(path))
-        return max(ends, default=0)
-    with contextlib.closing(RecordedSource(path, salvage=True)) as source:
-        return max(ranges[-1][1] for ranges in source.coverage().values()) - 1
 
 
 def _draw(view: Path, at: int | None, window: str) -> bytes:
@@ -81,6 +75,34 @@ def _draw(view: Path, at: int | None, window: str) -> bytes:
         time.sleep(SETTLE)
         viewer.ask(lambda client: _painted(client.get_state()))
         return bytes(viewer.ask(lambda client: client.take_screenshot()))
+
+
+def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WINDOW) -> None:
+    """Draw the table of a folder of runs without a screen.
+
+    Args:
+        folder: of a sweep that kept its logs, or any folder of runs.
+        out: the PNG file.
+        force: replace an existing file.
+        window: size, as "1600x1000".
+
+    Raises:
+        UsageError: `out` exists and `force` is not set, no such size, or no run is there.
+        LogDamagedError: a run without a run.json cannot be read.
+        CdmisfaError: no driver, or the viewer or the server failed.
+    """
+    refuse_taken(out, force=force)
+    check_size(window)
+    if missing_driver():
+        raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
+    with served_table(folder) as table, headless_viewer(window) as viewer:
+        if table is None:
+            raise CdmisfaError(f"{out} cannot be drawn: the server of runs has ended")
+        viewer.ask(lambda client: client.open(table.address) or True)
+        time.sleep(SETTLE)
+        png = bytes(viewer.ask(lambda client: client.take_screenshot()))
+    with whole(out) as partial:
+        partial.write_bytes(png)
 
 
 def _painted(state: Any) -> bool:

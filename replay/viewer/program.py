@@ -20,6 +20,9 @@ from typing import BinaryIO
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.view.bindings import viewer_client, viewer_program
 
+SIZE = re.compile(r"[1-9]\d{2,3}x[1-9]\d{2,3}")
+"""Width and height of a window, in points."""
+
 LIMIT = re.compile(r"\d+(%|B|[kMGT]B|[KMGT]iB)")
 """What Rerun takes for a limit of memory; another makes it panic."""
 
@@ -41,6 +44,17 @@ def check_limit(limit: str) -> str:
     if not LIMIT.fullmatch(limit):
         raise UsageError(f"--memory-limit {limit} is no amount of memory: say 4GB or 75%")
     return limit
+
+
+def check_size(size: str) -> str:
+    """A size of a window that the viewer takes.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if not SIZE.fullmatch(size):
+        raise UsageError(f"--size {size} is no size of a window: say 1600x1000")
+    return size
 
 
 class Program(subprocess.Popen[bytes]):

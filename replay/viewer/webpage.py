@@ -51,6 +51,27 @@ def shown_at(address: str) -> str:
     return f"{address}?url={quote(address + DATA, safe='')}"
 
 
+def page_server(viewer_port: int) -> list[str]:
+    """Arguments with which the viewer's own server has the page, and nothing else, at a port.
+
+    With an address to show it serves no data at a port of its own. This one is without the
+    token, as others can see the arguments.
+    """
+    place = f"http://{HOST}:{viewer_port}/"
+    return ["--serve-web", "--bind", HOST, "--web-viewer-port", str(viewer_port), place]
+
+
+def page_for(data: str, viewer_port: int) -> Answer:
+    """The files of the page, which may ask for data elsewhere on this machine, too.
+
+    Args:
+        data: where, as http://host:port.
+        viewer_port: as for `page_of`.
+    """
+    policy = POLICY.replace("connect-src 'self'", f"connect-src 'self' {data}")
+    return lambda request, path: _pass_on(request, path, viewer_port, policy)
+
+
 def page_of(view: BinaryIO, viewer_port: int) -> Answer:
     """What is served: a run, and the files of the page, with the policy.
 
@@ -81,7 +102,9 @@ def page_of(view: BinaryIO, viewer_port: int) -> Answer:
     return answer
 
 
-def _pass_on(request: BaseHTTPRequestHandler, path: str, viewer_port: int) -> None:
+def _pass_on(
+    request: BaseHTTPRequestHandler, path: str, viewer_port: int, policy: str = POLICY
+) -> None:
     """Answer with what the viewer's own server has, which is the same for every run."""
     source = http.client.HTTPConnection(HOST, viewer_port, timeout=SECONDS)
     try:
@@ -92,7 +115,7 @@ def _pass_on(request: BaseHTTPRequestHandler, path: str, viewer_port: int) -> No
         for name in KEPT:
             if value := answer.headers.get(name):
                 request.send_header(name, value)
-        request.send_header("Content-Security-Policy", POLICY)
+        request.send_header("Content-Security-Policy", policy)
         request.send_header("Referrer-Policy", "no-referrer")
         request.end_headers()
         shutil.copyfileobj(answer, request.wfile)

@@ -12,30 +12,37 @@ from typing import BinaryIO
 from cdmisfa.core.errors import CdmisfaError
 from replay.view.build import view_of
 from replay.viewer.display import has_display
-from replay.viewer.guarded import HOST, served
-from replay.viewer.program import check_limit, free_port, private_host, run_program
-from replay.viewer.webpage import page_of, shown_at
+from replay.viewer.guarded import served_at
+from replay.viewer.program import check_limit, check_size, free_port, private_host, run_program
+from replay.viewer.webpage import page_of, page_server, shown_at
 
 
 def open_window(
-    path: Path, *, every: int = 10, all_views: Path | None = None, memory_limit: str = "2GB"
+    path: Path,
+    *,
+    every: int = 10,
+    all_views: Path | None = None,
+    tab: str | None = None,
+    memory_limit: str = "2GB",
+    size: str | None = None,
 ) -> None:
     """Show a run or recording in the viewer, until its window is closed.
 
     Raises:
-        UsageError: no such limit of memory.
+        UsageError: no such limit of memory, size or tab.
         CdmisfaError: there is no display, or the viewer ended with an error.
     """
     check_limit(memory_limit)
+    window = [] if size is None else ["--window-size", check_size(size)]
     if path.exists() and not has_display():  # a wrong path is said first, below
         raise CdmisfaError(
             "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
             "--screenshot"
         )
-    with _opened(path, every, all_views) as (name, view):
+    with _opened(path, every, all_views, tab) as (name, view):
         host = private_host()
         place = ("--bind", host, "--port", str(free_port(host)))
-        run_program([name, *place, "--memory-limit", memory_limit], view)
+        run_program([name, *place, *window, "--memory-limit", memory_limit], view)
 
 
 def serve(
@@ -43,6 +50,7 @@ def serve(
     *,
     every: int = 10,
     all_views: Path | None = None,
+    tab: str | None = None,
     memory_limit: str = "2GB",
     port: int | None = None,
 ) -> None:
@@ -57,25 +65,16 @@ def serve(
     check_limit(memory_limit)
     viewer_port = free_port()
     with contextlib.ExitStack() as opened:
-        name, file = opened.enter_context(_opened(path, every, all_views))
+        name, file = opened.enter_context(_opened(path, every, all_views, tab))
         view = file or opened.enter_context(open(name, "rb"))
-        address = opened.enter_context(served(page_of(view, viewer_port), port))
+        address = opened.enter_context(served_at(page_of(view, viewer_port), port))
         print(shown_at(address), file=sys.stderr, flush=True)
-        run_program(
-            [
-                "--serve-web",
-                *("--bind", HOST),
-                *("--web-viewer-port", str(viewer_port)),
-                # With an address to show it serves the page alone, and no data at a port of its
-                # own; this one is without the token, as others can see the arguments.
-                f"http://{HOST}:{viewer_port}/",
-            ]
-        )
+        run_program(page_server(viewer_port))
 
 
 @contextlib.contextmanager
 def _opened(
-    path: Path, every: int, all_views: Path | None
+    path: Path, every: int, all_views: Path | None, tab: str | None
 ) -> Iterator[tuple[str, BinaryIO | None]]:
     """The view of a run as the viewer's argument, and as its standard input.
 
@@ -83,7 +82,7 @@ def _opened(
     whatever ends us. Windows cannot do that and keeps the name.
     """
     with contextlib.ExitStack() as until_read:
-        view = until_read.enter_context(view_of(path, every, all_views))
+        view = until_read.enter_context(view_of(path, every, all_views, tab))
         if os.name == "nt" or view == path:
             yield str(view), None
             return

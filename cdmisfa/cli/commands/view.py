@@ -19,7 +19,14 @@ from cdmisfa.core.errors import UsageError
 @click.option(
     "--screenshot", type=options.OUT, metavar="F.png", help="Draw the view without a screen."
 )
-@click.option("--at", type=click.IntRange(0), metavar="FRAME", help="Frame of the screenshot.")
+@click.option(
+    "--at",
+    metavar="WHEN",
+    help='Moment of the screenshot: a frame, "iteration 500", or words of an event, as "module 2".',
+)
+@click.option("--tab", metavar="NAME", help="The tab that is open; by default the first.")
+@click.option("--size", metavar="WxH", help="Size of the window or screenshot, as 1600x1000.")
+@click.option("--port", type=click.IntRange(1, 65535), help="Where --web, or a sweep, is served.")
 @click.option(
     "--every",
     type=click.IntRange(1),
@@ -41,10 +48,12 @@ def view_command(
     save: Path | None,
     web: bool,
     screenshot: Path | None,
-    at: int | None,
+    at: str | None,
+    size: str | None,
+    port: int | None,
     memory_limit: str,
     force: bool,
-    **frames: Any,
+    **shown: Any,
 ) -> None:
     """Open a run in the Rerun viewer, or save, serve or picture it.
 
@@ -56,31 +65,61 @@ def view_command(
         raise click.UsageError("choose one of --save, --web and --screenshot")
     if at is not None and screenshot is None:
         raise click.UsageError("--at goes with --screenshot")
+    if size is not None and (web or save is not None):
+        raise click.UsageError("--size goes with a window or --screenshot")
     from replay.runs.folders import is_sweep, runs_in
-    from replay.viewer.catalogue import serve_catalogue
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)
     if runs_in(run):
-        if save is not None or web or screenshot is not None:
-            raise click.UsageError(f"{run} holds many runs, which are only served: name one run")
-        with bar("preparing views", "runs") as shown:
-            serve_catalogue(run, progress=shown.update)
+        if save is not None:
+            raise click.UsageError(f"{run} holds many runs, which --save cannot: name one run")
+        if at is not None:
+            raise click.UsageError(f"{run} holds many runs: --at is a moment of one")
+        _view_sweep(run, screenshot, size, shown["tab"], web=web, port=port, force=force)
         return
     if is_sweep(run):
         raise UsageError(f"{run}: this sweep kept no logs: sweep again with --keep-logs")
+    if port is not None and not web:
+        raise click.UsageError("--port goes with --web, or with a sweep")
     # Only here: they take half a second.
     from replay.view.build import build_view
+    from replay.viewer.headless import WINDOW
     from replay.viewer.headless import screenshot as draw
     from replay.viewer.window import open_window, serve
 
     if save is not None:
-        build_view(run, save, force=force, **frames)
+        build_view(run, save, force=force, **shown)
         click.echo(f"view {save}", err=True)
     elif screenshot is not None:
-        draw(run, screenshot, at=at, force=force, **frames)
+        draw(run, screenshot, at=at, force=force, window=size or WINDOW, **shown)
         click.echo(f"picture {screenshot}", err=True)
     elif web:
-        serve(run, memory_limit=memory_limit, **frames)
+        serve(run, memory_limit=memory_limit, port=port, **shown)
     else:
-        open_window(run, memory_limit=memory_limit, **frames)
+        open_window(run, memory_limit=memory_limit, size=size, **shown)
+
+
+def _view_sweep(
+    folder: Path,
+    screenshot: Path | None,
+    size: str | None,
+    tab: str | None,
+    *,
+    web: bool,
+    port: int | None,
+    force: bool,
+) -> None:
+    """Serve the table of a sweep's runs, or draw it."""
+    if screenshot is not None:
+        if port is not None or tab is not None:
+            raise click.UsageError("a picture of a sweep's table has no --port and no --tab")
+        from replay.viewer.headless import WINDOW, draw_table
+
+        draw_table(folder, screenshot, window=size or WINDOW, force=force)
+        click.echo(f"picture {screenshot}", err=True)
+        return
+    from replay.viewer.catalogue import serve_catalogue
+
+    with bar("preparing views", "runs") as done:
+        serve_catalogue(folder, port=port, tab=tab, web=web, progress=done.update)
