@@ -16,6 +16,7 @@ import pytest
 from tests.torture import harness, page
 from tests.torture.campaigns import CAMPAIGNS, campaign
 from tests.torture.commands import Ran, judge
+from tests.torture.kills import check_disk
 from tests.torture.outcomes import (
     CLEAR_ERROR,
     HANG,
@@ -29,6 +30,7 @@ from tests.torture.outcomes import (
     Limits,
     Outcome,
 )
+from tests.torture.witness import due
 
 
 def made(case: Any, results: harness.Results, **limits: Any) -> harness.Campaign:
@@ -132,12 +134,12 @@ def test_how_commands_are_judged(code: int, err: str, seconds: float, kind: str)
 
 
 def test_the_page_counts_what_was_found() -> None:
-    shared = {"seconds": 36.0, "megabytes": 90}
+    shared, where = {"seconds": 36.0, "megabytes": 90}, "in /x/torture-x-1/case/out"
     lines = [
         {"run": {"commit": "abc", "python": "3.11", "platform": "here", "seed": 0}},
         *({"campaign": CAMPAIGNS[0], "seed": n, **Outcome(RIGHT, "a", count=3).as_json(), **shared}
           for n in range(4)),
-        {"campaign": CAMPAIGNS[0], "seed": 9, **Outcome(LOST, "b", "much").as_json(), **shared,
+        {"campaign": CAMPAIGNS[0], "seed": 9, **Outcome(LOST, "b", where).as_json(), **shared,
          "defect": "lost: much"},
     ]  # fmt: skip
     found = page.summary(lines)
@@ -145,7 +147,31 @@ def test_the_page_counts_what_was_found() -> None:
     assert "13 cases in 0.1 hours of work, 1 defects" in text
     assert "| a | 12 | 12 | 0 | 0 |" in text
     assert "| b | 1 | 0 | 0 | 1 |" in text
+    assert "lost, b: in out (" in text
     assert f"python -m tests.torture {CAMPAIGNS[0]} --case 9" in text
+
+
+def test_a_witness_tells_what_must_have_been_flushed(tmp_path: Path) -> None:
+    notes = [f"run {n} {n / 8}" for n in range(1, 25)] + [f"x1 {64 * n} 3.0" for n in (1, 2, 3)]
+    (tmp_path / "witness").write_text("\n".join(notes) + "\n")
+    # killed at 3.0, what came before 2.0 less the time of a block; less 50 frames and a block
+    assert due(tmp_path / "witness", 3.0, 50.0) == {"run": 15, "x1": 192 - 50 - 64}
+    assert due(tmp_path / "nothing", 3.0, 50.0) == {}
+
+
+def test_what_is_missing_or_broken_on_disk_is_a_defect(
+    tmp_path: Path, oscillatory_run: Path
+) -> None:
+    ran = Ran(("learn",), -9, "", "", 1.0)
+    check_disk(oscillatory_run, {"run": 15}, "group", ran)
+    with pytest.raises(Defect, match="run has 15, had 16") as found:
+        check_disk(oscillatory_run, {"run": 16}, "group", ran)
+    assert found.value.outcome.kind == LOST
+    data = (oscillatory_run / "run.mcap").read_bytes()
+    (tmp_path / "run.mcap").write_bytes(data[: len(data) // 2])
+    with pytest.raises(Defect, match=r"run\.mcap is not readable") as found:
+        check_disk(tmp_path, {}, "group", ran)
+    assert found.value.outcome.kind == WRONG
 
 
 @pytest.mark.parametrize("name", CAMPAIGNS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import Any
@@ -116,4 +117,5 @@ def _section(each: dict[str, Any], defects: Sequence[dict[str, Any]]) -> list[st
 
 
 def _plain(text: str) -> str:
+    text = re.sub(r"/\S*torture-[\w-]+/(case/)?", "", text)  # folders of a case, gone since
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")[:300]
