@@ -94,7 +94,7 @@ def test_a_case_that_hangs_is_ended_with_all_that_it_started(tmp_path: Path) -> 
 
     results = harness.Results(tmp_path / "cases.jsonl")
     hung = made(hanging, results, seconds=0.5)
-    harness.run([hung], results, time.monotonic() + 0.05, 1, io.StringIO())
+    harness.run(hung, results, time.monotonic() + 0.05, 1, io.StringIO())
     assert [line["kind"] for line in results.lines] == [HANG]
     state = Path("/proc", (tmp_path / "child").read_text(), "stat")
     assert not state.exists() or state.read_text().split()[2] == "Z"
@@ -105,7 +105,7 @@ def test_results_are_gone_on_with(tmp_path: Path) -> None:
     for _ in range(2):
         results = harness.Results(path)
         good = made(lambda job: Outcome(RIGHT, "group"), results)
-        harness.run([good], results, time.monotonic() + 0.1, 2, io.StringIO())
+        harness.run(good, results, time.monotonic() + 0.1, 2, io.StringIO())
         with path.open("a") as file:
             file.write('{"campaign": "ma')  # cut off
     seeds = [line["seed"] for line in harness.Results(path).lines]

@@ -12,9 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from . import __doc__ as about
 from . import harness, page
@@ -40,23 +40,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"no campaign {unknown[0]}: there are {', '.join(CAMPAIGNS)}")
     names = chosen.campaigns or CAMPAIGNS
-    results = harness.Results(chosen.out / harness.CASES)
-    deadline = time.monotonic() + 60 * chosen.minutes
-    with tempfile.TemporaryDirectory(prefix="torture-shared-") as shared:
-        if chosen.case is not None:
-            return _alone(_opened(names[0], Path(shared), results, chosen.seed), chosen.case)
-        if chosen.minutes > 0:
-            print(f"seed {chosen.seed}: {', '.join(names)} for {chosen.minutes:g} min", flush=True)
-            results.add({"run": {**_about(), "seed": chosen.seed, "minutes": chosen.minutes}})
-            opened = []
-            for name in names:
-                try:
-                    opened.append(_opened(name, Path(shared), results, chosen.seed))
-                except Exception as error:  # others go on
-                    results.add(_unprepared(name, error))
-                    print(f"{name}: not prepared: {error}", file=sys.stderr, flush=True)
-            harness.run(opened, results, deadline, chosen.jobs, sys.stderr)
-    summary = page.summary(results.lines)
+    results = chosen.out / harness.CASES
+    if chosen.case is not None:
+        return _alone(names[0], chosen.case)
+    if chosen.minutes > 0:
+        print(f"seed {chosen.seed}: {', '.join(names)} for {chosen.minutes:g} min", flush=True)
+        told = {**_about(), "seed": chosen.seed, "minutes": chosen.minutes}
+        harness.Results(results).add({"run": told})
+        deadline = time.monotonic() + 60 * chosen.minutes
+        for number, name in enumerate(names):
+            # Each in a process of its own, so that what one imports is none of another's memory.
+            shares = [_limits(other).share for other in names[number:]]
+            left = (deadline - time.monotonic()) * shares[0] / sum(shares)
+            if (pid := os.fork()) == 0:
+                _in_child(name, results, chosen.seed, time.monotonic() + left, chosen.jobs)
+            os.waitpid(pid, 0)
+    summary = page.summary(harness.Results(results).lines)
     (chosen.out / "torture.json").write_text(json.dumps(summary, indent=1) + "\n")
     if chosen.page is not None:
         chosen.page.write_text(page.markdown(summary))
@@ -64,27 +63,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if summary["defects"] else 0
 
 
-def _opened(name: str, shared: Path, results: harness.Results, first_seed: int) -> harness.Campaign:
+def _limits(name: str) -> Limits:
+    return getattr(campaign(name), "LIMITS", Limits())
+
+
+def _in_child(name: str, path: Path, first_seed: int, deadline: float, jobs: int) -> NoReturn:
+    results, code = harness.Results(path), 1
+    try:
+        with tempfile.TemporaryDirectory(prefix="torture-shared-") as shared:
+            opened = _opened(name, Path(shared), results.seeds(name, first_seed))
+            harness.run(opened, results, deadline, jobs, sys.stderr)
+        code = 0
+    except BaseException as error:  # other campaigns go on
+        results.add(_broken_off(name, error))
+        print(f"{name} broke off: {error}", file=sys.stderr, flush=True)
+    finally:
+        os._exit(code)
+
+
+def _opened(name: str, shared: Path, seeds: Iterator[int]) -> harness.Campaign:
     module = campaign(name)
-    (shared / name).mkdir()
     prepare = getattr(module, "prepare", None)
-    given = prepare(shared / name) if prepare else None
-    limits = getattr(module, "LIMITS", Limits())
-    return harness.Campaign(name, module, results.seeds(name, first_seed), given, limits)
+    given = prepare(shared) if prepare else None
+    return harness.Campaign(name, module, seeds, given, _limits(name))
 
 
-def _unprepared(name: str, error: Exception) -> dict[str, Any]:
-    outcome = Outcome(WRONG, "preparation", f"{type(error).__name__}: {error}").as_json()
+def _broken_off(name: str, error: BaseException) -> dict[str, Any]:
+    outcome = Outcome(WRONG, "the campaign itself", f"{type(error).__name__}: {error}").as_json()
     told = {"campaign": name, "seed": -1, **outcome, "seconds": 0.0, "megabytes": 0}
     return {**told, "defect": outcome["detail"]}
 
 
-def _alone(opened: harness.Campaign, seed: int) -> int:
-    folder = Path(tempfile.mkdtemp(prefix=f"torture-{opened.name}-{seed}-"))
-    case = harness.begin(opened, seed, folder)
-    if not select.select([case.pidfd], [], [], opened.limits.seconds)[0]:
-        os.kill(case.pid, signal.SIGKILL)
-    line = harness.end(case, keep=True)
+def _alone(name: str, seed: int) -> int:
+    folder = Path(tempfile.mkdtemp(prefix=f"torture-{name}-{seed}-"))
+    with tempfile.TemporaryDirectory(prefix="torture-shared-") as shared:
+        opened = _opened(name, Path(shared), iter(()))
+        case = harness.begin(opened, seed, folder)
+        if not select.select([case.pidfd], [], [], opened.limits.seconds)[0]:
+            os.kill(case.pid, signal.SIGKILL)
+        line = harness.end(case, keep=True)
     print(json.dumps({**line, "folder": str(folder)}, indent=1))
     return 1 if "defect" in line else 0
 

@@ -23,7 +23,7 @@ NAMES = tuple(name for name, work in WORKS.items() if "icub" not in name and "--
 
 def prepare(folder: Path) -> dict[str, Any]:
     """Results of commands that have room."""
-    return prepared(folder)
+    return prepared(folder, NAMES)
 
 
 def case(job: Job) -> Outcome:

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -24,20 +24,15 @@ from .outcomes import GOOD, HANG, MEMORY, WRONG, Defect, Job, Limits, Outcome
 CASES = "cases.jsonl"
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Campaign:
-    """A campaign while it runs.
-
-    Attributes:
-        used: seconds that its cases have taken.
-    """
+    """A campaign while it runs."""
 
     name: str
     module: ModuleType
     seeds: Iterator[int]
     given: Any
     limits: Limits
-    used: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +80,11 @@ class Results:
             number += 1
 
 
-def run(
-    campaigns: Sequence[Campaign], results: Results, deadline: float, jobs: int, say: TextIO
-) -> None:
+def run(campaign: Campaign, results: Results, deadline: float, jobs: int, say: TextIO) -> None:
     """Run cases until the time is over; those that run then are ended in peace.
 
     Args:
-        campaigns: with what `prepare` gave.
+        campaign: with what `prepare` gave.
         results: each case is written there as it ends.
         deadline: until when, by the monotonic clock.
         jobs: cases at a time.
@@ -100,18 +93,15 @@ def run(
     running: dict[int, Running] = {}
     while running or time.monotonic() < deadline:
         while len(running) < jobs and time.monotonic() < deadline:
-            least = min(campaigns, key=lambda c: c.used / c.limits.share)
-            least.used += 1e-6  # so that cases begun at one time are of different campaigns
-            case = begin(least, next(least.seeds))
+            case = begin(campaign, next(campaign.seeds))
             running[case.pidfd] = case
         for pidfd in select.select(list(running), [], [], 0.5)[0]:
             line = end(case := running.pop(pidfd))
-            case.campaign.used += line["seconds"]
             results.add(line)
             if "defect" in line:
-                print(f"{case.campaign.name} {case.seed}: {line['defect']}", file=say, flush=True)
+                print(f"{campaign.name} {case.seed}: {line['defect']}", file=say, flush=True)
         for case in running.values():
-            if time.monotonic() - case.began > case.campaign.limits.seconds:
+            if time.monotonic() - case.began > campaign.limits.seconds:
                 os.kill(case.pid, signal.SIGKILL)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,27 +123,19 @@ WORKS: Mapping[str, Work] = {
     ),
 }
 
-_PREPARED: list[dict[str, Any]] = []
 
-
-def prepared(folder: Path) -> dict[str, Any]:
-    """Results of all works that nobody stops, and how many seconds each takes.
-
-    The first one who asks lends its folder to the others.
-    """
-    if _PREPARED:
-        return _PREPARED[0]
+def prepared(folder: Path, names: Collection[str]) -> dict[str, Any]:
+    """Results of works that nobody stops, and how many seconds each takes."""
     must(folder, "record", "oscillatory", "-o", folder / "recording", "--frames", FRAMES)
     (folder / "png").mkdir()
     for name in ("left", "right"):
         write_pictures(folder / "png" / name, 400)
     results, seconds = {}, {}
-    for name, work in WORKS.items():
-        place = folder / "done" / name
+    for name in names:
+        work, place = WORKS[name], folder / "done" / name
         began = time.monotonic()
         ran = here(*work.words(place, folder))
         if ran.code != 0:
             raise Defect(WRONG, "setup", f"{ran.line}: exit {ran.code}: {ran.told()}")
         results[name], seconds[name] = work.result(place), time.monotonic() - began
-    _PREPARED.append({"folder": folder, "results": results, "seconds": seconds})
-    return _PREPARED[0]
+    return {"folder": folder, "results": results, "seconds": seconds}
