@@ -19,7 +19,10 @@ from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import DONE, ROWS, read_rows
+from recorder.config import RecordConfig
 from recorder.log.logfile import LogFile
+from recorder.log.resume import frames_held
+from recorder.recording import record_scene
 from replay.camera_logs import picture_folder
 from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
@@ -235,3 +238,19 @@ def test_a_row_that_is_no_result_is_damage(tmp_path: Path, result: object) -> No
     (tmp_path / ROWS).write_text(json.dumps(row) + "\n")
     with pytest.raises(LogDamagedError, match=ROWS):
         results(tmp_path)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_cannot_be_unpacked_ends_what_is_resumed(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "x1.mcap"
+    settings = RecordConfig(compression=compression)
+    record_scene("oscillatory", tmp_path, frames=300, settings=settings)
+    data = bytearray(path.read_bytes())
+    held = set()
+    for at in range(len(data) // 4, len(data) // 2, 31):
+        damaged = bytearray(data)
+        damaged[at : at + 40] = bytes(40)
+        path.write_bytes(damaged)
+        held.add(frames_held(path, "x1").stop)
+    assert 0 < len(held) < 300
+    assert max(held) <= 300

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
@@ -27,7 +28,10 @@ from recorder.log.split import Split
 from recorder.log.viewfacts import Identity, ViewFacts
 from recorder.log.whole import partial_path
 
-_DAMAGE = (McapError, ValueError, struct.error, OverflowError, MemoryError, KeyError)
+_DAMAGE = (
+    *(McapError, ValueError, struct.error, OverflowError, MemoryError, KeyError, EOFError),
+    *(zstandard.ZstdError, RuntimeError),  # of data that lz4 cannot unpack, the latter
+)
 
 
 class FramesHeld(NamedTuple):
