@@ -164,7 +164,7 @@ def record(
             for view, there in earlier.items()
         }
         if resume and (others := other_recordings(folder, identity)):
-            raise UsageError(f"{others[0]} is of another recording: choose another folder")
+            raise UsageError(f"{others[0]} is of another recording: overwrite with --force")
         unfinished = [view for view, place in places.items() if not place.complete]
         if unfinished:
             lengths = dict.fromkeys(unfinished, frames)

@@ -22,7 +22,7 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
-from recorder.log.folder import logs_in, part_name, part_number
+from recorder.log.folder import logs_in, part_name, part_number, view_logs
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity, ViewFacts
@@ -32,6 +32,10 @@ _DAMAGE = (
     *(McapError, ValueError, struct.error, OverflowError, MemoryError, KeyError, EOFError),
     *(zstandard.ZstdError, RuntimeError),  # of data that lz4 cannot unpack, the latter
 )
+
+
+_LEAST = 64
+"""Bytes that no log has less of once its header and metadata are written."""
 
 
 class FramesHeld(NamedTuple):
@@ -172,9 +176,14 @@ def other_recordings(folder: Path, identity: Identity) -> list[Path]:
         UsageError: one is readably of something else.
     """
     others = []
-    for path in logs_in(folder) if folder.is_dir() else ():
+    if not folder.is_dir():
+        return []
+    own = [path for view in identity.spec.streams for path in view_logs(folder, view)]
+    for path in logs_in(folder):
         record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
         if record is None:
+            if path not in own and path.stat().st_size < _LEAST:
+                others.append(path)  # begun, and killed before it said of what it is
             continue
         if record.name != RECORDING_METADATA:
             raise UsageError(f"{path} is of no recording: choose another folder")

@@ -16,7 +16,7 @@ from replay.storage.regular import check_regular, read_regular
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 
-MAX_BYTES: Final = 128 * 1024 * 1024
+MAX_BYTES: Final = 64 * 1024 * 1024
 """Largest file that is read as a picture."""
 
 

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.errors import UsageError
 from replay.mcap.records import Bytes, MalformedRecord
 
-MAX_PIXELS: Final = 64 * 1024 * 1024
-"""Largest image that is decoded."""
+MAX_PIXELS: Final = 36_000_000
+"""Largest image that is decoded, more than one of 7680x4320."""
+
+_BAND: Final = 1 << 20
+"""Pixels that are made gray at a time, for what is between takes several bytes each."""
 
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
@@ -82,8 +86,23 @@ def gray(
         return np.ascontiguousarray(rows[:, :, 0])
     if kind == "gray16":
         return np.ascontiguousarray(rows[:, :, 0 if big_endian else 1])
-    red, green, blue = (rows[:, :, kind.index(c)].astype(np.uint32) for c in "rgb")
-    return ((19595 * red + 38470 * green + 7471 * blue + 32768) >> 16).astype(np.uint8)
+    found = np.empty((height, width), np.uint8)
+    for band in _bands(height, width):
+        red, green, blue = (rows[band, :, kind.index(c)].astype(np.uint32) for c in "rgb")
+        found[band] = (19595 * red + 38470 * green + 7471 * blue + 32768) >> 16
+    return found
+
+
+def _bands(height: int, width: int) -> Iterator[slice]:
+    step = max(_BAND // width, 1)
+    return (slice(start, start + step) for start in range(0, height, step))
+
+
+def _high_bytes(pixels: NDArray[Any]) -> Bytes:
+    found = np.empty(pixels.shape, np.uint8)
+    for band in _bands(*pixels.shape):
+        found[band] = (pixels[band].astype(np.int64) >> 8).clip(0, 255)
+    return found
 
 
 def shrink(image: Bytes, height: int, width: int) -> Bytes:
@@ -116,10 +135,11 @@ def compressed_gray(data: bytes) -> Bytes:
             if not 0 < image.width * image.height <= MAX_PIXELS:
                 raise MalformedRecord(f"an image of {image.width}x{image.height} is not read")
             if image.mode in ("I;16", "I;16B", "I"):
-                return (np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)
+                return _high_bytes(np.asarray(image))
             if image.mode not in ("L", "RGB"):
                 image = image.convert("RGB")
-            return np.array(image.convert("L"), np.uint8)
+            image = image.convert("L")
+            return np.array(image, np.uint8)
     except MalformedRecord:
         raise
     except Exception as error:  # Pillow raises whatever its codecs raise

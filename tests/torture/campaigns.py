@@ -17,6 +17,7 @@ CAMPAIGNS = (
         "races",
         "damage",
         "servers",
+        "histories",
     ),
 )
 """Modules of this folder, in the order of the page."""
