@@ -15,7 +15,7 @@ from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules
 from cdmisfa.agents.gate import NOVEL
 from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Workers
 from recorder.world.oscillatory import OscillatorySource

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numba
 import pytest
 
-from cdmisfa.core.compiled import MARKS, compiled, needs_compiling
+from cdmisfa.core.arithmetic.compiled import MARKS, compiled, needs_compiling
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -22,7 +22,7 @@ def test_without_a_folder_for_results_it_compiles_all_the_same(
             raise RuntimeError("cannot cache function: no locator available")
         return numba.njit(**options)
 
-    monkeypatch.setattr("cdmisfa.core.compiled.numba", SimpleNamespace(njit=no_folder))
+    monkeypatch.setattr("cdmisfa.core.arithmetic.compiled.numba", SimpleNamespace(njit=no_folder))
 
     @compiled
     def double(x: float) -> float:
@@ -42,7 +42,7 @@ def test_what_was_kept_before_a_class_moved_is_made_again(tmp_path: Path) -> Non
         program = tmp_path / "program.py"
         program.write_text(
             f"from {home} import Pair\n"
-            "from cdmisfa.core.compiled import compiled\n"
+            "from cdmisfa.core.arithmetic.compiled import compiled\n"
             "@compiled\n"
             "def total(pair):\n"
             "    return pair.a + pair.b\n"

@@ -386,7 +386,7 @@ def test_differences_name_the_key() -> None:
 
 def test_compiling_is_announced_only_when_it_will_happen(tmp_path: Path) -> None:
     script = (
-        "from cdmisfa.core.compiled import needs_compiling as n;"
+        "from cdmisfa.core.arithmetic.compiled import needs_compiling as n;"
         "from cdmisfa.agents.exploration import decay;"
         "print(n(decay)); decay(1.0, .9, .5, .5); print(n(decay))"
     )

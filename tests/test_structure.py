@@ -39,6 +39,7 @@ FORBIDDEN = {
     "cdmisfa.cli": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
+    "cdmisfa.core.arithmetic": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.experiments": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.runs", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),

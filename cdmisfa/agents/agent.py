@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import DENSE_STREAMS

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 
 
 @compiled

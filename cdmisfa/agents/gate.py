@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.agents.roc import known_to
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.features.projection import outputs
 from cdmisfa.features.slowness import instantaneous_slowness
 

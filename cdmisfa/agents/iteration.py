@@ -19,7 +19,7 @@ from cdmisfa.agents.gate import NOVEL, Frozen, recognise
 from cdmisfa.agents.policy import policy_iteration
 from cdmisfa.agents.reward import add_reward, add_reward_locally, curiosity_reward, expert_reward
 from cdmisfa.agents.saving import ready_to_save, track_clusters, track_output
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.features.feature import feed
 from cdmisfa.features.projection import mean_output, outputs
 

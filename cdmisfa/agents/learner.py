@@ -18,6 +18,7 @@ from cdmisfa.agents.gate import Frozen
 from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.policy import action_values
+from cdmisfa.core.arithmetic.choice import in_own_arithmetic
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -167,6 +168,7 @@ class CuriousLearner:
         overwrite(self._arrays(), state.arrays)
         self.policy_rng.bit_generator.state = dict(state.policy_rng)
 
+    @in_own_arithmetic
     def step(self, block: Block) -> BlockSignals:
         """One iteration: look at tau frames, learn, and decide what to watch next.
 
@@ -295,6 +297,7 @@ class CuriousLearner:
             counts=np.array([m.counts for m in modules]).reshape(count, *agent.counts.shape),
         )
 
+    @in_own_arithmetic
     def _new_abstraction(self) -> Feature:
         key = (WEIGHTS_KEY, len(self.modules))
         seed = np.random.SeedSequence(self.seed, spawn_key=key)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
+from cdmisfa.core.arithmetic.elementary import exp
 
 Float = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ def expert_reward(xi: float, sigma: float, beta: float) -> float:
     """
     if sigma <= 0.0:
         return 0.0
-    return beta * math.exp(-xi * xi / (2.0 * sigma * sigma))
+    return beta * exp(-xi * xi / (2.0 * sigma * sigma))
 
 
 @compiled

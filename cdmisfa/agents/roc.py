@@ -12,7 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
+from cdmisfa.core.arithmetic.elementary import exp
 
 Float = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ def cluster(
         radius: distance within which a centre is near.
         memory: blocks after which a count has decayed to 1/e.
     """
-    keep = math.exp(-1.0 / memory)
+    keep = exp(-1.0 / memory)
     for s in range(counts.shape[0]):
         for c in range(counts.shape[1]):
             counts[s, c] *= keep

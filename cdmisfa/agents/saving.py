@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.agents.agent import Agent, Rules
 from cdmisfa.agents.roc import cluster
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.features.slowness import (
     block_moments,
     block_variance,

@@ -86,6 +86,7 @@ class LearnerConfig:
     roc_radius: float = 0.3
     roc_memory: int = 40
     roc_error: float = 0.1
+    portable: bool = False
 
     def __post_init__(self) -> None:
         from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy

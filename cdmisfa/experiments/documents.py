@@ -51,6 +51,39 @@ def versions() -> dict[str, str]:
     return found
 
 
+@functools.cache
+def machine() -> dict[str, str]:
+    """The system and the processor, and what the libraries that compute use of it.
+
+    Where arithmetic is not portable, the last bits of a result may depend on each.
+    """
+    import numpy as np
+    from numba.core.registry import cpu_target
+
+    _, compiled_for, features = cpu_target.target_context.codegen().magic_tuple()
+    numpy_built: Any = np.show_config(mode="dicts")
+    blas = numpy_built.get("Build Dependencies", {}).get("blas", {})
+    return {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "libc": " ".join(platform.libc_ver()).strip(),
+        "cpu": _cpu(),
+        "compiled_for": compiled_for,
+        "cpu_features": " ".join(f[1:] for f in features.split(",") if f.startswith("+")),
+        "numpy_features": " ".join(numpy_built.get("SIMD Extensions", {}).get("found", ())),
+        "blas": f"{blas.get('name', 'unknown')} {blas.get('version', '')}".strip(),
+    }
+
+
+def _cpu() -> str:
+    """The processor's name, as Linux or Python tells it."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"
+
+
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a JSON document, whole or not at all.
 

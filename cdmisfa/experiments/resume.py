@@ -33,6 +33,7 @@ OPTIONS = (
     "preset",
     "settings",
     "algorithm",
+    "portable",
     "loop",
     "salvage",
     "follow",
@@ -201,6 +202,8 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
     }
     now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec), COMMAND: None}
     for key, old, new in differences(_json(before), _json(now)):
+        if (key, old, new) == ("config.learner.portable", None, False):
+            continue  # begun when there was no choice
         raise UsageError(
             f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: resume with "
             "what it was made with, or choose another folder"

@@ -7,7 +7,6 @@ RUN/run.rrd the view. The loop itself is in `loop`.
 from __future__ import annotations
 
 import contextlib
-import platform
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learners import open_learner
+from cdmisfa.core.arithmetic.compiled import needs_compiling
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.compiled import needs_compiling
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
-from cdmisfa.experiments.documents import versions, write_json
+from cdmisfa.experiments.documents import machine, versions, write_json
 from cdmisfa.experiments.loop import Digest, learn
 from cdmisfa.experiments.resume import (
     COMMAND,
@@ -366,7 +365,7 @@ def _write_run(
         "source": dict(result.source),
         "streams": list(result.streams),
         "versions": versions(),
-        "platform": {"system": platform.system(), "machine": platform.machine()},
+        "platform": machine(),
         "result": result.as_json(),
         **begun,
     }

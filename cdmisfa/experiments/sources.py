@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
+from cdmisfa.core.arithmetic.choice import portable_bits
 from cdmisfa.core.blocks import SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
@@ -41,6 +42,13 @@ class Configuration:
     learner: Any
     scene: SceneConfig
     record: RecordConfig
+
+    def open_scene(self) -> SeekableSource:
+        """The live scene; what it computes in the arithmetic that the learner is told to use."""
+        from recorder.world.scenes import open_scene
+
+        with portable_bits(getattr(self.learner, "portable", False)):
+            return open_scene(self.scene.kind, self.scene, self.record)
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
@@ -182,8 +190,6 @@ def open_source(
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
-    from recorder.world.scenes import open_scene
-
     cameras = cameras or CameraOptions()
     if follow is not None and (
         len(words) > 1 or words[0] in SCENES or loop or salvage or cameras != CameraOptions()
@@ -196,7 +202,7 @@ def open_source(
             )
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
-        return open_scene(kind, configuration.scene, configuration.record), configuration
+        return configuration.open_scene(), configuration
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")

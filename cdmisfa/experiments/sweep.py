@@ -22,7 +22,7 @@ from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_t
 from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
-from recorder.world.scenes import SCENES, open_scene
+from recorder.world.scenes import SCENES
 from replay.storage.limits import Limits, limited, limits
 
 REQUEST = "sweep.json"
@@ -247,7 +247,7 @@ def _compiled_trial(trial: SweepTrial) -> dict[str, Any]:
 def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     configuration = trial.configuration
     if _is_live(trial.source):
-        source = open_scene(trial.source[0], configuration.scene, configuration.record)
+        source = configuration.open_scene()
     else:
         with limited(trial.limits):
             source, _ = open_source(trial.source, loop=trial.loop)

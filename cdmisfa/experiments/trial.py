@@ -19,7 +19,8 @@ from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.policy import action_values
-from cdmisfa.core.compiled import compiled, spliced
+from cdmisfa.core.arithmetic.choice import in_own_arithmetic
+from cdmisfa.core.arithmetic.compiled import compiled, spliced
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
@@ -173,6 +174,7 @@ def _compiles(learner: Learner) -> TypeGuard[CuriousLearner]:
     return isinstance(learner, CuriousLearner) and learner.kernel is not None
 
 
+@in_own_arithmetic
 def run_trial(
     config: LearnerConfig,
     streams: Sequence[str] = ("x1", "x2", "x3"),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import reordered
+from cdmisfa.core.arithmetic.choice import Either
+from cdmisfa.core.arithmetic.compiled import compiled, reordered
+from cdmisfa.features.lanes import LANES, load, multiply_add, total, zeros
 
 Float = NDArray[np.float64]
 
@@ -13,8 +15,28 @@ ROWS = 4
 """Frames measured at once: three vectors and so many sums fit into registers."""
 
 
+@compiled
+def _measure_in_order(
+    v: Float, column: int, width: int, rows: int, u: Float, first: int, e: Float
+) -> None:
+    """See `_measure_tile`; eight sums side by side, then theirs, then of what is left."""
+    whole = width - width % LANES
+    for j in range(rows):
+        a, b, c, d = zeros(), zeros(), zeros(), zeros()
+        for i in range(0, whole, LANES):
+            x = load(v, j, column + i)
+            a = multiply_add(a, x, load(u, first, i))
+            b = multiply_add(b, x, load(u, first + 1, i))
+            c = multiply_add(c, x, load(u, first + 2, i))
+            d = multiply_add(d, x, load(u, first + 3, i))
+        for k, y in enumerate((total(a), total(b), total(c), total(d))):
+            for i in range(whole, width):
+                y += v[j, column + i] * u[first + k, i]
+            e[j, first + k] += y
+
+
 @reordered
-def measure_tile(
+def _measure_tile(
     v: Float, column: int, width: int, rows: int, u: Float, first: int, e: Float
 ) -> None:
     """Add a tile's share of the inner products of vectors with ROWS frames.
@@ -63,3 +85,7 @@ def measure_tile(
             x3 += x * u3[i]
         for k, a in enumerate((x0, x1, x2, x3)):
             e[j, first + k] += a
+
+
+measure_tile = Either(_measure_tile, lambda: _measure_in_order)
+"""See `_measure_tile`."""

@@ -89,3 +89,37 @@ def add(typing: Any, x: Any, table: Any, row: Any, column: Any, y: Any) -> Any:
         return builder.fadd(x, builder.fmul(factor, y))
 
     return _LANES(_LANES, table, types.intp, types.intp, _LANES), emit
+
+
+@_intrinsic
+def multiply_add(typing: Any, x: Any, y: Any, z: Any) -> Any:
+    """Return x + y * z."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fadd(args[0], builder.fmul(args[1], args[2]))
+
+    return _LANES(_LANES, _LANES, _LANES), emit
+
+
+@_intrinsic
+def total(typing: Any, x: Any) -> Any:
+    """Return the sum of a value's numbers, of neighbours first."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        parts = [builder.extract_element(args[0], _INDEX(lane)) for lane in range(LANES)]
+        while len(parts) > 1:
+            pairs = zip(parts[::2], parts[1::2], strict=True)
+            parts = [builder.fadd(first, second) for first, second in pairs]
+        return parts[0]
+
+    return types.float64(_LANES), emit
+
+
+@_intrinsic
+def zeros(typing: Any) -> Any:
+    """Return a value of zeros."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return ir.Constant(_VECTOR, [0.0] * LANES)
+
+    return _LANES(), emit

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.choice import Either
+from cdmisfa.core.arithmetic.compiled import compiled, reordered
 from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
-from cdmisfa.core.compiled import compiled, reordered
 from cdmisfa.core.errors import UsageError
+from cdmisfa.features.inner_products import ROWS, measure_tile
 
 Float = NDArray[np.float64]
 
@@ -42,7 +45,7 @@ def project(phi: Float, offset: Float, frames: Any) -> Float:
 
 
 @reordered
-def outputs(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
+def _outputs(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
     """`project` for frames that were checked: compiled, and without a float copy of them.
 
     A row's output does not depend on which rows it is stacked with, nor a frame's on its
@@ -76,6 +79,33 @@ def outputs(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
         for r in range(rows):
             y[t, r] -= offset[r]
     return y
+
+
+@compiled
+def _outputs_in_order(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
+    """See `outputs`."""
+    n, size = frames.shape
+    rows = phi.shape[0]
+    scale = PIXEL if frames.dtype == UINT8 else 1.0
+    x, e = np.zeros((ROWS, CHUNK)), np.empty((rows, ROWS))
+    y = np.empty((n, rows))
+    for first in range(0, n, ROWS):
+        count = min(ROWS, n - first)
+        e[:] = 0.0
+        for start in range(0, size, CHUNK):
+            width = min(CHUNK, size - start)
+            for k in range(count):
+                for i in range(width):
+                    x[k, i] = frames[first + k, start + i] * scale
+            measure_tile(phi, start, width, rows, x, 0, e)
+        for k in range(count):
+            for r in range(rows):
+                y[first + k, r] = e[r, k] - offset[r]
+    return y
+
+
+outputs: Callable[[Float, Float, NDArray[Any]], Float] = Either(_outputs, lambda: _outputs_in_order)
+"""See `_outputs`."""
 
 
 @compiled

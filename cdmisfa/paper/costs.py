@@ -16,7 +16,7 @@ from cdmisfa.agents.gate import verdict
 from cdmisfa.agents.reward import add_reward, add_reward_locally
 from cdmisfa.agents.roc import known_to
 from cdmisfa.agents.saving import track_clusters, track_output
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.paper.oscillatory import STREAMS, learner_config

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.elementary import cos, sin
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -25,8 +26,8 @@ def x1(theta: Float) -> Float:
 
     Equation: 7
     """
-    fast = np.cos(44 * theta)
-    return np.stack([np.sin(4 * theta - np.pi / 4) - fast**2, fast], axis=1)
+    fast = cos(44 * theta)
+    return np.stack([sin(4 * theta - np.pi / 4) - fast**2, fast], axis=1)
 
 
 def x2(theta: Float) -> Float:
@@ -34,8 +35,8 @@ def x2(theta: Float) -> Float:
 
     Equation: 8
     """
-    fast = np.cos(27 * theta)
-    return np.stack([np.sin(3 * theta) + fast**2, fast], axis=1)
+    fast = cos(27 * theta)
+    return np.stack([sin(3 * theta) + fast**2, fast], axis=1)
 
 
 def x3(theta: Float) -> Float:
@@ -43,8 +44,8 @@ def x3(theta: Float) -> Float:
 
     Equation: 9
     """
-    fast = np.cos(12 * theta)
-    return np.stack([fast, np.cos(2 * theta) + fast**2], axis=1)
+    fast = cos(12 * theta)
+    return np.stack([fast, cos(2 * theta) + fast**2], axis=1)
 
 
 def zero(theta: Float) -> Float:

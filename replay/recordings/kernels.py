@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from replay.mcap.records import Bytes
 
 Places = NDArray[np.int64]

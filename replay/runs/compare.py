@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import SignalColumns
-from replay.runs.folders import run_log
+from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import read_header
 from replay.runs.outline import Outline, read_outline
 from replay.runs.stretches import read_columns
@@ -127,13 +127,56 @@ def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
     return differ & ~(np.isnan(x) & np.isnan(y)) if differ.any() else differ
 
 
+def computed_otherwise(first: Path, second: Path) -> tuple[str, ...]:
+    """What explains a difference of two runs that were told the same: other versions or processors.
+
+    Nothing where configuration, seed or source explain it, or a run.json does not say. Processors
+    explain nothing between runs with `learner.portable`.
+    """
+    a, b = (read_run_json(run_log(run).parent) for run in (first, second))
+    if any(a.get(key) != b.get(key) for key in ("config", "seed", "source")):
+        return ()
+    tables = ["versions"] if _is_portable(a) else ["versions", "platform"]
+    found = []
+    for before, after in ((a.get(table), b.get(table)) for table in tables):
+        if isinstance(before, Mapping) and isinstance(after, Mapping):
+            found += [
+                _otherwise(key, str(before.get(key, "unknown")), str(after.get(key, "unknown")))
+                for key in sorted({*before, *after})
+                if before.get(key) != after.get(key)
+            ]
+    return tuple(found)
+
+
+def _is_portable(document: Mapping[str, Any]) -> bool:
+    learner: Any = document.get("config", {})
+    for key in ("learner", "portable"):
+        learner = learner.get(key) if isinstance(learner, Mapping) else None
+    return learner is True
+
+
+def _otherwise(key: str, first: str, second: str) -> str:
+    """How a fact of two runs differs; of features of processors, those that one of them has."""
+    if not key.endswith("_features") or "unknown" in (first, second):
+        return f"{key} {first} against {second}"
+    a, b = first.split(), second.split()
+    more = (f"{sign}{f}" for sign, x, y in (("-", a, b), ("+", b, a)) for f in x if f not in y)
+    return f"{key} {' '.join(more)}"
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A run in a table of runs, and where its signals first differ from the first run's."""
+    """A run in a table of runs, and where its signals first differ from the first run's.
+
+    Attributes:
+        difference: from the first run, None where there is none.
+        otherwise: what explains it, see `computed_otherwise`.
+    """
 
     name: str
     outline: Outline
     difference: Difference | None
+    otherwise: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The row as JSON values."""
@@ -144,6 +187,7 @@ class Row:
             "iterations": self.outline.iterations,
             "modules": [streams[saved.stream] for saved in self.outline.saved],
             "first_difference": None if self.difference is None else self.difference.as_json(),
+            "computed_otherwise": list(self.otherwise),
         }
 
     def cells(self) -> tuple[str, ...]:
@@ -152,6 +196,12 @@ class Row:
         same = "identical, bit for bit" if self.difference is None else str(self.difference)
         learned = ", ".join(found["modules"]) or "none"
         return self.name, str(found["seed"]), str(found["iterations"]), learned, same
+
+    def explanation(self) -> str:
+        """What explains its difference, in words; "" where nothing known does."""
+        if not self.otherwise:
+            return ""
+        return f"{self.name} was computed otherwise, which may be why: {'; '.join(self.otherwise)}"
 
 
 HEAD = ("run", "seed", "iterations", "modules", "against the first run")
@@ -162,5 +212,7 @@ def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
     rows: list[Row] = []
     for run in runs:
         name, outline = run_log(run).resolve().parent.name, read_outline(run)
-        rows.append(Row(name, outline, first_difference(runs[0], run) if rows else None))
+        found = first_difference(runs[0], run) if rows else None
+        because = computed_otherwise(runs[0], run) if found is not None else ()
+        rows.append(Row(name, outline, found, because))
     return tuple(rows)

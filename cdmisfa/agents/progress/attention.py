@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.elementary import fading, log
+
 Float = NDArray[np.float64]
 
 HALF = 8
@@ -102,8 +104,7 @@ def _gamma_progress(s: Situation) -> Float:
     def value(errors: Float, _: int) -> float:
         if len(errors) < RECENT:
             return 1e3
-        ages = np.arange(len(errors))[::-1]
-        slow, fast = 0.95**ages, 0.7**ages
+        slow, fast = fading(0.95, len(errors)), fading(0.7, len(errors))
         return float((errors * slow).sum() / slow.sum() - (errors * fast).sum() / fast.sum())
 
     return _of_each(s, value, -1e3)
@@ -111,7 +112,7 @@ def _gamma_progress(s: Situation) -> Float:
 
 def _upper_bound(s: Situation) -> Float:
     """Upper confidence bound on the relative fall of the learning error (UCB1)."""
-    total = math.log(max(int(s.visits.sum()), 2))
+    total = log(max(int(s.visits.sum()), 2))
 
     def value(errors: Float, visits: int) -> float:
         if len(errors) < RECENT:

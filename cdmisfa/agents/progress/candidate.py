@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.elementary import log
 from cdmisfa.core.learning import overwrite
 from cdmisfa.features.projection import mean_output, project
 from cdmisfa.features.recursive.recursive import RecursiveSFA, State
@@ -33,7 +34,7 @@ UNTESTED = 3.0
 
 def log_ratio(a: float, b: float) -> float:
     """ln(a / b) of two slownesses, finite where one of them is 0."""
-    return math.log(max(a, _TINY) / max(b, _TINY))
+    return log(max(a, _TINY) / max(b, _TINY))
 
 
 def learning_error(change: float, tested: float, fitted: float) -> float:

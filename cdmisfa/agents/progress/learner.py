@@ -40,6 +40,7 @@ from cdmisfa.agents.progress.streams import (
     outcomes,
     watch,
 )
+from cdmisfa.core.arithmetic.choice import in_own_arithmetic
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
@@ -165,6 +166,7 @@ class ProgressLearner:
         self._freeze()
         self._rng.bit_generator.state = dict(state.policy_rng)
 
+    @in_own_arithmetic
     def step(self, block: Block) -> BlockSignals:
         """One iteration: test on tau frames, learn from them, and decide what to watch next.
 

@@ -38,6 +38,11 @@ TICK = 0.1
     help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
 )
+@click.option(
+    "--portable",
+    is_flag=True,
+    help="The same bits on every x86-64 processor, short for --set learner.portable=true; slower.",
+)
 @click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
 @click.option(
     "--max-modules",
@@ -74,6 +79,7 @@ def learn_command(
     preset: str | None,
     settings: tuple[str, ...],
     algorithm: str | None,
+    portable: bool,
     max_iterations: int | None,
     max_modules: int | None,
     loop: bool,
@@ -110,6 +116,8 @@ def learn_command(
 
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
+    if portable:
+        settings = (*settings, "learner.portable=true")
     frames, configuration = open_source(
         source,
         preset=preset,

@@ -58,6 +58,9 @@ def compare_command(
         click.echo(str(different[0]) if different else "identical, bit for bit")
     else:
         options.print_table(HEAD, [row.cells() for row in rows])
+    for explanation in filter(None, (row.explanation() for row in rows)):
+        if not as_json:
+            click.echo(explanation)
     if save is not None and not as_json:
         click.echo(f"view {save}    look at it: cdmisfa view {options.quoted(save)}", err=True)
     if different and len(runs) == 2:

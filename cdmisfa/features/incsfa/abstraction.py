@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.compiled import in_compiled_code
 from cdmisfa.core.blocks import as_frames
-from cdmisfa.core.compiled import in_compiled_code
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.features.feature import feed
 from cdmisfa.features.incsfa import gram, strict

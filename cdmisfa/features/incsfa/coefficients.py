@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cdmisfa.core.compiled import reordered
+from cdmisfa.core.arithmetic.compiled import reordered
 from cdmisfa.features.incsfa.state import Float, rank_floor, whitening_scale
 
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.compiled import compiled, reordered
 from cdmisfa.core.blocks import PIXEL, UINT8
-from cdmisfa.core.compiled import compiled, reordered
 from cdmisfa.features.incsfa.state import Float, State, mean_rate
 from cdmisfa.features.inner_products import ROWS, measure_tile
 from cdmisfa.features.lanes import LANES, add, load, store

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import inlined
+from cdmisfa.core.arithmetic.compiled import inlined
+from cdmisfa.core.arithmetic.elementary import normal
 from cdmisfa.core.config import LearnerConfig
 
 Float = NDArray[np.float64]
@@ -82,8 +83,8 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
         config: gives K = `components` and J = `outputs`.
     """
     K, J = config.components, config.outputs
-    v = 0.1 * rng.standard_normal((K, n_inputs))
-    w = rng.standard_normal((J, K))
+    v = 0.1 * normal(rng, (K, n_inputs))
+    w = normal(rng, (J, K))
     w /= np.sqrt((w * w).sum(axis=1))[:, None]
     return State(
         mean=np.zeros(n_inputs),

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.compiled import compiled, inlined
 from cdmisfa.core.blocks import PIXEL, UINT8
-from cdmisfa.core.compiled import compiled, inlined
 from cdmisfa.features.incsfa.state import (
     Float,
     Params,

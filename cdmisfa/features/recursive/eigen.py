@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import reordered
+from cdmisfa.core.arithmetic.compiled import reordered
 
 Float = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.features.recursive.eigen import eigen
 
 Float = NDArray[np.float64]

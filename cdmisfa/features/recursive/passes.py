@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.compiled import compiled, reordered
+from cdmisfa.core.arithmetic.compiled import compiled, reordered
 from cdmisfa.features.inner_products import ROWS, measure_tile
 from cdmisfa.features.lanes import LANES, add, load, store
 

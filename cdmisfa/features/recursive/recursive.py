@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
-from cdmisfa.core.compiled import compiled
 from cdmisfa.core.errors import UsageError
 from cdmisfa.features.inner_products import ROWS
 from cdmisfa.features.projection import outputs

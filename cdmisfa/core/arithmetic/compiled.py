@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.extending import overload
+
+from cdmisfa.core.arithmetic.choice import Either
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -21,6 +24,7 @@ MARKS = (
     b"@reordered",
     b"@in_compiled_code",
     b"@_intrinsic",
+    b"Either",
 )
 """What files that hold compiled functions contain."""
 
@@ -43,7 +47,8 @@ def spliced(function: Function) -> Function:
 def reordered(function: Function) -> Function:
     """Compile with sums in whichever order is fastest on this processor, and keep the result.
 
-    One machine gives the same bits every time; other processors may differ in the last ones.
+    One machine gives the same bits every time; other processors may differ in the last ones,
+    but not where `portable_bits` are asked for: then sums are in the order in which they stand.
     """
     return _compile(function, fastmath={"reassoc", "contract"})
 
@@ -59,10 +64,29 @@ def in_compiled_code(function: Callable[..., Any]) -> Callable[[Function], Funct
 
 def _compile(function: Function, **options: Any) -> Function:
     options["error_model"] = "numpy"  # no test at every division whether an error is to be raised
+    strict = {name: value for name, value in options.items() if name != "fastmath"}
+    return cast(
+        Function,
+        Either(_jit(function, options), lambda: _jit(_under_another_name(function), strict)),
+    )
+
+
+def _jit(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
     try:
-        return cast(Function, kept_while_sources_last(numba.njit(cache=True, **options)(function)))
+        return kept_while_sources_last(numba.njit(cache=True, **options)(function))
     except RuntimeError:  # numba found no folder that it may write to
-        return cast(Function, numba.njit(**options)(function))
+        return numba.njit(**options)(function)
+
+
+def _under_another_name(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function under a name that leads to files and symbols of its own."""
+    code = function.__code__
+    copy = FunctionType(
+        code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    copy.__qualname__ = f"{function.__qualname__}_portable"
+    copy.__module__ = function.__module__
+    return copy
 
 
 def kept_while_sources_last(dispatcher: Any) -> Any:
@@ -93,7 +117,7 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
 @cache
 def _sources() -> str:
     """Hash of the sources of all packages that hold compiled functions."""
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     digest = hashlib.sha256()
     for package in ("cdmisfa", "recorder", "replay"):
         for path in sorted((root / package).rglob("*.py")):
