@@ -1,12 +1,17 @@
-"""Commands whose standard streams are closed, as a daemon's are."""
+"""Commands whose standard streams are closed, as a daemon's are, and what signals end them with."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+
+from cdmisfa.cli.interrupts import interruptible, stoppable
 
 CLOSED = ("<&-", ">&-", "2>&-", "<&- >&- 2>&-")
 
@@ -46,3 +51,17 @@ def test_processes_of_a_command_do_theirs(tmp_path: Path, closed: str) -> None:
 @pytest.mark.parametrize("closed", CLOSED)
 def test_an_error_keeps_its_exit_code(tmp_path: Path, closed: str) -> None:
     assert cdmisfa(closed, "info", tmp_path / "nothing").returncode == 2
+
+
+def test_the_second_signal_is_the_one_that_the_exit_code_names() -> None:
+    def told_twice() -> None:
+        with stoppable(notice="") as inner:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert inner()
+            os.kill(os.getpid(), signal.SIGHUP)
+            time.sleep(5)
+
+    with interruptible() as outer:
+        with pytest.raises(KeyboardInterrupt):
+            told_twice()
+        assert outer.exit_code == 129

@@ -45,10 +45,12 @@ def stoppable(
     notice: str = "stopping after this iteration; again to stop at once\n",
 ) -> Iterator[Stop]:
     """Let the body end its step at the first signal, and say so; the second one interrupts it."""
-    stop = Stop()
+    stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
     def ask(number: int, frame: FrameType | None) -> None:
         if stop():
+            if callable(handle := outer[number]):  # which knows the exit code
+                handle(number, frame)
             raise KeyboardInterrupt
         stop.number = number
         # not print: the signal may have come in the middle of one
