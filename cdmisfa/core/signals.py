@@ -12,8 +12,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+import struct
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, lru_cache
+from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
@@ -279,6 +282,32 @@ def values(
         yield signal, np.asarray(getattr(signals, signal.name), dtype=signal.dtype)
 
 
+CODES: Mapping[str, str] = {"float64": "d", "int64": "q", "bool": "?"}
+"""What `struct` calls the types of signals."""
+
+
+class Fields:
+    """Some signals, whose values in a record are all got at once, to be made bytes of.
+
+    Attributes:
+        signals: which, in the order in which `values` gives them.
+        arrays: places of the arrays among them.
+    """
+
+    def __init__(self, signals: Iterable[Signal]) -> None:
+        self.signals = tuple(signals)
+        self._get = attrgetter(*(s.name for s in self.signals))
+        self.arrays = tuple(place for place, s in enumerate(self.signals) if s.dims)
+        self._types = tuple(np.dtype(s.dtype).newbyteorder("<") for s in self.signals if s.dims)
+
+    def values(self, record: BlockSignals) -> list[Any]:
+        """Scalars as they are, and arrays of the documented type, little-endian."""
+        values = list(self._get(record))
+        for place, dtype in zip(self.arrays, self._types, strict=True):
+            values[place] = np.asarray(values[place], dtype=dtype)
+        return values
+
+
 class SignalsHash:
     """SHA-256 over the canonical bytes of all records in order.
 
@@ -303,10 +332,39 @@ class SignalsHash:
 
 def canonical_bytes(signals: BlockSignals, version: int = SCHEMA_VERSION) -> bytes:
     """The bytes that stand for a record, as a version has it, wherever runs are compared."""
-    parts: list[bytes] = []
-    for _, value in values(signals, version):
-        parts.append(np.array(value.shape, dtype="<i8").tobytes())
-        if value.dtype.kind == "f":
-            value = np.where(np.isnan(value), np.nan, value)
-        parts.append(np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<")).tobytes())
-    return b"".join(parts)
+    fields = _fields(version)
+    values = fields.values(signals)
+    arrays = [(place, values[place]) for place in fields.arrays]
+    floats = np.concatenate([a.reshape(-1) for _, a in arrays if a.dtype.kind == "f"])
+    floats[np.isnan(floats)] = math.nan
+    data, at, lengths = floats.tobytes(), 0, []
+    for place, array in arrays:
+        if array.dtype.kind == "f":
+            elements = data[at : at + array.nbytes]
+            at += array.nbytes
+        else:
+            elements = array.tobytes()
+        values[place] = _sizes(array.shape) + elements
+        lengths.append(len(values[place]))
+    layout = _layout(version, tuple(lengths))
+    return layout.pack(*(x if x == x else math.nan for x in values))
+
+
+@cache
+def _fields(version: int) -> Fields:
+    return Fields(s for s in SIGNALS.values() if s.since <= version)
+
+
+@lru_cache
+def _sizes(shape: tuple[int, ...]) -> bytes:
+    return struct.pack(f"<{len(shape)}q", *shape)
+
+
+@lru_cache
+def _layout(version: int, lengths: tuple[int, ...]) -> struct.Struct:
+    """How the bytes lie in records of a version whose arrays take so many, sizes included."""
+    left = iter(lengths)
+    fields = _fields(version).signals
+    return struct.Struct(
+        "<" + "".join(f"{next(left)}s" if s.dims else CODES[s.dtype] for s in fields)
+    )

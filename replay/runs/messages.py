@@ -30,7 +30,15 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError, one_line
 from cdmisfa.core.learning import Keyframe, LearnerState
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import MISSING, SCHEMA_VERSION, SIGNALS, BlockSignals, Signal
+from cdmisfa.core.signals import (
+    CODES,
+    MISSING,
+    SCHEMA_VERSION,
+    SIGNALS,
+    BlockSignals,
+    Fields,
+    Signal,
+)
 from recorder.log.messages import varint
 from replay.mcap.records import MalformedRecord
 from replay.storage.arrays import contents, stored_arrays
@@ -53,7 +61,6 @@ _Field = tuple[str, int, Any, bool, str]
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
 _TYPES = {"float64": _FIELD.TYPE_DOUBLE, "int64": _FIELD.TYPE_SFIXED64, "bool": _FIELD.TYPE_BOOL}
-_CODES = {"float64": "d", "int64": "q", "bool": "?"}
 _WIRE = {"float64": 1, "int64": 1, "bool": 0}
 _VARINT, _LENGTH_DELIMITED = 0, 2
 _MODULES = "modules."
@@ -77,12 +84,12 @@ The length is a varint of five bytes, which any reader takes and which has a fix
 
 def encode_signals(signals: BlockSignals) -> bytes:
     """A record as the bytes of its message."""
+    values = _FIELDS.values(signals)
     scalars = list(_TAGGED)
-    scalars[1::2] = [getattr(signals, s.name) for s in _SCALARS]
+    scalars[1::2] = values[: len(_SCALARS)]
     parts = [_STRUCT.pack(*scalars)]
     shapes = []
-    for name, dtype, tag in _ARRAY_TAGS:
-        value = np.asarray(getattr(signals, name), dtype=dtype)
+    for tag, value in zip(_ARRAY_TAGS, values[len(_SCALARS) :], strict=True):
         shapes.append(value.shape)
         if value.size:
             parts.append(_length_prefix(tag, value.nbytes))
@@ -368,9 +375,8 @@ SCHEMAS: Mapping[str, bytes] = {
 _TAGGED: tuple[Any, ...] = tuple(
     part for s in _SCALARS for part in (_tag(s.name, _WIRE[s.dtype]), None)
 )
-_LAYOUT = (f"{len(tag)}s{_CODES[s.dtype]}" for tag, s in zip(_TAGGED[::2], _SCALARS, strict=True))
+_LAYOUT = (f"{len(tag)}s{CODES[s.dtype]}" for tag, s in zip(_TAGGED[::2], _SCALARS, strict=True))
 _STRUCT = struct.Struct("<" + "".join(_LAYOUT))
-_ARRAY_TAGS = tuple(
-    (s.name, np.dtype(s.dtype).newbyteorder("<"), _tag(s.name, _LENGTH_DELIMITED)) for s in _ARRAYS
-)
+_ARRAY_TAGS = tuple(_tag(s.name, _LENGTH_DELIMITED) for s in _ARRAYS)
+_FIELDS = Fields((*_SCALARS, *_ARRAYS))
 _SHAPE_BYTES: dict[tuple[tuple[int, ...], ...], bytes] = {}
