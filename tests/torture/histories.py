@@ -165,9 +165,7 @@ class History:
                 words = {"force": how == "force", "resume": how == "resume", "rerun": False}
                 with contextlib.suppress(RunExhaustedError):
                     limits = {"max_iterations": iterations, "max_modules": 99}
-                    found.append(
-                        run(source, CONFIG, self.run, checkpoint_every=3, **limits, **words)
-                    )
+                    found.append(run(source, CONFIG, self.run, keyframes=3, **limits, **words))
 
         self._do(work, die, self.run)
         for result in found:
