@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
     from cdmisfa.experiments.loop import learn as learn
+    from cdmisfa.experiments.recompute.run import Run as Run
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
-    from replay.runs.run import Run as Run
 
     __version__: str
 
@@ -45,7 +45,7 @@ _load, __dir__, __all__ = face(
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
         "cdmisfa.experiments.loop": "learn",
         "recorder.world.oscillatory": "OscillatorySource",
-        "replay.runs.run": "Run",
+        "cdmisfa.experiments.recompute.run": "Run",
     },
 )
 

@@ -41,6 +41,7 @@ FORBIDDEN = {
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
     "cdmisfa.core.arithmetic": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.experiments": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
+    "cdmisfa.experiments.recompute": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.runs", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
     "cdmisfa.features.recursive": ("cdmisfa.agents.learner", "recorder.config", "mcap"),

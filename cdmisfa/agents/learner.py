@@ -260,10 +260,11 @@ class CuriousLearner:
             **out,
         )
 
-    def save_abstraction(self) -> None:
-        """Freeze the abstraction that the last iteration found ready, and begin a new one."""
+    @property
+    def unfinished(self) -> Module:
+        """The adaptive abstraction as the last iteration left it, as a module."""
         agent, memory = self.agent, self.agent.memory[0]
-        module = Module(
+        return Module(
             index=len(self.modules) + 1,
             stream=self.spec.streams[int(memory["last_stream"])],
             stream_index=int(memory["last_stream"]),
@@ -279,9 +280,12 @@ class CuriousLearner:
             centres=agent.centres.copy(),
             counts=agent.counts.copy(),
         )
-        self.modules.append(module)
+
+    def save_abstraction(self) -> None:
+        """Freeze the abstraction that the last iteration found ready, and begin a new one."""
+        self.modules.append(self.unfinished)
         self._freeze()
-        begin_abstraction(agent, self.rules.epsilon_start)
+        begin_abstraction(self.agent, self.rules.epsilon_start)
         self.abstraction = self._new_abstraction()
 
     def _freeze(self) -> None:

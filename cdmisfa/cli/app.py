@@ -31,6 +31,15 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
     "convert": ("convert", "Write camera logs of others as a recording."),
     "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),
+    "check": (
+        "moments",
+        "Learn a run again from its source, and compare every signal bit for bit.",
+    ),
+    "at": ("moments", "Say what a learner was after K iterations of a run, exactly."),
+    "fork": (
+        "moments",
+        "Go on from some iteration of a run with other settings, as a run of its own.",
+    ),
     "plot": ("runs", "Draw the figures of a run."),
     "export": (
         "runs",

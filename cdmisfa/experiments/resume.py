@@ -10,13 +10,14 @@ import dataclasses
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, Sink
-from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
+from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import versions
 from recorder.log.begun import Begun, found_path, relative_path
 from recorder.log.whole import partial_path
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 COMMAND = "command"
 """Key of a manifest: the command that began the run, which may differ when it is resumed."""
+
+FORK = "fork"
+"""Key of a manifest: from which run and iteration a fork went on, and what it was told before."""
 
 OPTIONS = (
     "seed",
@@ -92,6 +96,22 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     return begun.source, options
 
 
+@dataclass(frozen=True, slots=True)
+class Fork:
+    """Where a run goes on from another one.
+
+    Attributes:
+        log: of the other run.
+        keyframe: where it goes on.
+        ancestry: what the manifest keeps of it: `parent`, `at`, `changed`, and as `before` what
+            the parent was told.
+    """
+
+    log: Path
+    keyframe: Keyframe
+    ancestry: Mapping[str, Any]
+
+
 class Keyframes(Sink):
     """Writes where a run stands into its log, every so many iterations and at its end.
 
@@ -148,6 +168,70 @@ def restore(learner: Learner, keyframe: Keyframe) -> None:
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
 
 
+def take_over(
+    log: RunWriter, learner: Learner, source: Any, digest: SignalsHash, fork: Fork
+) -> None:
+    """Bring log, learner, source and digest to where a fork goes on."""
+    restore(learner, fork.keyframe)
+    for signals in log.take_over(fork.log, fork.keyframe.iteration):
+        digest.add(signals)
+    source.seek(fork.keyframe.t)
+    changed = [f"{key} is {new}, was {old}" for key, (old, new) in fork.ancestry["changed"].items()]
+    text = f"fork of {fork.ancestry['parent']} after {learner.iteration} iterations"
+    log.event(source.t, max(learner.iteration - 1, 0), "; ".join([text, *changed]))
+    log.keyframe(fork.keyframe, again=True)
+    log.sync()
+
+
+def bring_back(
+    log: RunWriter, learner: Learner, source: Any, digest: SignalsHash, forked_at: int
+) -> None:
+    """Bring log, learner, source and digest to where the run's newest keyframe stands.
+
+    Args:
+        log: of the run that is resumed.
+        learner: of its configuration.
+        source: what it learns from.
+        digest: of the signals.
+        forked_at: the iteration from which on a fork is itself; 0 where it is none.
+    """
+    from replay.runs.log import read_keyframe
+
+    folder = log.path.parent
+    before = folder / SET_ASIDE
+    if not before.exists():
+        return
+    keyframe = read_keyframe(before)
+    if forked_at and (keyframe is None or keyframe.iteration < forked_at):
+        raise UsageError(f"{folder} was cut before its fork: fork again with --force")
+    if keyframe is not None:
+        restore(learner, keyframe)
+        for signals in log.take_over(before, keyframe.iteration):
+            digest.add(signals)
+            if keyframe.taken is not None:
+                source.take(signals.stream, learner.tau)
+        if keyframe.taken is not None and source.taken != keyframe.taken:
+            raise LogDamagedError(
+                f"{folder}: what it learned from is not there any more: begin anew with --force, "
+                "or choose another folder"
+            )
+        source.seek(keyframe.t)
+        last = max(keyframe.iteration - 1, 0)
+        log.event(source.t, last, f"resumed at iteration {keyframe.iteration}")
+        changed = [
+            f"{name} is {now}, was {keyframe.versions.get(name)}"
+            for name, now in versions().items()
+            if keyframe.versions.get(name) != now
+        ]
+        if changed:
+            log.event(source.t, last, "; ".join(changed), "WARNING")
+    log.sync()
+    try:
+        before.unlink()
+    except OSError as error:
+        raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
+
+
 def log_to_resume(run: Path) -> Path:
     """The log of a run that was stopped, wherever it is."""
     from replay.runs.folders import RUN_FILE
@@ -177,6 +261,17 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
         os.replace(found, run / SET_ASIDE)
     except OSError as error:
         raise LogWriteError(f"{found} cannot be set aside: {error.strerror}") from error
+
+
+def ancestry_of(run: Path | None) -> Mapping[str, Any] | None:
+    """Of which run a run that is to be resumed is a fork; None where it is none."""
+    from replay.runs.log import read_header
+
+    try:
+        ancestry = None if run is None else read_header(log_to_resume(run)).manifest.get(FORK)
+    except (LogDamagedError, UsageError):  # told where the run is resumed
+        return None
+    return ancestry if isinstance(ancestry, Mapping) and ancestry.get("at") else None
 
 
 def _has_header(log: Path) -> bool:

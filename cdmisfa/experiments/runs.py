@@ -18,7 +18,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.arithmetic.compiled import needs_compiling
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import as_table
-from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, LogWriteError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
@@ -26,10 +26,14 @@ from cdmisfa.experiments.documents import machine, versions, write_json
 from cdmisfa.experiments.loop import Digest, learn
 from cdmisfa.experiments.resume import (
     COMMAND,
+    FORK,
     SET_ASIDE,
+    Fork,
     Keyframes,
-    restore,
+    ancestry_of,
+    bring_back,
     set_aside,
+    take_over,
 )
 from cdmisfa.features.incsfa import strict
 from recorder.log.folder import folder_here, held, logs_in, refuse_existing
@@ -115,6 +119,7 @@ def run(
     live: bool = False,
     announce: Callable[[str], None] | None = None,
     command: Mapping[str, Any] | None = None,
+    fork: Fork | None = None,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
 
@@ -138,6 +143,7 @@ def run(
         live: also show the run in Rerun while it learns, to viewers on this machine.
         announce: called with the address of the live view.
         command: how the run is begun, kept with it; see `resume.command_of`.
+        fork: go on from another run, whose iterations before are this one's, too.
 
     Raises:
         UsageError: `folder` exists and `force` is not set; or `resume` is, and `folder` holds no
@@ -151,6 +157,9 @@ def run(
     described = description(source)
     manifest = {"config": tables, "seed": seed, "source": described}
     begun = {} if command is None else {COMMAND: dict(command)}
+    ancestry = fork.ancestry if fork is not None else ancestry_of(folder) if resume else None
+    if ancestry is not None:
+        begun[FORK] = dict(ancestry)
     told: list[Sink] = [digest]
     exhausted: LogExhaustedError | None = None
     if resume and not isinstance(source, SeekableSource):
@@ -185,9 +194,11 @@ def run(
             if announce is not None:
                 announce(shown.address)
         if log is not None and resume:
-            _restore(log, learner, source, digest)
-            if shown is not None:
-                shown.earlier(log.path.parent)
+            bring_back(log, learner, source, digest, 0 if ancestry is None else ancestry["at"])
+        elif log is not None and fork is not None:
+            take_over(log, learner, source, digest, fork)
+        if log is not None and shown is not None and (resume or fork):
+            shown.earlier(log.path.parent)
         _say_if_compiling()
         try:
             ended = learn(
@@ -293,43 +304,6 @@ def _run_log(
 def _no_folder(out: Path, error: OSError) -> UsageError:
     reason = error.strerror or error
     return UsageError(f"{out} cannot be a run's folder ({reason}): choose another")
-
-
-def _restore(log: Any, learner: Learner, source: Any, digest: Digest) -> None:
-    """Bring log, learner, source and digest to where the run's newest keyframe stands."""
-    from replay.runs.log import read_keyframe
-
-    folder = log.path.parent
-    before = folder / SET_ASIDE
-    if not before.exists():
-        return
-    keyframe = read_keyframe(before)
-    if keyframe is not None:
-        restore(learner, keyframe)
-        for signals in log.take_over(before, keyframe.iteration):
-            digest.add(signals)
-            if keyframe.taken is not None:
-                source.take(signals.stream, learner.tau)
-        if keyframe.taken is not None and source.taken != keyframe.taken:
-            raise LogDamagedError(
-                f"{folder}: what it learned from is not there any more: begin anew with --force, "
-                "or choose another folder"
-            )
-        source.seek(keyframe.t)
-        last = max(keyframe.iteration - 1, 0)
-        log.event(source.t, last, f"resumed at iteration {keyframe.iteration}")
-        changed = [
-            f"{name} is {now}, was {keyframe.versions.get(name)}"
-            for name, now in versions().items()
-            if keyframe.versions.get(name) != now
-        ]
-        if changed:
-            log.event(source.t, last, "; ".join(changed), "WARNING")
-    log.sync()
-    try:
-        before.unlink()
-    except OSError as error:
-        raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
 
 
 def _say_if_compiling() -> None:

@@ -69,18 +69,18 @@ def first_difference(first: Path, second: Path) -> Difference | None:
     """
     a, b = read_header(first), read_header(second)
     versions = a.schema, b.schema
-    found = _first_of(read_columns(first, a), read_columns(second, b), min(versions))
+    found = first_of(read_columns(first, a), read_columns(second, b), min(versions))
     if versions[0] == versions[1]:
         return found
     found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
     return replace(found, versions=versions)
 
 
-def _first_of(
-    first: Iterator[SignalColumns], second: Iterator[SignalColumns], version: int
+def first_of(
+    first: Iterator[SignalColumns], second: Iterator[SignalColumns], version: int, at: int = 0
 ) -> Difference | None:
-    """The first difference among the signals of a version of the record."""
-    at, a, b = 0, next(first, None), next(second, None)
+    """The first difference among the signals of a version of the record, from an iteration on."""
+    a, b = next(first, None), next(second, None)
     while a is not None and b is not None:
         n = min(len(a), len(b))
         found = _difference(at, a.rows(0, n), b.rows(0, n), version)

@@ -66,6 +66,13 @@ class RunHeader:
             return None
         return float(change), float(change + agreement)
 
+    @property
+    def forked_at(self) -> int:
+        """Iterations that a fork has in common with its parent; 0 of a run that is none."""
+        fork = self.manifest.get("fork")
+        at = fork.get("at") if isinstance(fork, Mapping) else None
+        return at if isinstance(at, int) and at > 0 else 0
+
     def setting(self, section: str, key: str) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`, or None."""
         config = self.manifest.get("config")

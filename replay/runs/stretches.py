@@ -66,14 +66,16 @@ def read_stretches(
     *,
     every: int = 1,
     topics: Sequence[str] = TOPICS,
+    start: int = 0,
 ) -> Iterator[Stretch]:
-    """Read a run's log from the beginning to the end, once.
+    """Read a run's log to the end, once.
 
     Args:
         path: the run's folder, or its log.
         header: what stands at the beginning of its log, where that was read already.
         every: decode images of every this many frames only.
         topics: what is wanted of it.
+        start: the frame to begin at, the first of a block.
 
     Raises:
         UsageError: there is no such run, or it is of a later version of this software.
@@ -84,7 +86,8 @@ def read_stretches(
     waiting, spec = _Waiting(log, header), header.spec
     with LogReader(log) as reader:
         wanted = {number: c.topic for number, c in reader.channels.items() if c.topic in topics}
-        for _, table in reader.tables(ordered=False):
+        since = spec.time_ns(start) if start else None
+        for _, table in reader.tables(ordered=False, start=since):
             data = memoryview(table.data.data)
             for number, t, at, size in zip(
                 table.channel.tolist(),
@@ -105,9 +108,11 @@ def read_stretches(
             raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")
 
 
-def read_columns(path: Path, header: RunHeader | None = None) -> Iterator[SignalColumns]:
-    """Every record of a run, in order, as arrays; see `read_stretches`."""
-    for stretch in read_stretches(path, header, topics=(SIGNALS_TOPIC,)):
+def read_columns(
+    path: Path, header: RunHeader | None = None, *, start: int = 0
+) -> Iterator[SignalColumns]:
+    """The records of a run from a frame on, in order, as arrays; see `read_stretches`."""
+    for stretch in read_stretches(path, header, topics=(SIGNALS_TOPIC,), start=start):
         yield from stretch.signals
 
 

@@ -156,13 +156,15 @@ class RunWriter(Sink):
         """Bytes written so far, as stored; what waits for a flush is not among them."""
         return self._log.size
 
-    def keyframe(self, keyframe: Keyframe) -> None:
-        """Write where the run stands, once for each iteration, in a chunk of its own.
+    def keyframe(self, keyframe: Keyframe, *, again: bool = False) -> None:
+        """Write where the run stands, in a chunk of its own; all is handed to the system.
 
-        All before it, and it, are handed to the operating system.
+        Args:
+            keyframe: once for each iteration.
+            again: also where there is one of this iteration.
         """
         at = keyframe.iteration
-        if at != self._last_keyframe:
+        if again or at != self._last_keyframe:
             self.flush()
             time_ns = self.spec.time_ns(keyframe.t)
             self._write(KEYFRAME_TOPIC, time_ns, at, encode_keyframe(keyframe))

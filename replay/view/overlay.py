@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from replay.palette import colour
+from replay.palette import Rgb, colour
 from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.stretches import read_columns
@@ -38,6 +38,12 @@ FIRST_TAB = ("eta_dot", "epsilon")
 R_STAY = "R_stay"
 
 OF_STREAM, ERROR_OF = "learning_error_of", "Learning error of"
+
+FORKED = "forked"
+"""Entities of the points where forks begin."""
+
+MARKER = 5.0
+"""Size of such a point."""
 
 FIRST = 3
 """Streams of the first tab."""
@@ -75,7 +81,22 @@ def table_text(rows: Sequence[Row]) -> str:
     ruler = tuple("---" for _ in HEAD)
     short = [(*row.cells()[:-1], _shortly(row.difference)) for row in rows]
     cells = [[cell.replace("|", "/") for cell in line] for line in (HEAD, ruler, *short)]
-    return "\n".join(["## Runs compared", "", *(f"| {' | '.join(line)} |" for line in cells)])
+    forks = [line for row in rows if (line := _fork(row))]
+    table = [f"| {' | '.join(line)} |" for line in cells]
+    return "\n".join(["## Runs compared", "", *table, *(("", *forks) if forks else ())])
+
+
+def _fork(row: Row) -> str:
+    """What a fork is one of; "" of another run."""
+    header = row.outline.header
+    ancestry = header.manifest.get("fork")
+    if not header.forked_at or not isinstance(ancestry, Mapping):
+        return ""
+    changed = ancestry.get("changed")
+    told = changed.items() if isinstance(changed, Mapping) else ()
+    what = "".join(f"; {key} {old} became {new}" for key, (old, new) in told)
+    parent, at = ancestry.get("parent"), header.forked_at
+    return f"{row.name} is a fork of {parent} after {at} iterations{what}"
 
 
 def _shortly(difference: Difference | None) -> str:
@@ -90,8 +111,15 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
     header = row.outline.header
     shown = row.outline.streams(MOST_STREAMS)
     lines: dict[str, Column] = {}
+    fork, marked = row.outline.header.forked_at, set[str]()
     for columns in read_columns(run, header):
         for entity, kept, values in _curves(columns, header.spec.streams, shown):
+            later = np.flatnonzero(kept & (columns.iterations >= fork))
+            if fork and len(later) and entity not in marked:
+                marked.add(entity)
+                first = np.searchsorted(np.flatnonzero(kept), later[0])
+                value, color = values.reshape(int(kept.sum()), -1)[first], colour(number)
+                _mark(recording, f"{root}/{FORKED}/{entity}", row.name, color, fork, value)
             path, rows = f"{root}/{entity}", values.reshape(int(kept.sum()), -1)
             if path not in lines:
                 width = rows.shape[1]
@@ -100,6 +128,27 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
             lines[path].add(columns.frames[kept], columns.iterations[kept], rows)
     for line in lines.values():
         line.flush()
+
+
+def _mark(
+    recording: rr.RecordingStream,
+    path: str,
+    run: str,
+    rgb: Rgb,
+    iteration: int,
+    values: NDArray[np.float64],
+) -> None:
+    """A point on a curve where a fork begins to differ from its parent."""
+    style = rr.SeriesPoints(
+        names=[label(f"fork {run}")] * len(values),
+        colors=[rgb] * len(values),
+        markers=["diamond"] * len(values),
+        marker_sizes=[MARKER] * len(values),
+    )
+    recording.log(path, style, static=True)
+    recording.set_time(ITERATION, sequence=iteration)
+    recording.log(path, rr.Scalars(values))
+    recording.reset_time()
 
 
 def _curves(
@@ -125,7 +174,12 @@ def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
     roots = [f"/compare/{part(names, i)}" for i in range(len(names))]
 
     def panel(title: str, entity: str) -> rrb.View:
-        return lines(title, [f"{root}/{entity}" for root in roots], axis)
+        marks = [
+            f"{root}/{FORKED}/{entity}"
+            for root, row in zip(roots, rows, strict=True)
+            if row.outline.header.forked_at
+        ]
+        return lines(title, [*(f"{root}/{entity}" for root in roots), *marks], axis)
 
     told = frozenset[str]().union(*(row.outline.told for row in rows))
     streams = outline.names()

@@ -99,8 +99,7 @@ class ProgressLearner:
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
-        self._streams = new_streams(len(spec.streams))
-        self._candidates: dict[int, Candidate] = {}
+        self._streams, self._candidates = new_streams(len(spec.streams)), dict[int, Candidate]()
         self._freeze()
 
     @property
@@ -123,6 +122,12 @@ class ProgressLearner:
         """Weights of the candidate of the stream to watch next, (J, I), a copy."""
         held = self._candidates.get(self.stream)
         return np.zeros((self._n_outputs, self._n_inputs)) if held is None else held.sfa.phi
+
+    @property
+    def unfinished(self) -> Module | None:
+        """The candidate of the stream to watch next, as a module; None where there is none."""
+        held = self._candidates.get(self.stream)
+        return None if held is None else self._module(self.stream, held)
 
     @property
     def over(self) -> str:
@@ -313,7 +318,8 @@ class ProgressLearner:
             index = known_by(candidate, self.modules, before)
         new = index is None
         if index is None:
-            self._save(stream, candidate)
+            self.modules.append(self._module(stream, candidate))
+            self._freeze()
             index = len(self.modules) - 1
         module = self.modules[index]
         power, slow, _ = (float(v[0]) for v in candidate.sfa.compare(module.phi[:1]))
@@ -349,30 +355,26 @@ class ProgressLearner:
         names = ", ".join(self.spec.streams[s] for s in np.flatnonzero(again))
         return (f"looking once more at what was given up: {names}",) if names else ()
 
-    def _save(self, stream: int, candidate: Candidate) -> None:
-        self.modules.append(
-            Module(
-                index=len(self.modules) + 1,
-                stream=self.spec.streams[stream],
-                stream_index=stream,
-                iteration=self.iteration - 1,
-                phi=candidate.sfa.phi,
-                mean=candidate.sfa.mean.copy(),
-                band_mean=candidate.tested,
-                band_sd=np.full(self._n_outputs, np.nan),
-                eta=candidate.tested,
-                policy=self._policy,
-                expansion=self._expansion,
-                scale=self._scale,
-            )
+    def _module(self, stream: int, candidate: Candidate) -> Module:
+        return Module(
+            index=len(self.modules) + 1,
+            stream=self.spec.streams[stream],
+            stream_index=stream,
+            iteration=self.iteration - 1,
+            phi=candidate.sfa.phi,
+            mean=candidate.sfa.mean.copy(),
+            band_mean=candidate.tested,
+            band_sd=np.full(self._n_outputs, np.nan),
+            eta=candidate.tested,
+            policy=self._policy,
+            expansion=self._expansion,
+            scale=self._scale,
         )
-        self._freeze()
 
     def _freeze(self) -> None:
         """Stack the modules' rows, so that one pass over a block serves all of them."""
-        found = self.modules
-        self._phi = np.array([m.phi for m in found]).reshape(-1, self._n_inputs)
-        self._offset = np.array([mean_output(m.phi, m.mean) for m in found]).reshape(-1)
+        self._phi = np.array([m.phi for m in self.modules]).reshape(-1, self._n_inputs)
+        self._offset = np.array([mean_output(m.phi, m.mean) for m in self.modules]).reshape(-1)
 
     def _choose(self, draws: Float) -> tuple[Float, bool]:
         """Choose the next stream; what each promises, and whether one was drawn at random."""

@@ -1,0 +1,214 @@
+"""`cdmisfa at`, `fork` and `check`: any moment of a run, another future of it, and the proof."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.commands.learn import Reporter, show
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.progress import bar
+from cdmisfa.core.errors import NotReproducedError, UsageError
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+source = click.option(
+    "--source",
+    multiple=True,
+    metavar="SOURCE",
+    help="What it learned from, where that is no longer what the run says, as its recording; "
+    "repeatable.",
+)
+
+
+@click.command("at")
+@options.path_argument("run")
+@click.argument("iterations", metavar="K", type=click.IntRange(0))
+@click.option(
+    "--save-module",
+    type=options.OUT,
+    metavar="F.npz",
+    help="Write what it was just learning as a file of modules.",
+)
+@source
+@options.server_limits
+@options.force
+@options.as_json
+def at_command(
+    run: Path,
+    iterations: int,
+    save_module: Path | None,
+    source: tuple[str, ...],
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Say what a learner was after K iterations of a run, exactly.
+
+    It is put where a keyframe in the run's log says and learns on from there, from what
+    the run learned from. Right after a keyframe no source is needed. --json prints all of
+    its memory.
+    """
+    from cdmisfa.experiments.recompute.check import learner_after
+    from cdmisfa.experiments.runs import module_table
+    from replay.runs.folders import run_log
+
+    learner, t = learner_after(run, iterations, source)
+    state, streams = learner.state, learner.spec.streams  # type: ignore[attr-defined]
+    if save_module is not None:
+        _save_unfinished(learner, save_module, force=force)
+    if as_json:
+        options.print_json(
+            {
+                "schema": options.SCHEMA,
+                "run": str(run_log(run).parent),
+                "iterations": iterations,
+                "t": t,
+                "stream": streams[learner.stream],
+                "modules": [module_table(module) for module in learner.modules],
+                **learner.summary(),
+                "policy_rng": state.policy_rng,
+                "arrays": state.arrays,
+            }
+        )
+        return
+    click.echo(f"after {iterations} iterations: frame {t}, next {streams[learner.stream]}")
+    learned = ", ".join(f"{m.index} {m.stream}" for m in learner.modules)
+    click.echo(f"modules: {learned or 'none'}")
+    rows = [(name, f"{a.dtype}", "x".join(map(str, a.shape))) for name, a in state.arrays.items()]
+    plain = [(name, kind, shape) for name, kind, shape in rows if not kind.startswith("[")]
+    options.print_table(("memory", "type", "shape"), plain)
+    if save_module is not None:
+        click.echo(f"module written to {save_module}")
+
+
+def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
+    """Write what a learner is learning as a file of one module."""
+    import dataclasses
+
+    from replay.runs.modules import save_modules
+
+    module = getattr(learner, "unfinished", None)
+    if module is None:
+        raise UsageError("nothing is being learned then: choose another iteration")
+    if path.exists() and not force:
+        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+    save_modules(path, [dataclasses.replace(module, index=1)])
+
+
+@click.command("check")
+@options.path_argument("run")
+@click.option("--from", "start", type=click.IntRange(0), default=0, metavar="K", help="Begin here.")
+@click.option("--to", "stop", type=click.IntRange(1), metavar="L", help="End before this one.")
+@source
+@options.server_limits
+@options.as_json
+@click.pass_context
+def check_command(
+    ctx: click.Context,
+    run: Path,
+    start: int,
+    stop: int | None,
+    source: tuple[str, ...],
+    as_json: bool,
+) -> None:
+    """Learn a run again from its source, and compare every signal bit for bit.
+
+    It says the first signal that differs, and exits with 4 if one does. A part begins at
+    the newest keyframe before it.
+    """
+    from cdmisfa.experiments.recompute.check import check_run
+
+    checked = check_run(run, source, start, stop)
+    found = checked.difference
+    if as_json:
+        options.print_json({"schema": options.SCHEMA, "run": str(run), **checked.as_json()})
+    elif found is None:
+        what = f"iterations {checked.start} to {checked.stop - 1}"
+        click.echo(f"{what}: learned again, they are identical, bit for bit")
+    else:
+        click.echo(f"{found} when learned again")
+    if found is not None:
+        ctx.exit(NotReproducedError.exit_code)
+
+
+@click.command("fork")
+@options.path_argument("run")
+@click.option(
+    "--at", type=click.IntRange(1), required=True, metavar="K", help="Iterations kept of the run."
+)
+@options.out("Folder of the fork.", required=True)
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="learner.KEY=VALUE",
+    help="What the learner is told from there on; may be repeated.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**63 - 1),
+    help="Seed of the random choices from there on; the world stays.",
+)
+@click.option("--max-iterations", type=click.IntRange(1), help="End there; else as the run.")
+@click.option("--max-modules", type=click.IntRange(1), help="End there; else as the run.")
+@source
+@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@options.keyframes
+@options.fsync_every
+@options.server_limits
+@options.force
+@options.as_json
+@click.pass_context
+def fork_command(
+    ctx: click.Context,
+    run: Path,
+    at: int,
+    out: Path,
+    settings: tuple[str, ...],
+    seed: int | None,
+    max_iterations: int | None,
+    max_modules: int | None,
+    source: tuple[str, ...],
+    no_rerun: bool,
+    keyframes: int | None,
+    fsync_every: float | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Go on from some iteration of a run with other settings, as a run of its own.
+
+    It has the run's first K iterations as they are; resume, check and view it like any run.
+    """
+    from cdmisfa.experiments.recompute.forks import fork_run
+    from cdmisfa.experiments.runs import RunExhaustedError
+
+    given = {"max_iterations": max_iterations, "max_modules": max_modules}
+    try:
+        with bar("learning", "blocks") as shown, stoppable() as stop:
+            result = fork_run(
+                run,
+                at,
+                out,
+                settings=settings,
+                seed=seed,
+                source=source,
+                limits={name: value for name, value in given.items() if value is not None},
+                force=force,
+                rerun=not no_rerun,
+                sinks=(Reporter(shown, max_iterations),),
+                stop=stop,
+                keyframes=keyframes,
+                fsync_every=fsync_every,
+            )
+    except RunExhaustedError as error:
+        show(error.result, as_json=as_json)
+        raise
+    show(result, as_json=as_json)
+    both = f"cdmisfa compare {options.quoted(run)} {options.quoted(out)} --save both.rrd"
+    click.echo(f"both in one view: {both}", err=True)
+    if stop():
+        ctx.exit(stop.exit_code)

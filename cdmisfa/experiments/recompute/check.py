@@ -1,0 +1,120 @@
+"""Whether a run is what it says: learned again from its source, and compared bit for bit."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, NotReproducedError, UsageError
+from cdmisfa.core.learning import Learner
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.recompute.again import Again
+from replay.runs.columns import SignalColumns, columns_of_records
+from replay.runs.compare import Difference, first_of
+from replay.runs.stretches import read_columns
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What came of learning the iterations [start, stop) of a run again.
+
+    Attributes:
+        difference: the first one, of the log from what was learned again.
+    """
+
+    start: int
+    stop: int
+    difference: Difference | None
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        found = self.difference
+        return {
+            "from": self.start,
+            "to": self.stop,
+            "identical": found is None,
+            "first_difference": None if found is None else found.as_json(),
+        }
+
+
+def check_run(
+    run: Path, source: Sequence[str] = (), start: int = 0, stop: int | None = None
+) -> Checked:
+    """Learn the iterations [start, stop) of a run again, and compare every signal.
+
+    Args:
+        run: its folder, or its log.
+        source: words that name its source, where it is not what the run says.
+        start: the newest keyframe at or before it is where learning begins.
+        stop: by default where its log ends.
+
+    Raises:
+        UsageError: there is no such run, source or part.
+        LogDamagedError: the log cannot be read.
+    """
+    with Again(Path(run), start, source) as again:
+        first = at = again.learner.iteration
+        for logged in _logged(again, stop):
+            again_learned = iter(_columns(again, len(logged)))
+            found = first_of(iter([logged]), again_learned, again.header.schema, at)
+            at += len(logged)
+            if found is not None:
+                return Checked(first, at, found)
+    if at <= start and (at or stop):
+        raise UsageError(f"{again.log} holds {at} iterations: choose a part of these")
+    if stop is not None and at < stop:
+        raise UsageError(f"{again.log} holds {at} iterations: end at one of these")
+    return Checked(first, at, None)
+
+
+def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tuple[Learner, int]:
+    """A run's learner as it was after so many iterations, and the next frame of its source.
+
+    What it learns again to get there is compared with the log.
+
+    Raises:
+        UsageError: there is no such run or iteration, or the source that is needed.
+        LogDamagedError: the log cannot be read.
+        NotReproducedError: learning again gives other signals than the log holds.
+    """
+    if iterations < 0:
+        raise UsageError(f"{iterations} iterations: a run begins after 0")
+    with Again(Path(run), iterations, source) as again:
+        at = again.learner.iteration
+        if at < iterations:
+            for logged in _logged(again, iterations):
+                learned = iter(_columns(again, len(logged)))
+                found = first_of(iter([logged]), learned, again.header.schema, at)
+                if found is not None:
+                    raise NotReproducedError(
+                        f"{again.log}: learned again, {found}: name its own source with --source"
+                    )
+                at += len(logged)
+        if at < iterations:
+            raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
+        return again.learner, again.t
+
+
+def _logged(again: Again, stop: int | None) -> Iterator[SignalColumns]:
+    """The records of a run from where its learner stands, up to an iteration."""
+    at = again.learner.iteration
+    for columns in read_columns(again.log, again.header, start=again.t):
+        kept = len(columns) if stop is None else min(len(columns), stop - at)
+        if kept <= 0:
+            return
+        if int(columns.iterations[0]) != at:
+            raise LogDamagedError(f"{again.log}: iteration {at} is missing, see cdmisfa verify")
+        yield columns.rows(0, kept)
+        at += kept
+
+
+def _columns(again: Again, count: int) -> list[SignalColumns]:
+    """So many iterations learned again, fewer where the source ends."""
+    records: list[BlockSignals] = []
+    with contextlib.suppress(LogExhaustedError):
+        for signals in again.steps(count):
+            records.append(signals)
+    return list(columns_of_records(records))

@@ -1,0 +1,293 @@
+"""Any moment of a run again: bit for bit the straight run's, however it came about."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from cdmisfa import Run
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.cli import run
+from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
+from cdmisfa.core.learning import Learner
+from cdmisfa.experiments.recompute.check import check_run, learner_after
+from cdmisfa.experiments.recompute.forks import fork_run
+from cdmisfa.experiments.sources import open_source
+from replay.mcap.reader import LogReader
+from replay.runs.compare import first_difference
+from replay.runs.log import read_header, read_keyframe
+from replay.runs.modules import load_modules
+
+EASY = ("learner.tau=40", "learner.eta_dot_window=8", "learner.warm_up=3", "learner.delta=1.0")
+EASIER = (*EASY, "learner.min_variance=1e-6", "learner.novel_share=0.0")
+"""It saves modules at iterations 8 and 42."""
+
+OF = {
+    "2.0": EASIER,
+    "progress": ("learner.tau=40", "learner.test_frames=40", "learner.watch=1000000"),
+}
+ENDS = 130
+LEARN = ("--seed", 3, "--max-modules", 99, "--no-rerun", "--json")
+
+
+def words(algorithm: str) -> list[str]:
+    chosen = (f"learner.algorithm={algorithm}", *OF[algorithm])
+    return [word for setting in chosen for word in ("--set", setting)]
+
+
+def same(a: Learner, b: Learner) -> None:
+    """Refuse two learners that differ in a bit."""
+    first, second = a.state, b.state
+    assert first.policy_rng == second.policy_rng
+    assert first.arrays.keys() == second.arrays.keys()
+    for name, array in first.arrays.items():
+        assert array.tobytes() == second.arrays[name].tobytes(), name
+    assert len(first.modules) == len(second.modules)
+    for x, y in zip(first.modules, second.modules, strict=True):
+        assert (x.index, x.stream, x.iteration) == (y.index, y.stream, y.iteration)
+        assert x.phi.tobytes() == y.phi.tobytes()
+
+
+def must(*args: object) -> None:
+    """Run a command that succeeds."""
+    assert run([str(arg) for arg in args]) == 0
+
+
+def lying(folder: Path, old: bytes, new: bytes) -> None:
+    """Change what a run's log says of itself, which no checksum protects while it is written."""
+    log = folder / "run.mcap"
+    with LogReader(log) as reader:
+        end = reader.segments[-1].stop
+    data = log.read_bytes()[:end]
+    assert old in data
+    (folder / "run.mcap.partial").write_bytes(data.replace(old, new))
+    log.unlink()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of both learners: live, recorded in a loop, and stopped and resumed many times."""
+    folder = tmp_path_factory.mktemp("moments")
+    must("record", "oscillatory", "-o", folder / "log", "--frames", 1500)
+    for algorithm in OF:
+        for name, source in (("live", "oscillatory"), ("loop", folder / "log")):
+            told = (*words(algorithm), *(["--loop"] if name == "loop" else []), *LEARN)
+            for out, stops in ((name, (ENDS,)), (f"{name}-resumed", (17, 23, 64, ENDS))):
+                for stop in stops:
+                    resume = () if stop == stops[0] else ("--resume",)
+                    where = ("-o", folder / f"{algorithm}-{out}", "--keyframes", 20, *resume)
+                    must("learn", source, *told, *where, "--max-iterations", stop)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def straight() -> Callable[[str, int], Learner]:
+    """A learner after so many iterations of a run that nobody logged."""
+
+    def after(algorithm: str, iterations: int) -> Learner:
+        chosen = (f"learner.algorithm={algorithm}", *OF[algorithm])
+        source, told = open_source(["oscillatory"], settings=chosen, seed=3)
+        learner = open_learner(told.learner, source.spec, 3)
+        for _ in range(iterations):
+            learner.step(source.take(learner.stream, learner.tau))
+        return learner
+
+    return after
+
+
+@pytest.mark.parametrize("algorithm", OF)
+@pytest.mark.parametrize("name", ["live", "loop", "live-resumed", "loop-resumed"])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(k=0)
+@example(k=20)
+@example(k=ENDS)
+@given(k=st.integers(0, ENDS))
+def test_any_moment_is_that_of_the_straight_run(
+    place: Path, straight: Callable[[str, int], Learner], algorithm: str, name: str, k: int
+) -> None:
+    found = Run(place / f"{algorithm}-{name}").at(k)
+    assert found.iteration == k
+    same(found, straight(algorithm, k))
+
+
+@pytest.mark.parametrize("algorithm", OF)
+def test_a_run_is_what_it_says(place: Path, algorithm: str) -> None:
+    for name in ("live", "loop-resumed"):
+        checked = check_run(place / f"{algorithm}-{name}")
+        assert (checked.start, checked.stop, checked.difference) == (0, ENDS, None)
+    part = check_run(place / f"{algorithm}-live", start=47, stop=71)
+    assert (part.start, part.stop, part.difference) == (40, 71, None)
+    recorded = check_run(place / f"{algorithm}-live", [str(place / "log")], stop=30)
+    assert recorded.difference is None
+
+
+def test_another_source_is_found_out(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    other = tmp_path / "other"
+    scene = ("--set", "scene.streams=x2,x1,x3")
+    assert cdmisfa("record", "oscillatory", *scene, "-o", other, "--frames", 3000).code == 0
+    run = place / "2.0-live"
+    refused = cdmisfa("check", run, "--source", other)
+    assert (refused.code, "shows other streams" in refused.err) == (2, True)
+    short = cdmisfa("check", run, "--source", place / "log", "--json")
+    assert short.code == 4
+    assert short.json["first_difference"]["iteration"] == 1500 // 40
+    assert "learned again" in cdmisfa("check", run, "--source", place / "log").out
+
+
+def test_a_run_that_lies_is_found_out(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    run = tmp_path / "run"
+    cdmisfa("learn", "oscillatory", *words("2.0"), *LEARN, "-o", run, "--max-iterations", 30)
+    lying(run, b'"seed": 3', b'"seed": 4')
+    assert read_header(run).manifest["seed"] == 4
+    checked = check_run(run)
+    assert checked.difference is not None
+    assert checked.difference.iteration <= 1
+    with pytest.raises(NotReproducedError, match="learned again, iteration"):
+        learner_after(run, 20)
+
+
+@pytest.mark.parametrize("k", [131, 10**9])
+def test_there_is_no_moment_after_the_end(place: Path, k: int) -> None:
+    with pytest.raises(UsageError, match="holds 130 iterations"):
+        Run(place / "2.0-live").at(k)
+    with pytest.raises(UsageError, match="holds 130 iterations"):
+        check_run(place / "2.0-live", start=k)
+    with pytest.raises(UsageError, match="holds 130 iterations"):
+        check_run(place / "2.0-live", stop=k)
+
+
+def test_without_its_source_a_run_has_its_keyframes(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    log, run = tmp_path / "log", tmp_path / "run"
+    cdmisfa("record", "oscillatory", "-o", log, "--frames", 2000)
+    told = (*words("2.0"), *LEARN, "--keyframes", 10, "--max-iterations", 25)
+    assert cdmisfa("learn", log, *told, "-o", run).code == 0
+    log.rename(tmp_path / "moved")
+    assert cdmisfa("at", run, 20, "--json").json["t"] == 800
+    gone = cdmisfa("at", run, 21)
+    assert gone.code == 2
+    assert len(gone.err.splitlines()) == 1
+    assert all(word in gone.err for word in ("no such file", "--source", "20 iterations"))
+    assert cdmisfa("at", run, 21, "--source", tmp_path / "moved").code == 0
+
+
+def test_at_prints_all_of_the_memory(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    run, early = place / "2.0-live", tmp_path / "early.npz"
+    found = cdmisfa("at", run, 50, "--json").json
+    learner = Run(run).at(50)
+    assert [m["iteration"] for m in found["modules"]] == [8, 42]
+    assert found["arrays"].keys() == learner.state.arrays.keys()
+    for name, array in learner.state.arrays.items():
+        if not array.dtype.names:
+            printed = np.array(found["arrays"][name], float).reshape(array.shape)
+            assert np.array_equal(printed, array, equal_nan=True), name
+    done = cdmisfa("at", run, 50, "--save-module", early)
+    assert done.code == 0
+    (module,) = load_modules(early)
+    assert np.array_equal(module.phi, learner.phi)
+    assert cdmisfa("at", run, 50, "--save-module", early).code == 2
+    assert cdmisfa("at", place / "progress-live", 50, "--save-module", early, "--force").code == 0
+
+
+def test_a_fork_goes_on_as_told(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    parent, fork = place / "2.0-loop", tmp_path / "fork"
+    done = cdmisfa("fork", parent, "--at", 30, "--set", "learner.nu=0.02", "-o", fork, "--json")
+    assert done.code == 0, done.err
+    assert done.json["iterations"] == ENDS
+    found = first_difference(parent, fork)
+    assert found is not None
+    assert 30 <= found.iteration < 42
+    about = json.loads((fork / "run.json").read_text())["fork"]
+    assert (about["at"], about["changed"]) == (30, {"learner.nu": [0.05, 0.02]})
+    assert (fork / about["parent"]).resolve() == parent.resolve()
+    assert cdmisfa("check", fork).code == 0
+    assert cdmisfa("verify", fork).code == 0
+    same(Run(fork).at(27), Run(parent).at(27))
+    same(Run(fork).at(30), Run(parent).at(30))
+    view = tmp_path / "both.rrd"
+    assert cdmisfa("compare", parent, fork, "--save", view).code == 4
+    assert view.stat().st_size > 0
+
+
+def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) -> None:
+    for algorithm in OF:
+        parent, fork = place / f"{algorithm}-live", tmp_path / algorithm
+        fork_run(parent, 33, fork, seed=3, rerun=False)
+        assert first_difference(parent, fork) is None
+
+
+def test_forks_of_forks_are_resumed_and_checked(
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
+) -> None:
+    for algorithm, key in (("2.0", "learner.nu=0.03"), ("progress", "learner.settled=0.1")):
+        one, two, straight = (tmp_path / f"{algorithm}-{n}" for n in ("one", "two", "straight"))
+        told = ("--no-rerun", "--keyframes", 15)
+        fork = ("fork", place / f"{algorithm}-live", "--at", 31, "--set", key, *told, "-o", one)
+        assert cdmisfa(*fork, "--max-iterations", 60).code == 0
+        again = ("fork", one, "--at", 52, "--seed", 9, *told)
+        assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
+        assert cdmisfa(*again, "-o", straight, "--max-iterations", 110).code == 0
+        resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")
+        assert resumed.code == 0, resumed.err
+        assert first_difference(two, straight) is None
+        assert check_run(two).difference is None
+        assert check_run(two, start=40, stop=100).difference is None
+        keyframe = read_keyframe(two, 52)
+        assert keyframe is not None
+        assert keyframe.iteration == 52
+        found = first_difference(one, two)
+        assert found is not None
+        assert found.iteration >= 52
+
+
+@pytest.mark.parametrize(
+    ("told", "why"),
+    [
+        (("--set", "learner.tau=20"), "learner.tau is 40 and stays"),
+        (("--set", "learner.expansion=none"), "learner.expansion is quadratic and stays"),
+        (("--set", "learner.components=3"), "does not fit"),
+        (("--set", "scene.seed=3"), "changes learner.* alone"),
+        (("--set", "learner.nuu=3"), "unknown key learner.nuu"),
+        (("--at", 131), "holds 130 iterations"),
+    ],
+)
+def test_a_fork_that_cannot_be_is_refused(
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa, told: tuple[object, ...], why: str
+) -> None:
+    refused = cdmisfa("fork", place / "2.0-live", "--at", 40, *told, "-o", tmp_path / "fork")
+    assert (refused.code, len(refused.err.splitlines())) == (2, 1)
+    assert why in refused.err
+    assert not (tmp_path / "fork").exists()
+
+
+def test_a_fork_that_was_cut_before_it_began_is_refused(
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
+) -> None:
+    fork = tmp_path / "fork"
+    fork_run(place / "2.0-live", 40, fork, settings=["learner.nu=0.02"], rerun=False)
+    log = (fork / "run.mcap").read_bytes()
+    (fork / "run.mcap").unlink()
+    (fork / "run.mcap.partial").write_bytes(log[: len(log) // 5])
+    refused = cdmisfa("learn", "--resume", "-o", fork)
+    assert (refused.code, "fork again with --force" in refused.err) == (2, True)
+
+
+def test_a_manifest_that_says_nothing_is_damage(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    run = tmp_path / "run"
+    cdmisfa("learn", "oscillatory", "-o", run, "--max-iterations", 3, "--no-rerun")
+    lying(run, b'"config"', b'"confix"')
+    with pytest.raises(LogDamagedError, match="does not say"):
+        Run(run).at(2)
+
+
+def test_an_option_that_is_short_for_a_key_is_kept(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    run, told = tmp_path / "run", ("--algorithm", "progress", "--set", "learner.explore=0.3")
+    done = cdmisfa("learn", "oscillatory", *told, *LEARN, "-o", run, "--max-iterations", 12)
+    assert done.code == 0, done.err
+    assert check_run(run).difference is None
