@@ -17,9 +17,9 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.pixels import shrink
 from replay.camera_logs.source import ForeignSource
-from replay.camera_logs.video import VideoImages
 
 av = pytest.importorskip("av")
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.bag import BAGS, BagImages
+from replay.camera_logs.formats.bag import BAGS, BagImages
+from replay.camera_logs.formats.mcap_log import McapImages
+from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
+from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages
-from replay.camera_logs.mcap_log import McapImages
-from replay.camera_logs.picture_folder import PICTURES, FolderImages, by_number
 from replay.camera_logs.stream import ImageStream
-from replay.camera_logs.video import VIDEOS, VideoImages
 from replay.mcap.identity import identity
 from replay.storage.checksum import sha256
 from replay.storage.listing import log_files

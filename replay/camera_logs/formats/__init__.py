@@ -1,0 +1,13 @@
+"""Each kind of file that holds images as a stream of them."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "replay.camera_logs.formats.bag": "BagImages",
+        "replay.camera_logs.formats.mcap_log": "McapImages",
+        "replay.camera_logs.formats.picture_folder": "FolderImages",
+        "replay.camera_logs.formats.video": "VideoImages",
+    },
+)
