@@ -27,6 +27,7 @@ from recorder.log.folder import (
 )
 from recorder.log.resume import (
     FramesHeld,
+    finished_logs,
     frames_held,
     other_recordings,
     resume_view,
@@ -126,6 +127,7 @@ def record(
         UsageError: the folder exists, or an argument is wrong.
         LogWriteError: the disk does not take it.
         LogExhaustedError: the source has fewer frames.
+        LogDamagedError: the source was replaced while it was read.
         RecordingStoppedError: it was stopped.
     """
     scene = scene_of(source)
@@ -207,6 +209,8 @@ def record(
                     progress(min(log.t for log in logs.values()))
                 if stop():
                     raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
+        if logs:
+            source.describe()  # an error where it was replaced while it was read
         for log in logs.values():
             log.finish()
         keep_recording(folder, chosen)
@@ -234,6 +238,15 @@ def record_scene(
     """
     with contextlib.closing(open_scene(name, config, settings)) as source:
         return record(source, folder, **options)
+
+
+def recorded(folder: Path) -> list[ViewRecording]:
+    """The files of a recording that is complete, with all of its views; none of another.
+
+    Raises:
+        LogDamagedError: the disk does not give a file.
+    """
+    return [_written(*log) for log in finished_logs(folder)]
 
 
 def _written(view: str, path: Path, frames: int) -> ViewRecording:

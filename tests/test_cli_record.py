@@ -114,6 +114,12 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
     assert done.code == 0, done.err
     contents = [{p.name: p.read_bytes() for p in f.iterdir()} for f in (folder, tmp_path / "whole")]
     assert contents[0] == contents[1]
+    complete = cdmisfa(*again, "--json")
+    assert (complete.code, complete.json["frames"]) == (0, 400)
+    assert complete.err == f"{folder} is complete: nothing was left to record\n"
+    (folder / "x2-000.mcap").unlink()
+    for unknown in (again, (*again, "--frames", 9)):
+        assert cdmisfa(*unknown).code == 2
     nothing = cdmisfa("record", "--resume", "-o", tmp_path / "new")
     assert (nothing.code, "name the SCENE" in nothing.err) == (2, True)
 

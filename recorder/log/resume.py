@@ -22,7 +22,7 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
-from recorder.log.folder import logs_in, part_name, part_number, view_logs
+from recorder.log.folder import RECORDING, logs_in, part_name, part_number, view_logs
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity, ViewFacts
@@ -167,6 +167,29 @@ def resume_view(
             "part first, or overwrite with --force"
         )
     return place
+
+
+def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
+    """View, file and frames of each log of a recording that is complete; none of another.
+
+    Raises:
+        LogDamagedError: the disk does not give a log.
+    """
+    logs = logs_in(folder) if folder.is_dir() and not (folder / RECORDING).exists() else []
+    found: list[tuple[str, Path, int]] = []
+    streams: set[str] = set()
+    stops: dict[str, int] = {}
+    for path in sorted(logs, key=lambda path: (len(path.name), path.name)):
+        record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
+        if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
+            return []
+        streams.update(record.metadata.get("streams", "").split(","))
+        held = frames_held(path, view := record.metadata.get("view", ""))
+        if held.first != stops.get(view, 0) or held.stop != held.end:
+            return []
+        stops[view] = held.stop
+        found.append((view, path, held.stop - held.first))
+    return found if stops.keys() == streams and len(set(stops.values())) == 1 else []
 
 
 def other_recordings(folder: Path, identity: Identity) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,11 @@ from replay.runs.modules import load_modules
 from replay.runs.stretches import read_columns
 from replay.storage.checksum import sha256
 
-MAKE_AGAIN = "make it again with cdmisfa view {run} --save {run}/run.rrd --force"
-"""How a view comes back; it holds nothing that the log does not."""
+
+def view_again(run: Path) -> str:
+    """How the view of a run comes back; it holds nothing that the log does not."""
+    command = ("cdmisfa", "view", str(run), "--save", str(run / VIEW_FILE), "--force")
+    return f"make it again with {shlex.join(command)}"
 
 
 def read_final(log: Path) -> Mapping[str, str] | None:
@@ -51,7 +55,7 @@ def check_run(log: Path, *, beside: bool) -> Iterator[Problem]:
     yield from _check_modules(folder / MODULES_FILE, final.get("modules_sha256"))
     view = folder / VIEW_FILE
     if final.get("view") == json.dumps(True) and not view.is_file():
-        yield Problem(str(view), f"is missing; {MAKE_AGAIN.format(run=folder)}")
+        yield Problem(str(view), f"is missing; {view_again(folder)}")
 
 
 def _check_signals(

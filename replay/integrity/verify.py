@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.integrity.run_files import MAKE_AGAIN, check_run, read_final
+from replay.integrity.run_files import check_run, read_final, view_again
 from replay.integrity.survey import SCHEMA, Crc, Kind, moved, survey
 from replay.mcap.reader import LogReader
 from replay.mcap.segments import Problem
@@ -76,7 +76,7 @@ def check_log(path: str | Location) -> LogCheck:
                 beside = isinstance(place, Path) and place.is_dir()
                 problems += check_run(file, beside=beside)
                 if beside and (view := file.parent / VIEW_FILE).is_file():
-                    notes.append(f"{view} is not checked: {MAKE_AGAIN.format(run=file.parent)}")
+                    notes.append(f"{view} is not checked: {view_again(file.parent)}")
                 if read_final(file) is None:
                     notes.append(f"{file} holds no final record: nothing proves what is beside it")
         if views:

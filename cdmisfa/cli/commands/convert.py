@@ -74,4 +74,4 @@ def convert_command(
                 stop=stop,
                 progress=lambda done: shown.update(done, length),
             )
-    print_recording(out, length, files, as_json=as_json)
+    print_recording(out, files, as_json=as_json)

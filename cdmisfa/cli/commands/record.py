@@ -83,11 +83,19 @@ def record_command(
     if begun.source == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
+    given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
     scene = scene or "".join(begun.source)
+    if resume and out is not None and not (scene or frames or given_seed or split):
+        from recorder.recording import recorded
+
+        if files := recorded(out):
+            _say_complete(out)
+            print_recording(out, files, as_json=as_json)
+            return
     if not scene:
         where = f"{out} does not say of what it is: " if resume and out is not None else ""
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
-    if ctx.get_parameter_source("seed") is ParameterSource.DEFAULT:
+    if not given_seed:
         seed = begun.options.get("seed", seed)
     configuration = configure(scene, preset, settings, seed)
     if scene_picture is not None:
@@ -105,11 +113,11 @@ def record_command(
     from recorder.recording import DEFAULT_FRAMES, record_scene
 
     parts = None if split is None else Split.parse(split)
-    recorded = False
+    nothing_left = resume
 
     def report(done: float) -> None:
-        nonlocal recorded
-        recorded = True
+        nonlocal nothing_left
+        nothing_left = False
         shown.update(done, max(done, frames or DEFAULT_FRAMES))
 
     with bar("recording", "frames") as shown, recording_stoppable(ctx, out, notice="") as stop:
@@ -128,10 +136,13 @@ def record_command(
             stop=stop,
             progress=report,
         )
-    if resume and not recorded:
-        click.echo(f"{out} is complete: nothing was left to record", err=True)
-    held = sum(file.frames for file in files if file.name == files[0].name)
-    print_recording(out, held, files, as_json=as_json)
+    if nothing_left:
+        _say_complete(out)
+    print_recording(out, files, as_json=as_json)
+
+
+def _say_complete(folder: Path) -> None:
+    click.echo(f"{folder} is complete: nothing was left to record", err=True)
 
 
 @contextlib.contextmanager
@@ -148,11 +159,10 @@ def recording_stoppable(ctx: click.Context, out: Path, **notice: str) -> Iterato
             ctx.exit(stop.exit_code)
 
 
-def print_recording(
-    folder: Path, frames: int, files: Sequence[ViewRecording], *, as_json: bool
-) -> None:
+def print_recording(folder: Path, files: Sequence[ViewRecording], *, as_json: bool) -> None:
     """Say what was written: each view's file."""
     if as_json:
+        frames = sum(file.frames for file in files if file.name == files[0].name)
         rows = [file.as_json() for file in files]
         options.print_json(
             {"schema": options.SCHEMA, "recording": str(folder), "frames": frames, "views": rows}
