@@ -133,7 +133,11 @@ class FrameSource(Protocol):
         """
 
     def describe(self) -> Mapping[str, Any]:
-        """What identifies the source, as JSON values: its kind, seed or file hashes."""
+        """What identifies the source, as JSON values: its kind, seed or file hashes.
+
+        Raises:
+            LogDamagedError: it was replaced since it was opened, by others or in part.
+        """
 
     def close(self) -> None:
         """Let go of files and simulators; harmless when called twice."""

@@ -149,10 +149,17 @@ class ForeignSource(ClockedSource):
         super().seek(t)
 
     def describe(self) -> Mapping[str, Any]:
-        """The logs with their SHA-256, the topics, and how they became frames."""
+        """The logs with their SHA-256, the topics, and how they became frames.
+
+        Raises:
+            LogDamagedError: a server has other logs by now than those that were opened.
+        """
+        parts = [p for s in self._streams for p in getattr(s, "parts", [s])]
         if self._hashes is None:
-            parts = [p for s in self._streams for p in getattr(s, "parts", [s])]
             self._hashes = [fingerprint(path, parts) for path in self._files]
+        else:
+            for part in parts:
+                part.confirm()
         return {
             "kind": "foreign",
             "files": self._hashes,

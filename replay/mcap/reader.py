@@ -9,19 +9,23 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.chunks import Chunks
-from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
+from replay.mcap.records import MAGIC, MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
 from replay.mcap.segments import Attachment, Message, Problem, Segment
+from replay.mcap.summary import FOOTER_BYTES
 from replay.mcap.tables import MessageTable, in_order, within
-from replay.mcap.walk import LogStructure
+from replay.mcap.walk import DATA_END_BYTES, LogStructure
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import open_store
+
+_BEGINNING: Final = 64 * 1024
+"""Bytes that are read of a log behind a URL before its end is known."""
 
 
 class LogReader:
@@ -65,6 +69,7 @@ class LogReader:
         self._failed: set[int] = set()
         self._defined = 0
         self._searched = False
+        self._marks_then: list[int] = []
         self._file = open_store(self.path)
         try:
             by_index = isinstance(self.path, Url)
@@ -153,6 +158,21 @@ class LogReader:
         for block in self._file.blocks(start, self.size):
             sha256.update(block)
         return sha256.hexdigest()
+
+    def confirm(self) -> None:
+        """See that a log behind a URL is still the one that was opened.
+
+        Its beginning, the checksums of its data and summary are asked for again.
+
+        Raises:
+            LogDamagedError: it was replaced while it was read.
+        """
+        if isinstance(self.path, Url) and self.complete:
+            self._file.forget()
+            if self._marks() != self._marks_then:
+                raise LogDamagedError(
+                    f"{self.path}: it was replaced while it was read; begin again"
+                )
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects."""
@@ -322,6 +342,14 @@ class LogReader:
             if table is not None and len(table):
                 tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
         self._check_data_crc()
+        if isinstance(self.path, Url) and self.complete:
+            self._marks_then = self._marks()
+
+    def _marks(self) -> list[int]:
+        """CRCs of what another log would not have: the beginning, and those that it states."""
+        end, last = self._structure.data_end, self.size - FOOTER_BYTES - len(MAGIC)
+        spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, self.size))
+        return [self._file.crc(start, stop) for start, stop in spans]
 
     def _check_data_crc(self) -> None:
         structure = self._structure

@@ -29,7 +29,7 @@ from replay.storage.store import Store
 
 _FIXED = RECORD_HEADER.size + 40
 """Bytes of a chunk before its records, without the name of its compression."""
-_FOOTER_BYTES: Final = RECORD_HEADER.size + 20
+FOOTER_BYTES: Final = RECORD_HEADER.size + 20
 _INDEXES: Final = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
 
@@ -59,10 +59,10 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
     Returns:
         The summary as far as it can be read, or None where the file has no end.
     """
-    footer_at = file.size - len(MAGIC) - _FOOTER_BYTES
+    footer_at = file.size - len(MAGIC) - FOOTER_BYTES
     if footer_at < len(MAGIC) or file.read(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
         return None
-    footer = file.read(footer_at, _FOOTER_BYTES)
+    footer = file.read(footer_at, FOOTER_BYTES)
     opcode, length = RECORD_HEADER.unpack_from(footer)
     if opcode != Opcode.FOOTER or length != 20:
         refuse("footer", "it is no footer record")
@@ -73,7 +73,7 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
         refuse("footer", "it points outside the file")
         return None
     summary = Summary(begin)
-    if crc and file.crc(begin, footer_at + _FOOTER_BYTES - 4) != crc:
+    if crc and file.crc(begin, footer_at + FOOTER_BYTES - 4) != crc:
         refuse("summary", "its CRC does not match: damaged")
         return summary
     try:

@@ -39,7 +39,7 @@ LOOSE_BYTES: Final = 1024 * 1024
 _CHUNK_HEADER: Final = 256
 _LOOSE: Final = struct.Struct("<HIQ")
 _INDEX: Final = struct.Struct("<HI")
-_DATA_END_BYTES: Final = RECORD_HEADER.size + 4
+DATA_END_BYTES: Final = RECORD_HEADER.size + 4
 _OPEN_LENGTH: Final = 2**64 - 1
 _BEFORE_DATA: Final = 1024 * 1024
 
@@ -124,7 +124,7 @@ class LogStructure:
                 return False
             attachments = stated_spans(self._file, summary, Opcode.ATTACHMENT_INDEX)
             self._record_at(len(MAGIC), None, Opcode.HEADER)
-            self._record_at(summary.begin - _DATA_END_BYTES, summary.begin, Opcode.DATA_END)
+            self._record_at(summary.begin - DATA_END_BYTES, summary.begin, Opcode.DATA_END)
             for start, stop in stated_spans(self._file, summary, Opcode.METADATA_INDEX):
                 self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord as error:

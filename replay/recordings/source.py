@@ -169,9 +169,16 @@ class RecordedSource(ClockedSource):
         self._t = t
 
     def describe(self) -> Mapping[str, Any]:
-        """The recording's views with the SHA-256 of their files, and what was recorded."""
+        """The recording's views with the SHA-256 of their files, and what was recorded.
+
+        Raises:
+            LogDamagedError: a server has other files by now than those that were opened.
+        """
         if self._hashes is None:
             self._hashes = self._described(lambda view: identity(view.path, view.reader))
+        else:
+            for view in self._all():
+                view.reader.confirm()
         return {
             "kind": "recording",
             **self.scene(),

@@ -75,11 +75,15 @@ class RemoteStore(Store):
         self._spans = sorted(spans)
         self._starts = [start for start, _ in self._spans]
 
-    def close(self) -> None:
+    def forget(self) -> None:
+        super().forget()
         self._drop_ahead()
         self._parts.clear()
         self._begins.clear()
         self._held = 0
+
+    def close(self) -> None:
+        self.forget()
 
     def _unexpected(self, start: int, stop: int) -> tuple[int, bytes]:
         """Fetch somewhat more than was asked for; more and more while reads go forward."""

@@ -47,6 +47,10 @@ class Store(ABC):
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:  # noqa: B027 - a hint
         """Hear which spans [start, stop) will be read, one after the other."""
 
+    def forget(self) -> None:
+        """Let go of what was read, so that it is read again."""
+        self._window = b""
+
     def grow(self) -> bool:
         """Look at the size again; whether it grew."""
         return False
@@ -122,7 +126,7 @@ class FileStore(Store):
     def grow(self) -> bool:
         self._seen = os.fstat(self._open().number)
         before, self.size = self.size, self._seen.st_size
-        self._window = b""
+        self.forget()
         return self.size > before
 
     def close(self) -> None:

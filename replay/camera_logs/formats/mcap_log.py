@@ -56,6 +56,9 @@ class McapImages(ImageStream):
             place = int(own[place])
         return self._decode(table.payload(place))
 
+    def confirm(self) -> None:
+        self.reader.confirm()
+
     def close(self) -> None:
         self.reader.close()
 
