@@ -291,3 +291,24 @@ def test_an_option_that_is_short_for_a_key_is_kept(tmp_path: Path, cdmisfa: Cdmi
     done = cdmisfa("learn", "oscillatory", *told, *LEARN, "-o", run, "--max-iterations", 12)
     assert done.code == 0, done.err
     assert check_run(run).difference is None
+
+
+def test_compare_says_what_differs_and_shows_both(
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
+) -> None:
+    parent, fork = place / "2.0-live", tmp_path / "fork"
+    fork_run(parent, 20, fork, settings=["learner.epsilon_decay=0.5"], seed=8, rerun=False)
+    found = cdmisfa("compare", parent, fork)
+    assert found.code == 4
+    told = "fork was told otherwise: learner.epsilon_decay 0.999 against 0.5; seed 3 against 8"
+    assert told in found.out
+    assert "signals of iteration 20:" in found.out
+    row = next(line for line in found.out.splitlines() if line.startswith("epsilon "))
+    assert row.endswith("differs")
+    document = cdmisfa("compare", parent, fork, "--json").json
+    first, second = document["signals"]["epsilon"]
+    assert (first > second, document["signals"]["t"]) == (True, [800, 800])
+    keys = [told["key"] for told in document["runs"][1]["told_otherwise"]]
+    assert keys == ["learner.epsilon_decay", "seed"]
+    same = cdmisfa("compare", parent, place / "2.0-live-resumed", "--json").json
+    assert (same["signals"], same["identical"]) == ({}, True)

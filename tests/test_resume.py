@@ -19,11 +19,11 @@ from run_data import parts_of, read_signals
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
-from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.config import LearnerConfig, differences
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.resume import SET_ASIDE, Keyframes, differences
+from cdmisfa.experiments.resume import SET_ASIDE, Keyframes
 from cdmisfa.experiments.runs import RunResult, run
 from recorder.config import RecordConfig
 from recorder.recording import record_scene

@@ -14,7 +14,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -364,6 +364,16 @@ def as_table(section: Any) -> dict[str, Any]:
         else:
             table[field.name] = list(value) if isinstance(value, tuple) else value
     return table
+
+
+def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two JSON values differ: dotted key, the value before, the value now."""
+    if isinstance(before, Mapping) and isinstance(now, Mapping):
+        for name in sorted({*before, *now}):
+            where = f"{key}.{name}" if key else name
+            yield from differences(before.get(name), now.get(name), where)
+    elif before != now:
+        yield key, before, now
 
 
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}

@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
+from cdmisfa.core.config import differences
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
 from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
@@ -303,16 +304,6 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
             f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: resume with "
             "what it was made with, or choose another folder"
         )
-
-
-def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Where two JSON values differ: dotted key, the value before, the value now."""
-    if isinstance(before, Mapping) and isinstance(now, Mapping):
-        for name in sorted({*before, *now}):
-            where = f"{key}.{name}" if key else name
-            yield from differences(before.get(name), now.get(name), where)
-    elif before != now:
-        yield key, before, now
 
 
 def _json(value: Any) -> Any:

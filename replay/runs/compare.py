@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.config import differences
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import read_header
 from replay.runs.outline import Outline, read_outline
 from replay.runs.stretches import read_columns
+
+FEW_VALUES = 4
+"""Of a signal that is written out."""
+
+LONGEST = 60
+"""Letters of a value that runs were told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,14 +135,12 @@ def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def computed_otherwise(first: Path, second: Path) -> tuple[str, ...]:
-    """What explains a difference of two runs that were told the same: other versions or processors.
+    """What may explain a difference of two runs beside what they were told: versions, processors.
 
-    Nothing where configuration, seed or source explain it, or a run.json does not say. Processors
-    explain nothing between runs with `learner.portable`.
+    Nothing where a run.json does not say. Processors explain nothing between runs with
+    `learner.portable`.
     """
     a, b = (read_run_json(run_log(run).parent) for run in (first, second))
-    if any(a.get(key) != b.get(key) for key in ("config", "seed", "source")):
-        return ()
     tables = ["versions"] if _is_portable(a) else ["versions", "platform"]
     found = []
     for before, after in ((a.get(table), b.get(table)) for table in tables):
@@ -164,6 +169,43 @@ def _otherwise(key: str, first: str, second: str) -> str:
     return f"{key} {' '.join(more)}"
 
 
+def told_otherwise(first: Path, second: Path) -> tuple[tuple[str, Any, Any], ...]:
+    """What of configuration, seed and source two runs were told otherwise: key and both values."""
+    a, b = (
+        {key: read_header(run).manifest.get(key) for key in ("config", "seed", "source")}
+        for run in (first, second)
+    )
+    return tuple((key.removeprefix("config."), x, y) for key, x, y in differences(a, b))
+
+
+def signals_of(run: Path, iteration: int) -> Mapping[str, NDArray[Any]]:
+    """The signals of an iteration by name; none where the run holds no such iteration."""
+    for columns in read_columns(run):
+        place = iteration - int(columns.iterations[0])
+        if 0 <= place < len(columns):
+            return {name: columns[name][place] for name in SIGNALS}
+    return {}
+
+
+def both_signals(
+    first: Mapping[str, NDArray[Any]], second: Mapping[str, NDArray[Any]]
+) -> tuple[tuple[str, str, str, str], ...]:
+    """An iteration's signals of two runs as words: name, both values, and whether they differ."""
+    rows = []
+    for name in first.keys() & second.keys():
+        x, y = (np.asarray(signals[name])[None] for signals in (first, second))
+        differ = "" if x.shape == y.shape and not _differ(x, y).any() else "differs"
+        rows.append((name, _words(x[0]), _words(y[0]), differ))
+    order = list(SIGNALS)
+    return tuple(sorted(rows, key=lambda row: order.index(row[0])))
+
+
+def _words(value: NDArray[Any]) -> str:
+    if value.size > FEW_VALUES:
+        return f"{'x'.join(map(str, value.shape))}, {value.flat[0]!s} ..."
+    return " ".join(map(str, value.ravel().tolist())) or "-"
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """A run in a table of runs, and where its signals first differ from the first run's.
@@ -171,12 +213,14 @@ class Row:
     Attributes:
         difference: from the first run, None where there is none.
         otherwise: what explains it, see `computed_otherwise`.
+        told: what it was told otherwise, see `told_otherwise`.
     """
 
     name: str
     outline: Outline
     difference: Difference | None
     otherwise: tuple[str, ...] = ()
+    told: tuple[tuple[str, Any, Any], ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """The row as JSON values."""
@@ -187,6 +231,7 @@ class Row:
             "iterations": self.outline.iterations,
             "modules": [streams[saved.stream] for saved in self.outline.saved],
             "first_difference": None if self.difference is None else self.difference.as_json(),
+            "told_otherwise": [{"key": k, "first": a, "second": b} for k, a, b in self.told],
             "computed_otherwise": list(self.otherwise),
         }
 
@@ -199,9 +244,19 @@ class Row:
 
     def explanation(self) -> str:
         """What explains its difference, in words; "" where nothing known does."""
-        if not self.otherwise:
-            return ""
-        return f"{self.name} was computed otherwise, which may be why: {'; '.join(self.otherwise)}"
+        found = []
+        if self.told:
+            what = "; ".join(f"{key} {_short(a)} against {_short(b)}" for key, a, b in self.told)
+            found.append(f"{self.name} was told otherwise: {what}")
+        if self.otherwise:
+            why = "; ".join(self.otherwise)
+            found.append(f"{self.name} was computed otherwise, which may be why: {why}")
+        return "\n".join(found)
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 HEAD = ("run", "seed", "iterations", "modules", "against the first run")
@@ -213,6 +268,9 @@ def side_by_side(runs: Sequence[Path]) -> tuple[Row, ...]:
     for run in runs:
         name, outline = run_log(run).resolve().parent.name, read_outline(run)
         found = first_difference(runs[0], run) if rows else None
-        because = computed_otherwise(runs[0], run) if found is not None else ()
-        rows.append(Row(name, outline, found, because))
+        if found is None:
+            rows.append(Row(name, outline, None))
+            continue
+        because, told = computed_otherwise(runs[0], run), told_otherwise(runs[0], run)
+        rows.append(Row(name, outline, found, because, told))
     return tuple(rows)

@@ -30,13 +30,14 @@ def compare_command(
 ) -> None:
     """Check that runs' signals are the same bits, and show their curves.
 
-    Of two runs it says where they first differ, and exits with 4 if they do. Of more it
+    Of two runs it says where they first differ, with all signals there and what the runs were
+    told or computed otherwise, and exits with 4 if they do. Of more it
     prints a table, each run compared with the first, and exits with 0. A run may be the URL of
     its run.mcap, of which a copy is made.
     """
     if len(runs) < 2:
         raise click.UsageError("name two runs, or more")
-    from replay.runs.compare import HEAD, side_by_side
+    from replay.runs.compare import HEAD, both_signals, side_by_side, signals_of
 
     rows = side_by_side(runs)
     if save is not None:
@@ -44,12 +45,15 @@ def compare_command(
 
         build_overlay(runs, rows, save, force=force)
     different = [row.difference for row in rows if row.difference is not None]
+    at = different[0].iteration if different and len(runs) == 2 else -1
+    first, second = ({}, {}) if at < 0 else (signals_of(runs[0], at), signals_of(runs[1], at))
     if as_json:
         options.print_json(
             {
                 "schema": options.SCHEMA,
                 "identical": not different,
                 "first_difference": different[0].as_json() if different else None,
+                "signals": {name: [first[name], second[name]] for name in first if name in second},
                 "runs": [row.as_json() for row in rows],
                 "view": save,
             }
@@ -61,6 +65,9 @@ def compare_command(
     for explanation in filter(None, (row.explanation() for row in rows)):
         if not as_json:
             click.echo(explanation)
+    if first and second and not as_json:
+        click.echo(f"signals of iteration {at}:")
+        options.print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
     if save is not None and not as_json:
         click.echo(f"view {save}    look at it: cdmisfa view {options.quoted(save)}", err=True)
     if different and len(runs) == 2:

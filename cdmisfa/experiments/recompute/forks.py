@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.core.config import as_table, build, parse_settings
+from cdmisfa.core.config import as_table, build, differences, parse_settings
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.recompute.again import Era, source_of, told_anew
 from cdmisfa.experiments.recompute.check import learner_after
-from cdmisfa.experiments.resume import FORK, Fork, command_of, differences, read_command
+from cdmisfa.experiments.resume import FORK, Fork, command_of, read_command
 from cdmisfa.experiments.runs import RunResult, run
 from recorder.log.folder import folder_here
 from replay.runs.folders import run_log
