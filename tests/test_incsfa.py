@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from cdmisfa.core.arithmetic.choice import portable_bits
 from cdmisfa.core.blocks import PIXEL, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import gram, strict
 from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.features.incsfa.state import State, new_state, parameters, rank_floor
-from cdmisfa.features.projection import project
+from cdmisfa.features.projection import mean_output, project
 from cdmisfa.features.sfa import batch_sfa, slowness
 from recorder.world.oscillatory import OscillatorySource, one_period
 
@@ -261,13 +262,39 @@ def test_strict_bits_do_not_depend_on_how_frames_are_cut():
     assert a.phi.tobytes() == b.phi.tobytes()
 
 
-def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it():
+@pytest.mark.parametrize("portable", [False, True])
+@pytest.mark.parametrize(("rows", "size", "n"), [(4, 1300, 9), (7, 1024, 67), (3, 544, 5)])
+def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it(rows, size, n, portable):
+    """Nor do those of a frame on its block: neither tells where it is paired, or alone."""
     rng = np.random.default_rng(0)
-    phi, offset = rng.standard_normal((4, 1300)), rng.standard_normal(4)
-    frames = rng.standard_normal((9, 1300))
-    stacked = project(phi, offset, frames)
-    np.testing.assert_allclose(stacked, frames @ phi.T - offset, rtol=1e-10, atol=1e-10)
-    for row in range(4):
-        alone = project(phi[row : row + 1], offset[row : row + 1], frames[2:5])
-        assert alone[:, 0].tobytes() == stacked[2:5, row].tobytes()
-    assert project(phi[:0], offset[:0], frames).shape == (9, 0)
+    phi, offset = rng.standard_normal((rows, size)), rng.standard_normal(rows)
+    frames = rng.standard_normal((n, size))
+    with portable_bits(portable):
+        stacked = project(phi, offset, frames)
+        np.testing.assert_allclose(stacked, frames @ phi.T - offset, rtol=1e-10, atol=1e-10)
+        for row in range(rows):
+            for first, stop in ((0, n), (1, 2), (2, 5)):
+                some = phi[row : row + 2], offset[row : row + 2], frames[first:stop]
+                alone = project(some[0][:1], some[1][:1], some[2])
+                assert alone[:, 0].tobytes() == stacked[first:stop, row].tobytes()
+                assert project(*some).tobytes() == stacked[first:stop, row : row + 2].tobytes()
+        assert project(phi[:0], offset[:0], frames).shape == (n, 0)
+        assert project(phi, offset, frames[:0]).shape == (0, rows)
+
+
+def test_pixels_are_projected_as_their_values_are():
+    rng = np.random.default_rng(1)
+    phi, offset = rng.standard_normal((5, 700)), rng.standard_normal(5)
+    pixels = rng.integers(0, 256, (70, 700), dtype=np.uint8)
+    values = pixels * PIXEL
+    assert project(phi, offset, pixels).tobytes() == project(phi, offset, values).tobytes()
+
+
+@pytest.mark.parametrize("outputs", [1, 4, 6])
+def test_the_mean_output_is_summed_in_order(outputs):
+    rng = np.random.default_rng(2)
+    phi, mean = rng.standard_normal((outputs, 300)), rng.standard_normal(300)
+    plain = np.zeros(outputs)
+    for i in range(300):
+        plain += phi[:, i] * mean[i]
+    assert mean_output(phi, mean).tobytes() == plain.tobytes()

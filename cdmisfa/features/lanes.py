@@ -116,6 +116,31 @@ def total(typing: Any, x: Any) -> Any:
 
 
 @_intrinsic
+def folded(typing: Any, x: Any) -> Any:
+    """Return the sum of a value's numbers, its second half added to the first until one is left."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        parts = [builder.extract_element(args[0], _INDEX(lane)) for lane in range(LANES)]
+        while len(parts) > 1:
+            half = len(parts) // 2
+            pairs = zip(parts[:half], parts[half:], strict=True)
+            parts = [builder.fadd(first, second) for first, second in pairs]
+        return parts[0]
+
+    return types.float64(_LANES), emit
+
+
+@_intrinsic
+def plus(typing: Any, x: Any, y: Any) -> Any:
+    """Return x + y."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fadd(*args)
+
+    return _LANES(_LANES, _LANES), emit
+
+
+@_intrinsic
 def zeros(typing: Any) -> Any:
     """Return a value of zeros."""
 
