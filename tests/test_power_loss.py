@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from torture.calls import Call
 from torture.power import (
+    GONE,
     NAMES,
     OLD_NAMES,
     SYNCED,
@@ -47,6 +48,14 @@ def test_a_command_goes_on_after_a_power_cut(tmp_path: Path, name: str) -> None:
     goes_on(random.Random(name).sample(found, SAMPLED[name]) + over, tmp_path)
 
 
+def test_files_half_written_by_processes_that_are_gone_are_gone_after(tmp_path: Path) -> None:
+    (tmp_path / "recorded").mkdir()
+    found = list(cuts(record(STORIES["record"], tmp_path / "recorded")))
+    left = [cut for cut in found if any(f".{GONE}." in path.name for path in cut.tree)]
+    assert left
+    goes_on(left[:3], tmp_path)
+
+
 @pytest.mark.parametrize("name", ["record --resume", "learn --resume"])
 def test_what_was_there_before_is_not_given_up_for_what_the_disk_has_not(
     tmp_path: Path, name: str
@@ -65,22 +74,24 @@ def test_what_was_there_before_is_not_given_up_for_what_the_disk_has_not(
 @pytest.mark.parametrize(
     ("name", "before", "progress", "least"),
     [
-        ("record", "x1.mcap.partial", frames, 3 * (FRAMES - 100)),
-        ("learn", "checkpoint-000000000450", iterations, 400),
+        ("record", ("x1.mcap.partial", -2), frames, 3 * (FRAMES - 100)),
+        # the last four, with the end of the log, follow when all before is synced
+        ("learn", ("run.mcap.partial", -5), iterations, 400),
     ],
 )
 def test_fsync_every_bounds_what_a_power_cut_takes(
-    tmp_path: Path, name: str, before: str, progress: Callable[[Path], int], least: int
+    tmp_path: Path, name: str, before: tuple[str, int], progress: Callable[[Path], int], least: int
 ) -> None:
-    """Before the last of a file is written, all but what was written since is on the disk."""
+    """Before a file's last data is written, all but what was written since is on the disk."""
+    file, write = before
     found = []
     for number, option in enumerate(("", " --fsync-every 0")):
         (tmp_path / f"recorded{number}").mkdir()
         story = replace(STORIES[name], words=f"{STORIES[name].words}{option}")
         recorded = record(story, tmp_path / f"recorded{number}")
         about = enumerate(recorded.calls)
-        writes = [n for n, c in about if c.kind == "write" and c.path.name.startswith(before)]
-        cut = Cut(recorded, writes[0 if name == "learn" else -2], SYNCED, OLD_NAMES)
+        writes = [n for n, c in about if c.kind == "write" and c.path.name == file]
+        cut = Cut(recorded, writes[write], SYNCED, OLD_NAMES)
         (tmp_path / f"left{number}").mkdir()
         write_tree(cut.tree, tmp_path / f"left{number}")
         found.append((recorded.result, progress(tmp_path / f"left{number}" / OUT)))

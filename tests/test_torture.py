@@ -113,6 +113,28 @@ def test_results_are_gone_on_with(tmp_path: Path) -> None:
     assert len(seeds) > 2
 
 
+def test_what_prepares_for_long_has_its_fewest_cases(tmp_path: Path) -> None:
+    results = harness.Results(tmp_path / "cases.jsonl")
+    good = made(lambda job: Outcome(RIGHT, "group"), results)
+    harness.run(good, results, time.monotonic() - 60, 2, io.StringIO(), fewest=3)
+    assert sorted(line["seed"] for line in results.lines) == [0, 1, 2]
+
+
+def test_results_are_of_one_commit(tmp_path: Path) -> None:
+    path = tmp_path / "cases.jsonl"
+    case = {"campaign": "made", "seed": 0}
+    for commit in ("abc", "abc", "def"):
+        results = harness.Results(path)
+        results.begin({"commit": commit})
+        results.add(case)
+    assert harness.Results(path).lines == [{"run": {"commit": "def"}}, case]
+    assert (
+        harness.Results(tmp_path / "cases-abc.jsonl").lines
+        == [{"run": {"commit": "abc"}}, case] * 2
+    )
+    assert next(harness.Results(path).seeds("made", 0)) == 1
+
+
 @pytest.mark.parametrize(
     ("code", "err", "seconds", "kind"),
     [

@@ -22,6 +22,8 @@ from .campaigns import CAMPAIGNS, campaign
 from .outcomes import WRONG, Limits, Outcome
 
 ROOT = Path(__file__).resolve().parents[2]
+FEWEST = 4
+"""Cases of each campaign, however long preparing takes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.minutes > 0:
         print(f"seed {chosen.seed}: {', '.join(names)} for {chosen.minutes:g} min", flush=True)
         told = {**_about(), "seed": chosen.seed, "minutes": chosen.minutes}
-        harness.Results(results).add({"run": told})
+        harness.Results(results).begin(told)
         deadline = time.monotonic() + 60 * chosen.minutes
         for number, name in enumerate(names):
             # Each in a process of its own, so that what one imports is none of another's memory.
@@ -56,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _in_child(name, results, chosen.seed, time.monotonic() + left, chosen.jobs)
             os.waitpid(pid, 0)
     summary = page.summary(harness.Results(results).lines)
+    if not summary["runs"]:
+        parser.error(f"no results in {results}: run campaigns first")
     (chosen.out / "torture.json").write_text(json.dumps(summary, indent=1) + "\n")
     if chosen.page is not None:
         chosen.page.write_text(page.markdown(summary))
@@ -72,7 +76,7 @@ def _in_child(name: str, path: Path, first_seed: int, deadline: float, jobs: int
     try:
         with tempfile.TemporaryDirectory(prefix="torture-shared-") as shared:
             opened = _opened(name, Path(shared), results.seeds(name, first_seed))
-            harness.run(opened, results, deadline, jobs, sys.stderr)
+            harness.run(opened, results, deadline, jobs, sys.stderr, fewest=FEWEST)
         code = 0
     except BaseException as error:  # other campaigns go on
         results.add(_broken_off(name, error))
@@ -108,7 +112,7 @@ def _alone(name: str, seed: int) -> int:
 
 def _about() -> dict[str, str]:
     commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
+        ["git", "describe", "--always", "--abbrev=7", "--dirty", "--exclude=*"],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -6,19 +6,17 @@ import importlib
 from types import ModuleType
 
 CAMPAIGNS = (
-    *(
-        "kills",
-        "children",
-        "follows",
-        "power",
-        "failing",
-        "disks",
-        "descriptors",
-        "races",
-        "damage",
-        "servers",
-        "histories",
-    ),
+    "kills",
+    "children",
+    "follows",
+    "power",
+    "failing",
+    "disks",
+    "descriptors",
+    "races",
+    "damage",
+    "servers",
+    "histories",
 )
 """Modules of this folder, in the order of the page."""
 

@@ -18,14 +18,20 @@ from typing import Any
 
 import psutil
 
-from .commands import LIMIT, ROOT, Fork, Process, judge, must, until
+from .commands import LIMIT, ROOT, Fork, Process, here, judge, until
 from .kills import check_disk, finish
-from .outcomes import HANG, MIXED, RIGHT, SKIPPED, Defect, Job, Limits, Outcome
+from .outcomes import HANG, MIXED, RIGHT, SKIPPED, WRONG, Defect, Job, Limits, Outcome
 from .processes import descendants, wait_gone
 from .works import WORKS, Work, files
 
 LIMITS = Limits(seconds=200, share=3)
 
+REAL = 0.2
+"""Share of commands that are begun as a user would; workers import everything anyway."""
+ALONE = ("--jobs", 1)
+"""Going on without workers gives the same, sooner: most cases do."""
+BEGINNING = 3.0
+"""Seconds after which all workers compute."""
 GOING_ON = 90.0
 """Seconds in which what goes on without a worker must have ended."""
 
@@ -65,14 +71,16 @@ CHILDREN: Mapping[str, Work] = {
 
 
 def prepare(folder: Path) -> dict[str, Any]:
-    """Results of commands whose workers nobody kills, and how long each takes."""
+    """Results of commands without workers, and how long each takes."""
     results, seconds = {}, {}
     for name, work in CHILDREN.items():
         if name.startswith("arena") and not STREAMS.exists():
             continue
-        place = folder / "done" / name
-        seconds[name] = must(folder, *work.words(place, folder)).seconds
-        results[name] = work.result(place)
+        place, began = folder / "done" / name, time.monotonic()
+        ran = here(*work.words(place, folder), *ALONE)
+        if ran.code != 0:
+            raise Defect(WRONG, "setup", f"{ran.line}: exit {ran.code}: {ran.told()}")
+        results[name], seconds[name] = work.result(place), time.monotonic() - began
     return {"folder": folder, "results": results, "seconds": seconds}
 
 
@@ -85,10 +93,10 @@ def case(job: Job) -> Outcome:
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1)  # orphans become children of this process
     work, place = CHILDREN[name], job.folder / "out"
     words = work.words(place, given["folder"])
-    process = rng.choice((Process, Fork))(job.folder, *words)
+    process = (Process if rng.random() < REAL else Fork)(job.folder, *words)
     until(lambda: bool(workers(process.pid)) or not process.running, 60)
     # half of them at once: while workers begin, import and load what is compiled
-    takes = rng.choice((0.3, 2.0, given["seconds"][name]))
+    takes = rng.choice((0.3, 2.0, BEGINNING + given["seconds"][name]))
     until(lambda: not process.running, rng.uniform(0, takes))
     if rng.random() < 0.5:
         group = f"{name}: its worker"
@@ -97,7 +105,7 @@ def case(job: Job) -> Outcome:
         group = f"{name}: itself"
         outcome = _itself_killed(process, group)
     check_disk(place, {}, group, process.ran())
-    finish(place, words, work, group)
+    finish(place, (*words, *rng.choice(((), ALONE, ALONE, ALONE))), work, group)
     if (found := work.result(place)) != given["results"][name]:
         raise Defect(MIXED, group, f"{name}: gone on with, it gives {found}")
     return outcome
@@ -129,7 +137,7 @@ def _itself_killed(process: Process, group: str) -> Outcome:
     process.send(signal.SIGKILL)
     ran = process.wait(LIMIT, group)
     began = time.monotonic()
-    until(lambda: not descendants(os.getpid()), LIMIT)
+    until(lambda: not wait_gone(descendants(os.getpid()), 0), LIMIT)
     if left := wait_gone(descendants(os.getpid()), 0):
         seconds = time.monotonic() - began
         raise Defect(HANG, group, f"{ran.line}: {seconds:.0f} s after kill -9 there is {left}")

@@ -70,6 +70,14 @@ class Results:
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
 
+    def begin(self, told: dict[str, Any]) -> None:
+        """Note a run; what is of another commit than its own is put aside under that one's name."""
+        commits = [line["run"]["commit"] for line in self.lines if "run" in line]
+        if commits and commits[-1] != told["commit"]:
+            self.path.replace(self.path.with_stem(f"{self.path.stem}-{commits[-1]}"))
+            self.lines = []
+        self.add({"run": told})
+
     def seeds(self, campaign: str, first: int) -> Iterator[int]:
         """Those from `first` on of which there is no line yet."""
         done = {line["seed"] for line in self.lines if line.get("campaign") == campaign}
@@ -80,7 +88,15 @@ class Results:
             number += 1
 
 
-def run(campaign: Campaign, results: Results, deadline: float, jobs: int, say: TextIO) -> None:
+def run(
+    campaign: Campaign,
+    results: Results,
+    deadline: float,
+    jobs: int,
+    say: TextIO,
+    *,
+    fewest: int = 0,
+) -> None:
     """Run cases until the time is over; those that run then are ended in peace.
 
     Args:
@@ -89,12 +105,15 @@ def run(campaign: Campaign, results: Results, deadline: float, jobs: int, say: T
         deadline: until when, by the monotonic clock.
         jobs: cases at a time.
         say: where found defects are told.
+        fewest: cases that are run even when the time is over.
     """
     running: dict[int, Running] = {}
-    while running or time.monotonic() < deadline:
-        while len(running) < jobs and time.monotonic() < deadline:
+    begun = 0
+    while running or begun < fewest or time.monotonic() < deadline:
+        while len(running) < jobs and (begun < fewest or time.monotonic() < deadline):
             case = begin(campaign, next(campaign.seeds))
             running[case.pidfd] = case
+            begun += 1
         for pidfd in select.select(list(running), [], [], 0.5)[0]:
             line = end(case := running.pop(pidfd))
             results.add(line)

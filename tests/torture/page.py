@@ -71,11 +71,12 @@ def markdown(found: dict[str, Any]) -> str:
     lines = [
         "# What was done to it, and what came of that",
         "",
-        "Made by `make torture` (`python -m tests.torture --page docs/reliability.md`); figures",
-        "are of the runs named here, failures included.",
+        "Made by `make torture`, then `python -m tests.torture --minutes 0 --page "
+        "docs/reliability.md`;",
+        "figures are of the runs named here, failures included.",
         "",
         f"{cases} cases in {hours:.1f} hours of work, {len(found['defects'])} defects. "
-        f"Commits {_distinct(runs, 'commit')}; Python {_distinct(runs, 'python')}; "
+        f"Commit {_distinct(runs, 'commit')}; Python {_distinct(runs, 'python')}; "
         f"{_distinct(runs, 'platform')}; first seeds {_distinct(runs, 'seed')}.",
         "",
         *(f"- **{kind}**: {MEANING[kind]}" for kind in (*GOOD, *DEFECTS)),

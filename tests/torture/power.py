@@ -9,6 +9,7 @@ have the length alone, with zeros in it.
 from __future__ import annotations
 
 import itertools
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -24,6 +25,9 @@ WRITTEN, ZEROS, SYNCED = "all that was written", "lengths with zeros", "what was
 NAMES, OLD_NAMES = "all names", "synced names"
 LEFT = tuple(itertools.product((WRITTEN, ZEROS, SYNCED), (NAMES, OLD_NAMES)))
 """What is left of the data, and of the names."""
+
+GONE = 1 << 22
+"""The number of no process, as all processes of before are gone when the power is back."""
 
 Tree = dict[Path, bytes | None]
 """Files with their data, folders with None; paths are relative to the story's folder."""
@@ -189,13 +193,16 @@ def record(story: Story, folder: Path) -> Recorded:
     calls: list[Call] = []
     known = set(tree)
 
+    def named(path: Path) -> Path:
+        return Path(str(path.relative_to(folder)).replace(f".{os.getpid()}.", f".{GONE}."))
+
     def told(call: Call) -> None:
-        path, target = call.path.relative_to(folder), call.target
+        path, target = named(call.path), call.target
         if path not in known and call.kind in ("fsync", "rename") and call.path.is_file():
             calls.extend((Call("create", path), Call("write", path, data=call.path.read_bytes())))
         known.add(path)
         if target is not None:
-            target = target.relative_to(folder)
+            target = named(target)
             known.discard(path)
             known.add(target)
         if call.kind in ("unlink", "rmdir"):
