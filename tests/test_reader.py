@@ -155,7 +155,7 @@ def test_absent_checksums_are_told(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     for options, absent in [({}, False), ({"enable_crcs": False}, True)]:
         path.write_bytes(written([1, 2, 3], **options))
-        with LogReader(path) as reader:
+        with LogReader(path, check="data") as reader:
             assert bool(reader.crc_absent()) == absent
     path.write_bytes(written([1], use_chunking=False, enable_data_crcs=True))
     with LogReader(path) as reader:

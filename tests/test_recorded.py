@@ -173,7 +173,11 @@ def damage(path: Path) -> tuple[int, int]:
 def test_damage_stops_and_is_named(copy: Path) -> None:
     start, end = damage(copy / "x1.mcap")
     with pytest.raises(LogDamagedError, match=rf"x1\.mcap.*{start} to {end}"):
-        RecordedSource(copy)
+        RecordedSource(copy).describe()
+    source = RecordedSource(copy)
+    assert len(source.take(0, 100)) == 100
+    with pytest.raises(LogDamagedError, match=rf"x1\.mcap.*{start} to {end}"):
+        source.take(0, 1)
 
 
 def test_salvage_leaves_the_damage_out_of_every_view(copy: Path) -> None:

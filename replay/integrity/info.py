@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from replay.integrity.survey import SCHEMA, Crc, Kind, survey
-from replay.mcap.reader import LogReader
+from replay.mcap.reader import Check, LogReader
 from replay.mcap.records import Channel
 from replay.mcap.segments import Problem
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
@@ -20,7 +20,7 @@ from replay.storage.listing import log_files
 from replay.storage.location import Location, location
 
 CHECK_BYTES: Final = 1024 * 1024 * 1024
-"""Logs with more decompressed bytes are described by their index, not decoded."""
+"""Logs with more bytes, decompressed or not, are described by their index, not decoded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def describe(path: str | Location) -> LogInfo:
 
 
 def _describe_file(path: Location) -> LogInfo:
-    with LogReader(path, salvage=True) as reader:
+    with LogReader(path, salvage=True, check=_check(path)) as reader:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
         surveyed, channels = survey(reader, decode=decode), []
         for number, found in sorted(surveyed.channels.items()):
@@ -139,6 +139,10 @@ def _describe_file(path: Location) -> LogInfo:
             metadata={path.name: metadata},
             signals=RecordInfo(version, missing(version)) if version else None,
         )
+
+
+def _check(path: Location) -> Check:
+    return "pass" if isinstance(path, Path) and path.stat().st_size <= CHECK_BYTES else "chunks"
 
 
 def _seed(records: Sequence[Mapping[str, str]]) -> int | None:

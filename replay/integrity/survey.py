@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -15,6 +15,7 @@ from recorder.log.messages import RECORDING_METADATA
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
 from replay.mcap.segments import Problem, Segment
+from replay.mcap.tables import MessageTable
 from replay.runs.folders import RUN_METADATA
 from replay.storage.location import Location
 
@@ -80,32 +81,42 @@ def problems_of(reader: LogReader) -> tuple[Problem, ...]:
     return (*found, *([Problem(str(reader.path), reader.missing)] if reader.missing else ()))
 
 
-def survey(reader: LogReader, *, decode: bool) -> Survey:
+def survey(
+    reader: LogReader, *, decode: bool, told: Callable[[Segment], None] = lambda _: None
+) -> Survey:
     """Count the messages of each channel, and collect what is wrong.
 
     Args:
         reader: of a log; of one behind a URL the summary and few message indexes are read.
         decode: decode every chunk, which finds all damage, and not only where it has no
-            message indexes.
+            message indexes. The file is read in one pass.
+        told: of every chunk that is decoded, in file order.
 
     Raises:
         LogDamagedError: a message index is damaged.
     """
     found = {number: ChannelSurvey() for number in reader.channels}
-    if reader.by_index:
+    if decode:
+        for segment, table in reader.one_pass():
+            told(segment)
+            _add(found, _decoded(table))
+    elif reader.by_index:
         _survey_summary(reader, found)
     else:
         for segment in reader.segments:
-            for number, times in _times(reader, segment, decode):
-                found.setdefault(number, ChannelSurvey()).add(times)
+            indexed = segment.indexes
+            _add(found, _indexed(reader, segment) if indexed else _decoded(reader.table(segment)))
     return Survey(kind_of(reader), found, _crc(reader, decode), problems_of(reader))
 
 
-def _times(reader: LogReader, segment: Segment, decode: bool) -> Iterator[tuple[int, Times]]:
+def _add(found: dict[int, ChannelSurvey], times: Iterable[tuple[int, Times]]) -> None:
+    for number, each in times:
+        found.setdefault(number, ChannelSurvey()).add(each)
+
+
+def _decoded(table: MessageTable | None) -> Iterator[tuple[int, Times]]:
     """The log times of each channel's messages in a chunk."""
-    if segment.indexes and not decode:
-        yield from _indexed(reader, segment)
-    elif (table := reader.table(segment)) is not None:
+    if table is not None:
         for number in np.unique(table.channel).tolist():
             yield number, table.log_time[table.channel == number]
 

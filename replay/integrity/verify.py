@@ -11,9 +11,9 @@ from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.integrity.run_files import check_run, read_final, view_again
-from replay.integrity.survey import SCHEMA, Crc, Kind, moved, survey
+from replay.integrity.survey import SCHEMA, Crc, Kind, kind_of, moved, survey
 from replay.mcap.reader import LogReader
-from replay.mcap.segments import Problem
+from replay.mcap.segments import Problem, Segment
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.runs.folders import VIEW_FILE
@@ -49,7 +49,7 @@ class LogCheck:
 
 
 def check_log(path: str | Location) -> LogCheck:
-    """Check a log, or all logs of a folder, by decoding everything in them.
+    """Check a log, or all logs of a folder, by decoding everything in them, in one pass of each.
 
     What lies behind a URL is copied first, for all of it is needed more than once.
 
@@ -63,20 +63,20 @@ def check_log(path: str | Location) -> LogCheck:
     place = location(path)
     problems: list[Problem] = []
     files: list[FileCheck] = []
-    views: list[Location] = []
+    views: list[_ViewPass] = []
     notes: list[str] = []
     with fetched(place) as copy:
         for file in log_files(copy):
-            crc, kind, found = _check_file(file)
+            crc, kind, found, view = _check_file(file)
             problems += found
             files.append(FileCheck(str(file).replace(str(copy), str(place)), crc))
-            if kind == "recording":
-                views.append(file)
+            if view is not None:
+                views.append(view)
             if kind == "run" and not found and isinstance(file, Path):
                 beside = isinstance(place, Path) and place.is_dir()
                 problems += check_run(file, beside=beside)
-                if beside and (view := file.parent / VIEW_FILE).is_file():
-                    notes.append(f"{view} is not checked: {view_again(file.parent)}")
+                if beside and (shown := file.parent / VIEW_FILE).is_file():
+                    notes.append(f"{shown} is not checked: {view_again(file.parent)}")
                 if read_final(file) is None:
                     notes.append(f"{file} holds no final record: nothing proves what is beside it")
         if views:
@@ -85,10 +85,41 @@ def check_log(path: str | Location) -> LogCheck:
     return LogCheck(tuple(unique), tuple(files), tuple(notes))
 
 
-def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem]]:
+class _ViewPass:
+    """Looks at the frames of one file of a recording while its chunks are decoded."""
+
+    def __init__(self, path: Location, reader: LogReader) -> None:
+        self.path = path
+        self.view: ViewFile | None = None
+        self.error: LogDamagedError | None = None
+        with self._telling():
+            self.view = ViewFile(path, passing=reader)
+
+    def add(self, segment: Segment) -> None:
+        with self._telling():
+            if self.view is not None and self.error is None:
+                self.view.pass_over(segment)
+
+    def finish(self) -> None:
+        with self._telling():
+            if self.view is not None:
+                self.view.passed()
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        try:
+            yield
+        except LogDamagedError as error:
+            self.error = error
+
+
+def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem], _ViewPass | None]:
     try:
-        with LogReader(path, salvage=True) as reader:
-            found = survey(reader, decode=True)
+        with LogReader(path, salvage=True, check="pass") as reader:
+            view = _ViewPass(path, reader) if kind_of(reader) == "recording" else None
+            found = survey(reader, decode=True, told=view.add if view else lambda _: None)
+            if view:
+                view.finish()
             wrong = [
                 f"holds messages of channel {number}, never defined"
                 for number in found.channels.keys() - reader.channels.keys()
@@ -98,36 +129,35 @@ def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem]]:
             if stated != there and not reader.problems:
                 wrong.append(f"its summary states {stated} messages, there are {there}")
             problems = [Problem(str(path), what) for what in wrong]
-            return found.crc, found.kind, [*problems, *found.problems]
+            return found.crc, found.kind, [*problems, *found.problems], view
     except LogDamagedError as error:
-        return "bad", "foreign", [_said(path, error)]
+        return "bad", "foreign", [_said(path, error)], None
 
 
-def _check_views(paths: list[Location], *, alone: bool) -> Iterator[Problem]:
-    sound, folder = True, str(paths[0].parent)
+def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
+    folder = str(passes[0].path.parent)
     streams: set[str] = set()
     names: set[str] = set()
-    for path in paths:
-        try:
-            with contextlib.closing(ViewFile(path, salvage=True)) as view:
-                names.add(view.facts.view)
-                streams |= set(filter(None, view.facts.values.get("streams", "").split(",")))
-                edges = [(0, view.facts.first_frame), *view.ranges]
-                for (_, end), (start, _) in itertools.pairwise(edges):
-                    if start > end:
-                        yield Problem(str(path), f"frames {end} to {start - 1} are missing")
-                view.check()
-        except LogDamagedError as error:
-            sound = False
-            yield _said(path, error)
+    for checked in passes:
+        if checked.view is not None:
+            facts = checked.view.facts
+            names.add(facts.view)
+            streams |= set(filter(None, facts.values.get("streams", "").split(",")))
+            edges = [(0, facts.first_frame), *checked.view.ranges]
+            for (_, end), (start, _) in itertools.pairwise(edges):
+                if start > end:
+                    yield Problem(str(checked.path), f"frames {end} to {start - 1} are missing")
+        if checked.error is not None:
+            yield _said(checked.path, checked.error)
     for name in () if alone else sorted(streams - names):
         yield Problem(folder, f"the view {name!r} of the recording has no file")
-    if not sound:
+    if any(checked.error is not None for checked in passes):
         return
+    views = [checked.view for checked in passes if checked.view is not None]
     try:
-        source = RecordedSource(paths, salvage=True)
+        source = RecordedSource([v.path for v in views], salvage=True, opened=views)
     except LogDamagedError as error:
-        yield replace(_said(paths[0], error), where=folder)
+        yield replace(_said(passes[0].path, error), where=folder)
         return
     with contextlib.closing(source):
         ends = {name: ranges[-1][1] for name, ranges in source.coverage().items()}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -24,6 +25,7 @@ from replay.mcap.records import (
 from replay.mcap.segments import Definitions, Segment
 from replay.mcap.tables import MessageTable, Spans, indexed_table, walked_table
 from replay.storage.checksum import crc32
+from replay.storage.once import OnePass
 from replay.storage.store import Store
 
 CACHE_BYTES: Final = 32 * 1024 * 1024
@@ -38,6 +40,7 @@ class Chunks:
         definitions: take in what the chunks define.
         note: told (where, what) of an index that contradicts its chunk, and is not used.
         cache_bytes: of decoded chunks that are kept.
+        without_crc: called for a chunk that has no CRC of its own.
     """
 
     def __init__(
@@ -46,8 +49,10 @@ class Chunks:
         definitions: Definitions,
         note: Callable[[str, str], None],
         cache_bytes: int | None,
+        without_crc: Callable[[], None],
     ) -> None:
         self._file = file
+        self._without_crc = without_crc
         self._definitions = definitions
         self._note = note
         self._cache_bytes = CACHE_BYTES if cache_bytes is None else cache_bytes
@@ -107,6 +112,16 @@ class Chunks:
         raw = self._unpack(segment, stop, out)
         return raw[segment.indexes[0].offset - INDEX_HEADER - segment.data_offset :]
 
+    @contextlib.contextmanager
+    def passing(self) -> Iterator[OnePass]:
+        """Read each byte of the file once, as far as chunks are asked for in its order."""
+        before = self._file
+        self._file = store = OnePass(before)
+        try:
+            yield store
+        finally:
+            self._file = before
+
     def forget(self, but: Collection[int] = ()) -> None:
         """Let go of the chunks that were decoded, but those at some places of the file."""
         for key in self._cache.keys() - set(but):
@@ -121,7 +136,9 @@ class Chunks:
             confirm(self._file, segment)
         raw = memoryview(self._file.read(segment.data_offset, stop - segment.data_offset))
         self._decompressor.decompress(raw[: segment.stored], segment.compression, out)
-        if segment.crc and crc32(out.data) != segment.crc:
+        if not segment.crc:
+            self._without_crc()
+        elif crc32(out.data) != segment.crc:
             raise MalformedRecord("its CRC does not match: damaged")
         return raw
 

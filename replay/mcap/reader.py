@@ -6,26 +6,28 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Final, Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.chunks import Chunks
-from replay.mcap.records import MAGIC, MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
+from replay.mcap.data_section import DataSection
+from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
 from replay.mcap.segments import Attachment, Message, Problem, Segment
-from replay.mcap.summary import FOOTER_BYTES
 from replay.mcap.tables import MessageTable, in_order, within
-from replay.mcap.walk import DATA_END_BYTES, LogStructure
+from replay.mcap.walk import LogStructure
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import open_store
 
-_BEGINNING: Final = 64 * 1024
-"""Bytes that are read of a log behind a URL before its end is known."""
+Check = Literal["chunks", "data", "pass"]
+
+_SENT_LESS = (
+    "the server sends less than the log, or the log was cut (cdmisfa recover saves what is there)"
+)
 
 
 class LogReader:
@@ -33,9 +35,10 @@ class LogReader:
 
     Damage is an error that names the file, the chunk and its time range. With
     `salvage` the damaged chunk is left out and noted in `problems` instead, and the
-    unverifiable part of a chunk in which the file ends is read too. Of a URL only what is
-    asked for is read, as far as its summary accounts for every message; one that lacks its
-    end is damaged, as nothing tells whether the server sent all of it.
+    unverifiable part of a chunk in which the file ends is read too. Where its summary accounts
+    for every message, only what is asked for is read: each chunk is checked when it is, and the
+    checksum over all data where all of it is read (`check`, `digest`) or a chunk has none of its
+    own. A URL that lacks its end is damaged, as nothing tells whether the server sent all of it.
 
     Attributes:
         path: the file.
@@ -56,8 +59,17 @@ class LogReader:
         *,
         salvage: bool = False,
         cache_bytes: int | None = None,
+        check: Check | None = None,
     ) -> None:
-        """Open a file or URL and walk over its structure; keep `cache_bytes` of decoded chunks.
+        """Open a file or URL.
+
+        Args:
+            path: of the log.
+            salvage: leave out what is damaged.
+            cache_bytes: of decoded chunks that are kept.
+            check: "chunks" believes a summary that accounts for every message; "data" looks at
+                every record of a file and at the checksum over its data, "pass" leaves the latter
+                to `one_pass`. By default "chunks", with `salvage` "data"; of a URL "chunks".
 
         Raises:
             UsageError: it cannot be opened.
@@ -69,24 +81,24 @@ class LogReader:
         self._failed: set[int] = set()
         self._defined = 0
         self._searched = False
-        self._marks_then: list[int] = []
         self._file = open_store(self.path)
         try:
-            by_index = isinstance(self.path, Url)
+            remote = isinstance(self.path, Url)
+            check = check or ("data" if salvage else "chunks")
+            by_index = remote or check == "chunks"
             self._structure = LogStructure(self._file, self._refuse, by_index=by_index)
-            definitions = self._structure.definitions
-            self._chunks = Chunks(self._file, definitions, self._note, cache_bytes)
+            self._data = DataSection(self._file, self._structure, self._refuse_data)
+            known, unproven = self._structure.definitions, self._data.check_unproven
+            self._chunks = Chunks(self._file, known, self._note, cache_bytes, unproven)
             self._settle()
-            if by_index and not (self.complete or salvage):
-                raise LogDamagedError(
-                    f"{self.path}: {self.missing}: the server sends less than the log, or the log "
-                    "was cut (cdmisfa recover saves what is there)"
-                )
-        except MalformedRecord as error:
+            if not self.by_index and check != "pass":
+                self._data.check()
+            if remote and not (self.complete or salvage):
+                raise LogDamagedError(f"{self.path}: {self.missing}: {_SENT_LESS}")
+        except BaseException as error:
             self._file.close()
-            raise LogDamagedError(f"{self.path}: {error}") from None
-        except BaseException:
-            self._file.close()
+            if isinstance(error, MalformedRecord):
+                raise LogDamagedError(f"{self.path}: {error}") from None
             raise
 
     # What the file holds
@@ -153,26 +165,13 @@ class LogReader:
         return self._file.read(attachment.offset, attachment.size)
 
     def digest(self) -> str:
-        """SHA-256 of the file; where only the summary was read, from its data's end on."""
-        sha256, start = hashlib.sha256(), self._structure.data_end if self.by_index else 0
-        for block in self._file.blocks(start, self.size):
-            sha256.update(block)
-        return sha256.hexdigest()
+        """SHA-256 of the file, checked as it is read; of a URL opened by index of its end."""
+        remote = self.by_index and isinstance(self.path, Url)
+        return self._data.sha256(self._structure.data_end if remote else 0)
 
     def confirm(self) -> None:
-        """See that a log behind a URL is still the one that was opened.
-
-        Its beginning, the checksums of its data and summary are asked for again.
-
-        Raises:
-            LogDamagedError: it was replaced while it was read.
-        """
-        if isinstance(self.path, Url) and self.complete:
-            self._file.forget()
-            if self._marks() != self._marks_then:
-                raise LogDamagedError(
-                    f"{self.path}: it was replaced while it was read; begin again"
-                )
+        """See that a log behind a URL was not replaced; see `DataSection.confirm`."""
+        self._data.confirm()
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects."""
@@ -241,6 +240,21 @@ class LogReader:
         for segment, table in in_order(chosen, self.table) if ordered else in_file:
             yield segment, within(table, low, high)
 
+    def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
+        """Give every chunk in file order, None for one that is damaged and left out.
+
+        The file is read once, and the checksum over all of its data is checked at the end.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        with self._chunks.passing() as store:
+            for segment in self.segments:
+                store.pass_to(segment.offset)
+                yield segment, self.table(segment)
+            store.pass_to(self._structure.data_end)
+        self._data.check(store.crc(0, self._structure.data_end))
+
     def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""
         spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
@@ -300,6 +314,7 @@ class LogReader:
         self._failed &= same
         self._defined, self._searched = min(self._defined, kept), False
         self._settle()
+        self._data.check()
         return True
 
     def close(self) -> None:
@@ -341,22 +356,8 @@ class LogReader:
             table = self.table(tail)
             if table is not None and len(table):
                 tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
-        self._check_data_crc()
-        if isinstance(self.path, Url) and self.complete:
-            self._marks_then = self._marks()
 
-    def _marks(self) -> list[int]:
-        """CRCs of what another log would not have: the beginning, and those that it states."""
-        end, last = self._structure.data_end, self.size - FOOTER_BYTES - len(MAGIC)
-        spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, self.size))
-        return [self._file.crc(start, stop) for start, stop in spans]
-
-    def _check_data_crc(self) -> None:
-        structure = self._structure
-        if not structure.data_crc or structure.by_index:
-            return
-        if self._file.crc(0, structure.data_end) == structure.data_crc:
-            return
+    def _refuse_data(self) -> None:
         if not self.salvage:
             self._search()  # an error that names the chunk says more
         self._refuse("data section", "its CRC does not match: damaged")

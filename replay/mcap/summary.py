@@ -25,6 +25,7 @@ from replay.mcap.records import (
     statistics,
 )
 from replay.mcap.segments import Definitions, IndexPart, Refuse, Segment
+from replay.storage.once import Excerpt
 from replay.storage.store import Store
 
 _FIXED = RECORD_HEADER.size + 40
@@ -39,12 +40,14 @@ class Summary:
 
     Attributes:
         begin: place in the file where the data ends.
+        file: the log, with its summary in memory unless that is large.
         read: it is there, and was read to its end.
         chunks: places that it names for chunks, in order.
         indexes: place and bytes of each of its chunk, attachment and metadata indexes.
     """
 
     begin: int
+    file: Store
     read: bool = False
     statistics: Statistics | None = None
     chunks: list[int] = field(default_factory=list)
@@ -72,7 +75,9 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
     if not len(MAGIC) <= begin <= footer_at or (offsets and not begin <= offsets <= footer_at):
         refuse("footer", "it points outside the file")
         return None
-    summary = Summary(begin)
+    if footer_at - begin <= MAX_DEFINITION:
+        file = Excerpt(file, begin, file.size)
+    summary = Summary(begin, file)
     if crc and file.crc(begin, footer_at + FOOTER_BYTES - 4) != crc:
         refuse("summary", "its CRC does not match: damaged")
         return summary
@@ -121,7 +126,7 @@ def definition(file: Store, content: int, length: int) -> bytes:
     return file.read(content, length)
 
 
-def stated_segments(file: Store, summary: Summary, known: set[int]) -> list[Segment] | None:
+def stated_segments(summary: Summary, known: set[int]) -> list[Segment] | None:
     """The chunks that a summary names, in file order, where it defines the `known` channels.
 
     Returns:
@@ -135,7 +140,7 @@ def stated_segments(file: Store, summary: Summary, known: set[int]) -> list[Segm
         return None
     segments: list[Segment] = []
     for content, length in summary.indexes[Opcode.CHUNK_INDEX]:
-        segment = _segment(_index(file, content, length))
+        segment = _segment(_index(summary.file, content, length))
         if segment is None:
             return None
         segments.append(segment)
@@ -155,11 +160,11 @@ def stated_segments(file: Store, summary: Summary, known: set[int]) -> list[Segm
     return segments if accounted else None
 
 
-def stated_spans(file: Store, summary: Summary, opcode: int) -> list[tuple[int, int]]:
+def stated_spans(summary: Summary, opcode: int) -> list[tuple[int, int]]:
     """Where a summary says that attachments or metadata are, as spans [start, stop) of the file."""
     spans = []
     for content, length in summary.indexes[opcode]:
-        fields = _index(file, content, length)
+        fields = _index(summary.file, content, length)
         start, size = fields.integer(8), fields.integer(8)
         if size < RECORD_HEADER.size or start + size > summary.begin:
             raise MalformedRecord("an index points outside the data")

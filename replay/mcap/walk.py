@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_right
+from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
@@ -119,17 +120,19 @@ class LogStructure:
         if summary is None:
             return False
         try:
-            segments = stated_segments(self._file, summary, set(self.definitions.channels))
+            segments = stated_segments(summary, set(self.definitions.channels))
             if segments is None:
                 return False
-            attachments = stated_spans(self._file, summary, Opcode.ATTACHMENT_INDEX)
+            attachments = stated_spans(summary, Opcode.ATTACHMENT_INDEX)
             self._record_at(len(MAGIC), None, Opcode.HEADER)
             self._record_at(summary.begin - DATA_END_BYTES, summary.begin, Opcode.DATA_END)
-            for start, stop in stated_spans(self._file, summary, Opcode.METADATA_INDEX):
+            for start, stop in stated_spans(summary, Opcode.METADATA_INDEX):
                 self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord as error:
-            self._refuse("summary", str(error))
-            self._at, self.data_crc, self.metadata = len(MAGIC), None, []
+            if not isinstance(self._file.path, Path):
+                self._refuse("summary", str(error))  # of a file a walk says more
+            self._at, self.data_crc = len(MAGIC), None
+            self.metadata, self._metadata_bytes = [], 0
             return False
         self.segments, self._attachment_spans = segments, attachments
         self.by_index = self.complete = True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -58,6 +57,7 @@ class ChannelRows:
         reader: the file.
         channel: the channel.
         facts: the clock of the recording.
+        passing: number its messages as `pass_over` is told of the chunks.
 
     Attributes:
         spans: the frames that are there; one, except where gaps and damage are left out.
@@ -67,7 +67,9 @@ class ChannelRows:
             without `salvage` a frame that is missing.
     """
 
-    def __init__(self, reader: LogReader, channel: Channel, facts: ViewFacts) -> None:
+    def __init__(
+        self, reader: LogReader, channel: Channel, facts: ViewFacts, *, passing: bool = False
+    ) -> None:
         self.channel = channel
         self._reader = reader
         self._facts = facts
@@ -76,7 +78,10 @@ class ChannelRows:
         self._starts = [0]
         self._taken: list[Segment] = []
         self._take_segments()
-        if reader.by_index and not reader.salvage:
+        self._passed = 0
+        if passing:
+            self.spans = self._unbroken(0)
+        elif reader.by_index and not reader.salvage:
             # Each chunk's log times are compared with the summary when it is read.
             self._to_confirm = set(range(len(self._segments)))
             self.spans = self._unbroken(self._starts[-1])
@@ -86,6 +91,17 @@ class ChannelRows:
     def extend(self) -> None:
         """Take in what its recorder has added to the file."""
         self.spans = self._spans_from(self._take_segments())
+
+    def pass_over(self, segment: Segment) -> MessageTable | None:
+        """Number the messages of the next chunk; give them if it is whole and has some."""
+        number = self._passed
+        if number == len(self._segments) or self._segments[number] is not segment:
+            return None
+        self._passed += 1
+        if self._reader.table(segment) is None:
+            return None
+        self._number([self._times(number)], self._starts[number], self.spans)
+        return self._table(number)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
@@ -179,12 +195,6 @@ class ChannelRows:
         row = self._row(frame)
         number = bisect.bisect_right(self._starts, row) - 1
         return self._table(number).payload(row - self._starts[number])
-
-    def tables(self) -> Iterator[tuple[Segment, MessageTable]]:
-        """The messages chunk by chunk, without what is damaged where that is left out."""
-        for segment in self._segments:
-            if self._reader.table(segment) is not None:
-                yield segment, own_messages(self._reader, segment, self.channel)
 
     def pieces(self, frame: int, count: int, which: int) -> list[Piece]:
         """The chunks that hold the messages of `count` frames from one on, of the same span."""

@@ -42,6 +42,7 @@ class RecordedSource(ClockedSource):
             S3 prefix, or URLs.
         loop: begin again at the end instead of stopping there.
         salvage: leave out, in every view, what is damaged in one of them.
+        opened: views that were opened already.
 
     Attributes:
         warnings: what the user should know: files that were cut, frames left out.
@@ -53,6 +54,7 @@ class RecordedSource(ClockedSource):
         *,
         loop: bool = False,
         salvage: bool = False,
+        opened: Iterable[ViewFile] = (),
     ) -> None:
         """Open every view and check that they belong together.
 
@@ -64,14 +66,16 @@ class RecordedSource(ClockedSource):
         self._paths = paths
         self._files = [path for path in log_files(paths) if not _only_begun(path)]
         self._hashes: list[dict[str, Any]] | None = None
-        opened: list[ViewFile] = []
+        known = {view.path: view for view in opened}
+        views: list[ViewFile] = []
         try:
             for path in self._files:
-                opened.append(ViewFile(path, salvage=salvage, cache_bytes=CACHE_BYTES))
-            self._views = _arrange(opened, salvage=salvage)
+                view = known.get(path)
+                views.append(view or ViewFile(path, salvage=salvage, cache_bytes=CACHE_BYTES))
+            self._views = _arrange(views, salvage=salvage)
             self._set_clock()
         except BaseException:
-            for view in opened:
+            for view in views:
                 view.close()
             raise
         self._t = self._first

@@ -28,6 +28,7 @@ from recorder.log.messages import (
 )
 from recorder.log.viewfacts import ViewFacts
 from replay.mcap.reader import LogReader
+from replay.mcap.segments import Segment
 from replay.recordings.channel_rows import ChannelRows
 from replay.recordings.scanner import ChunkScanner, RowLayout
 from replay.storage.location import Location
@@ -48,20 +49,33 @@ class ViewFile:
     """
 
     def __init__(
-        self, path: Location, *, salvage: bool = False, cache_bytes: int | None = None
+        self,
+        path: Location,
+        *,
+        salvage: bool = False,
+        cache_bytes: int | None = None,
+        passing: LogReader | None = None,
     ) -> None:
         """Open one view's file and check the times of its frames.
+
+        Args:
+            path: the file.
+            salvage: leave out what is damaged.
+            cache_bytes: of decoded chunks that are kept.
+            passing: its reader, where `pass_over` is told of the chunks that this gives.
 
         Raises:
             LogDamagedError: it is damaged, or no view of a recording.
         """
         self.path = path
         self._scanner: ChunkScanner | None = None
-        self.reader = LogReader(path, salvage=salvage, cache_bytes=cache_bytes)
+        self._passing = passing is not None
+        self.reader = passing or LogReader(path, salvage=salvage, cache_bytes=cache_bytes)
         try:
             self._open()
         except BaseException:
-            self.reader.close()
+            if passing is None:
+                self.reader.close()
             raise
 
     def _open(self) -> None:
@@ -78,11 +92,13 @@ class ViewFile:
         self._channels = [self._channel(view_topic(facts.view), schema)]
         if facts.truth:
             self._channels.append(self._channel(TRUTH_TOPIC, TRUTH_SCHEMA))
+        self._layouts: list[RowLayout] = []
         self._find_ranges()
 
     def _find_ranges(self) -> None:
         self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))
-        self._layouts = self._find_layouts() if self.ranges else []
+        if self.ranges and not self._passing:
+            self._layouts = self._find_layouts(self._channels[0].payload(self.ranges[0][0]))
 
     def refresh(self, path: Path) -> None:
         """Take in the frames that a recorder wrote since; it may have renamed the file."""
@@ -122,21 +138,28 @@ class ViewFile:
             out = outs[piece.which][piece.at : piece.at + piece.n]
             self._scanner.copy(chunk, piece.which, piece.low, out)
 
-    def check(self) -> None:
-        """Look at how every frame and its ground truth are laid out, and compile nothing for it.
+    def pass_over(self, segment: Segment) -> None:
+        """Look at every frame of the next chunk of the file, and compile nothing for it.
 
         Raises:
-            LogDamagedError: a message in it is damaged, or a chunk that was not passed over.
+            LogDamagedError: a time is no frame's, or a message is laid out unlike the others.
         """
-        for rows, layout in zip(self._channels, self._layouts, strict=False):
-            for segment, table in rows.tables():
+        found = [rows.pass_over(segment) for rows in self._channels]
+        if not self._layouts and found[0] is not None:
+            self._layouts = self._find_layouts(found[0].payload(0))
+        for layout, table in zip(self._layouts, found, strict=False):
+            if table is not None:
                 layout.checked_ends(self.path, segment, table)
+
+    def passed(self) -> None:
+        """Hear that there is no further chunk: `ranges` are known."""
+        self._find_ranges()
 
     def close(self) -> None:
         self.reader.close()
 
-    def _find_layouts(self) -> list[RowLayout]:
-        payload = self._find_payload()
+    def _find_layouts(self, first: bytes) -> list[RowLayout]:
+        payload = self._find_payload(first)
         place = payload.tail + payload.size
         marks = np.frombuffer(payload.before, np.uint8)
         least = place + len(marks)
@@ -163,13 +186,12 @@ class ViewFile:
         known = self.reader.schemas.get(channels[0].schema_id)
         if known is None or known.name != schema or channels[0].encoding != "protobuf":
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
-        return ChannelRows(self.reader, channels[0], self.facts)
+        return ChannelRows(self.reader, channels[0], self.facts, passing=self._passing)
 
-    def _find_payload(self) -> Payload:
+    def _find_payload(self, first: bytes) -> Payload:
         shape = self.facts.frame_shape
         if not self.facts.spec.images:
             return vector_payload(shape[0])
-        first = self._channels[0].payload(self.ranges[0][0])
         try:
             image = RawImage.FromString(first)
         except DecodeError:

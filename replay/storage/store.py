@@ -20,6 +20,8 @@ OPEN_FILES = 24
 """Files of recordings that are open at once; a recording in parts has thousands."""
 
 _PEEK: Final = 4096
+_PEEK_FAR: Final = 256
+"""Bytes read ahead at a place that is far from the last."""
 
 
 class Store(ABC):
@@ -63,7 +65,8 @@ class Store(ABC):
         """Up to `count` (few) bytes, read ahead for the peeks that follow."""
         at = offset - self._window_at
         if at < 0 or at + count > len(self._window):
-            self._window = self.read(offset, max(count, _PEEK))
+            near = 0 <= at - len(self._window) < _PEEK_FAR
+            self._window = self.read(offset, max(count, _PEEK if near else _PEEK_FAR))
             self._window_at, at = offset, 0
         return self._window[at : at + count]
 

@@ -1,0 +1,125 @@
+"""How much of a log is read: little to open it, all of it once to verify it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.errors import LogDamagedError
+from recorder.config import RecordConfig
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
+from replay.integrity.verify import check_log
+from replay.mcap.reader import LogReader
+from replay.recordings.source import RecordedSource
+from replay.storage.once import OnePass
+from replay.storage.store import FileStore
+
+FRAMES = 2000
+
+
+@pytest.fixture(scope="module")
+def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of pictures that cannot be compressed, 25 MB."""
+    folder = tmp_path_factory.mktemp("noise")
+    spec = SourceSpec(("left",), (96, 128), "uint8", ("x",), 50.0, 10**18)
+    log = ViewLog(folder, "left", Identity("plain", 0, spec, {}), RecordConfig())
+    frames = np.random.default_rng(0).integers(0, 256, (FRAMES, 96, 128), np.uint8)
+    log.write(Block(0, 0, frames, np.zeros((FRAMES, 1))))
+    log.file.finish()
+    return log.file.path
+
+
+def share_read(path: Path, work: str) -> float:
+    """Bytes that a process reads to do something with a recording, of those it has."""
+    script = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from replay.integrity.info import describe\n"
+        "from replay.integrity.verify import check_log\n"
+        "from replay.recordings.source import RecordedSource\n"
+        "from replay.mcap.reader import LogReader\n"
+        f"def work(path): {work}\n"
+        "def read(): return int(Path('/proc/self/io').read_text().split()[1])\n"
+        "work(sys.argv[2])\n"  # imports what it needs
+        "before = read()\n"
+        "work(sys.argv[1])\n"
+        "print(read() - before)\n"
+    )
+    other = path.with_name("other")
+    if not other.exists():
+        other.mkdir()
+        (other / "left.mcap").write_bytes(path.read_bytes())
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path), str(other / "left.mcap")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return int(done.stdout) / path.stat().st_size
+
+
+@pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="counts what Linux counts")
+@pytest.mark.parametrize(
+    ("work", "most"),
+    [
+        ("LogReader(path).close()", 0.01),
+        ("RecordedSource(path).close()", 0.05),  # looks at one chunk's layout
+        ("RecordedSource(path).describe()", 1.1),
+        ("describe(path)", 1.1),
+        ("check_log(path)", 1.1),
+    ],
+)
+def test_no_byte_is_read_without_need(noise: Path, work: str, most: float) -> None:
+    assert share_read(noise, work) <= most
+
+
+def test_a_damaged_chunk_is_told_when_it_is_reached(noise: Path, tmp_path: Path) -> None:
+    with LogReader(noise) as reader:
+        assert reader.by_index
+        chunk = reader.segments[len(reader.segments) // 2]
+    raw = bytearray(noise.read_bytes())
+    raw[chunk.data_offset + chunk.stored // 2] ^= 4
+    path = tmp_path / "left.mcap"
+    path.write_bytes(raw)
+    whole, source = RecordedSource(noise), RecordedSource(path)
+    before = (chunk.start - source.spec.start_ns) // 20_000_000
+    assert 0 < before < FRAMES - 1
+    assert np.array_equal(source.take(0, before).frames, whole.take(0, before).frames)
+    with pytest.raises(LogDamagedError, match=rf"left\.mcap.*{chunk.start} to {chunk.end}"):
+        source.take(0, 1)
+    with pytest.raises(LogDamagedError, match=rf"left\.mcap.*{chunk.start} to {chunk.end}"):
+        RecordedSource(path).describe()
+    assert any("data section" in problem.where for problem in check_log(path).problems)
+
+
+def test_a_changed_fact_is_found_by_who_reads_all(noise: Path, tmp_path: Path) -> None:
+    path = tmp_path / "left.mcap"
+    path.write_bytes(noise.read_bytes().replace(b"plain", b"plane", 1))
+    assert RecordedSource(path).scene()["scene"] == "plane"
+    with pytest.raises(LogDamagedError, match="data section"):
+        RecordedSource(path).describe()
+    assert not check_log(path).ok
+
+
+def test_a_pass_knows_the_checksum_wherever_reading_went(tmp_path: Path) -> None:
+    data = np.random.default_rng(1).integers(0, 256, 100_000, np.uint8).tobytes()
+    (tmp_path / "file").write_bytes(data)
+    store = FileStore(tmp_path / "file")
+    one_pass = OnePass(store)
+    for place, reads in [(10, [(12, 5), (500, 700)]), (600, [(600, 9), (1100, 50)]), (9, [])]:
+        one_pass.pass_to(place)
+        for at, count in reads:
+            assert one_pass.read(at, count) == data[at : at + count]
+    assert one_pass.read(0, 20) == data[:20]
+    one_pass.pass_to(1120)
+    one_pass.pass_to(90_000)
+    assert one_pass.read(99_990, 50) == data[99_990:]
+    for stop in (90_000, 100_000):
+        one_pass.pass_to(stop)
+        assert one_pass.crc(0, stop) == store.crc(0, stop)
