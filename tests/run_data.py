@@ -133,15 +133,17 @@ def write_run(
     seed: int = 0,
     saves: bool = False,
     learner: Mapping[str, Any] | None = None,
+    source: Mapping[str, Any] | None = None,
     edit: Callable[[BlockSignals], BlockSignals] = lambda signals: signals,
     **options: Any,
 ) -> list[BlockSignals]:
     """Write such a run to a file and return its records.
 
-    Its manifest has the keys `learner.*` of `learner`; `edit` is done to each record before.
+    Its manifest has the keys `learner.*` of `learner`, and `source`; `edit` is done to each record
+    before.
     """
     config = {"learner": {"tau": tau, "delta": DELTA, **(learner or {})}}
-    manifest = {"config": config, "seed": seed, "source": {"kind": "test"}}
+    manifest = {"config": config, "seed": seed, "source": source or {"kind": "test"}}
     writer = RunWriter(path, spec, manifest, **options)
     phi_size = int(np.prod(spec.frame_shape))
     records = []

@@ -63,6 +63,7 @@ FORBIDDEN = {
     "replay.storage": ("replay.mcap.records", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.images", "pybullet"),
     "replay.view.layouts": ("replay.viewer.window", "replay.export.figures", "recorder.recording"),
+    "replay.view.world": ("replay.viewer.window", "replay.export.figures", "recorder.world.scenes"),
     "replay.viewer": ("cdmisfa.experiments.runs", "recorder.world.icub.world"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""

@@ -57,14 +57,14 @@ def test_the_viewer_shows_the_layout_without_a_complaint(tmp_path):
         for block in (blocks[3], next(b for b in blocks if b.stream != blocks[3].stream)):
             opened.go_to(block.t)
             grey = int(block.frames[0].min())
-            view = views["What it sees"].view_id
+            view = views["What it sees now"].view_id
             opened.ask(lambda client, v=view, g=grey: shows(client, v, g))
 
 
 BY_PROGRESS = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
 NAMED = {
-    "2.0": (6, 25, ("R and Q, every 10 iterations", "What was done: the last 50 blocks", "Events")),
-    "progress": (4, 18, ("φ 3: right", "Output y on new frames, from least to most", "Events")),
+    "2.0": (7, 30, ("R and Q, every 10 iterations", "What was done: the last 50 blocks", "Events")),
+    "progress": (5, 23, ("φ 3: right", "Output y on new frames, from least to most", "Events")),
 }
 
 
@@ -175,7 +175,9 @@ def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path
 
 def test_tabs_and_sizes_that_are_not_there_are_refused(tmp_path):
     write_run(tmp_path / "run.mcap", VECTOR, 3)
-    with pytest.raises(UsageError, match="no tab 'Bridge': there are Overview, Abstraction, Gate"):
+    with pytest.raises(
+        UsageError, match="no tab 'Bridge': there are World, Overview, Abstraction, Gate"
+    ):
         build_view(tmp_path, tmp_path / "run.rrd", tab="Bridge")
     build_view(tmp_path, tmp_path / "run.rrd", tab="MODULES")
     with (

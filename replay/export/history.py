@@ -2,144 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.runs.columns import SignalColumns
-from replay.runs.log import TRUTH_TOPIC, WATCHED_TOPIC, RunHeader
+from replay.following import Output, read_outputs
+from replay.runs.log import WATCHED_TOPIC, RunHeader
 from replay.runs.outline import Outline, read_outline
-from replay.runs.stretches import Frames, read_columns, read_stretches
+from replay.runs.stretches import read_columns, read_stretches
 
 Float = NDArray[np.float64]
-
-KEPT = 20_000
-"""Last frames of each module's output that are kept."""
-
-BETTER = 0.03
-"""By how much a function must be followed better than a simpler one."""
-
-FREQUENCIES = 12
-"""Sines of an angle that are tried."""
 
 STRIP = 8
 """Pictures of each module."""
 
-LAST_BLOCKS = 40
-"""Blocks before the save whose output is shown with what the frozen module says later."""
-
 SHOWN = 6
 """Streams and modules that are drawn: the most watched, the first learned."""
 
-
 LANES = 40
 """Streams whose states are drawn: the most watched."""
-
-
-@dataclass(frozen=True, slots=True)
-class Output:
-    """What a frozen module says about its own stream.
-
-    Attributes:
-        t: (n,) frames at which that stream was watched after the save.
-        y: (n,) its first output there.
-        truth: (n, D) what the world knows at these frames; D may be 0.
-    """
-
-    module: int
-    stream: int
-    t: NDArray[np.int64]
-    y: Float
-    truth: Float
-
-    def follows(self, names: Sequence[str]) -> Following | None:
-        """What the world knows that the output follows most; None where it knows nothing.
-
-        Args:
-            names: of the columns of truth.
-        """
-        found = [
-            fit
-            for column, name in enumerate(names[: self.truth.shape[1]])
-            if (fit := follow(self.truth[:, column], self.y, column, name)) is not None
-        ]
-        return max(found, key=lambda fit: fit.r, default=None)
-
-
-@dataclass(frozen=True, slots=True)
-class Following:
-    """A function of something true that an output follows.
-
-    Attributes:
-        column: of the truth.
-        function: in words, of the truth's name.
-        r: correlation of the output with the function, 0 to 1.
-        weights: (K,) of the terms.
-        terms: (n,) truth -> (n, K).
-    """
-
-    column: int
-    function: str
-    r: float
-    weights: Float
-    terms: Callable[[Float], Float]
-
-    def __call__(self, truth: Float) -> Float:
-        """The function's values."""
-        return np.asarray(self.terms(truth) @ self.weights)
-
-
-def follow(truth: Float, y: Float, column: int, name: str) -> Following | None:
-    """The simplest function of a true quantity that an output follows.
-
-    Of an angle that goes round these are its sines, of all others a straight line or, where
-    that is better by `BETTER`, a parabola: a slow feature need not be the quantity itself.
-
-    Args:
-        truth: (n,) its values.
-        y: (n,) the output.
-        column: number of the quantity.
-        name: its name.
-    """
-    if len(truth) < 3 or np.std(truth) == 0 or np.std(y) == 0:
-        return None
-    powers = range(1, min(len(np.unique(truth)), 3))
-    tried = [
-        (name if k == 1 else f"a parabola of {name}", partial(_powers, degree=k)) for k in powers
-    ]
-    if _goes_round(truth):
-        tried += [
-            (f"sin({name if k == 1 else f'{k} {name}'} + c)", partial(_sines, frequency=k))
-            for k in range(1, FREQUENCIES + 1)
-        ]
-    best: Following | None = None
-    for function, terms in tried:
-        table = terms(truth)
-        weights: Float = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
-        fit = table @ weights
-        r = float(np.corrcoef(fit, y)[0, 1]) if np.std(fit) > 0 else 0.0
-        if best is None or r > best.r + BETTER:
-            best = Following(column, function, r, weights, terms)
-    return best
-
-
-def _powers(x: Float, degree: int) -> Float:
-    return np.stack([x**k for k in range(degree + 1)], axis=1)
-
-
-def _sines(x: Float, frequency: int) -> Float:
-    return np.stack([np.ones_like(x), np.sin(frequency * x), np.cos(frequency * x)], axis=1)
-
-
-def _goes_round(x: Float) -> bool:
-    """Whether these are angles of all around a circle, in radians."""
-    turn = 2 * np.pi
-    return bool(x.min() >= 0 and x.max() <= turn and np.ptp(x) > 0.9 * turn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,10 +79,6 @@ def read_history(path: Path) -> History:
     stay = np.full((n, len(shown)), np.nan)
     lanes, known_by = outline.streams(LANES), np.empty(n, dtype=np.int64)
     state = np.empty((n, len(lanes)), dtype=np.int64)
-    heard = [
-        _OutputCollector(save.module, save.stream, alone=header.by_progress)
-        for save in outline.saved[:SHOWN]
-    ]
     at = 0
     for columns in read_columns(path, header):
         rows = slice(at, at := at + len(columns))
@@ -206,10 +87,7 @@ def read_history(path: Path) -> History:
         state[rows], known_by[rows] = columns["state"][:, lanes], columns["known_by"]
         if columns["R"].size:
             stay[rows] = columns["R"][:, shown, 0, shown]
-        for module in heard:
-            module.add(columns)
-    truth = _truth(path, header) if header.spec.truth else None
-    outputs = tuple(module.output(truth) for module in heard if module.blocks)
+    outputs = read_outputs(path, outline, SHOWN)
     lines = outline.lines
     untested = np.isnan(lines["tested"])
     return History(
@@ -229,55 +107,6 @@ def read_history(path: Path) -> History:
         outputs=outputs,
         pictures=_pictures(path, header, outputs) if header.spec.images else (),
     )
-
-
-class _OutputCollector:
-    """What a module says whenever its own stream is watched; at its save, what it last said.
-
-    Args:
-        module: its number.
-        stream: its own.
-        alone: it was learned from its own stream alone, while others were learned from theirs.
-    """
-
-    def __init__(self, module: int, stream: int, *, alone: bool) -> None:
-        self._module, self._stream, self._alone = module, stream, alone
-        self.blocks: list[tuple[int, Float]] = []
-
-    def add(self, columns: SignalColumns) -> None:
-        own, frozen = columns["stream"] == self._stream, columns["y_frozen"]
-        if frozen.shape[1] >= self._module:
-            said = frozen[own, self._module - 1, :, 0]
-            self.blocks += zip(columns.frames[own].tolist(), said, strict=True)
-            return
-        # Before it is frozen the abstraction still changes: only its last blocks count.
-        own &= self._alone | (columns["module"] == self._module)
-        own &= np.isfinite(columns["y"]).all(axis=(1, 2))
-        self.blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
-        del self.blocks[: -LAST_BLOCKS - int(columns["saved"][own].any())]
-
-    def output(self, truth: Frames | None) -> Output:
-        """What was heard last, with what the world knew then."""
-        blocks = self.blocks[-max(KEPT // max(len(self.blocks[0][1]), 1), 1) :]
-        t = np.concatenate([start + np.arange(len(y)) for start, y in blocks])
-        known = np.empty((len(t), 0))
-        if truth is not None:
-            frames, values = truth
-            at = np.searchsorted(frames, t)
-            if at.max() < len(frames) and (frames[at] == t).all():
-                known = values[at]
-        y = np.concatenate([y for _, y in blocks])
-        return Output(module=self._module, stream=self._stream, t=t, y=y, truth=known)
-
-
-def _truth(path: Path, header: RunHeader) -> Frames | None:
-    """What the world knew at each frame that was watched."""
-    stretches = read_stretches(path, header, topics=(TRUTH_TOPIC,))
-    pieces = [piece for stretch in stretches for piece in stretch.truth]
-    if not pieces:
-        return None
-    frames, values = zip(*pieces, strict=True)
-    return np.concatenate(frames), np.concatenate(values)
 
 
 def _pictures(path: Path, header: RunHeader, outputs: Sequence[Output]) -> tuple[Strip, ...]:

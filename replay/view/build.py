@@ -27,6 +27,7 @@ from replay.view.properties import APPLICATION, identity, properties_of, propert
 from replay.view.recording import write_recording, write_unwatched
 from replay.view.run import RunView
 from replay.view.summary import summary_text
+from replay.view.world.first import FirstTab
 
 FLUSH_SECONDS = 60.0
 
@@ -132,11 +133,15 @@ def _write_run(
     if len(streams) > MOST_STREAMS:  # which are watched most is known at the end only
         streams = read_outline(log).streams(MOST_STREAMS)
     tally, view = Tally(header), RunView(recording, header, streams, every)
+    world = FirstTab(recording, header, log, streams, every, all_views)
+    for note in world.notes:
+        view.event(0, 0, note, "WARN")
     events: list[str] = []
     for stretch in read_stretches(log, header, every=every):
         for columns in stretch.signals:
             tally.add(columns)
         view.take(stretch)
+        world.take(stretch)
         events += [event.text for event in stretch.events]
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
@@ -145,8 +150,9 @@ def _write_run(
     text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, log, all_views, outline, every)
+    first = world.finish(outline)
     recording.send_blueprint(
-        run_layout(outline, all_views=all_views is not None, head=head, tab=tab)
+        run_layout(outline, first=first, all_views=all_views is not None, head=head, tab=tab)
     )
 
 

@@ -17,9 +17,9 @@ POWERS_OF_TEN = "as powers of ten"
 R_STAY = "/decision/R_stay/**"
 
 
-def paper_layout(panels: Panels) -> rrb.Blueprint:
+def paper_layout(panels: Panels) -> list[rrb.Container]:
     """The tabs of a run of CD-MISFA."""
-    return panels.tabs(_overview(panels), _abstraction(panels), _gate(panels), _decision(panels))
+    return [_overview(panels), _abstraction(panels), _gate(panels), _decision(panels)]
 
 
 def feels(panels: Panels) -> list[rrb.View]:

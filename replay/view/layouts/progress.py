@@ -19,9 +19,9 @@ MOST_WEIGHTS = 3
 """Modules whose weights stand beside one another."""
 
 
-def progress_layout(panels: Panels) -> rrb.Blueprint:
+def progress_layout(panels: Panels) -> list[rrb.Container]:
     """The tabs of a run of the progress learner."""
-    return panels.tabs(_overview(panels), _candidate(panels))
+    return [_overview(panels), _candidate(panels)]
 
 
 def _overview(panels: Panels) -> rrb.Container:

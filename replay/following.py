@@ -1,0 +1,257 @@
+"""What of the world each module of a run follows: the same for figures and for the view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.runs.columns import SignalColumns
+from replay.runs.folders import MODULES_FILE, run_log
+from replay.runs.log import TRUTH_TOPIC, WATCHED_TOPIC, RunHeader
+from replay.runs.modules import load_modules
+from replay.runs.outline import Outline
+from replay.runs.stretches import Frames, read_columns, read_stretches
+
+Float = NDArray[np.float64]
+
+KEPT = 20_000
+"""Last frames of each module's output that are fitted."""
+
+BETTER = 0.03
+"""By how much a function must be followed better than a simpler one."""
+
+FREQUENCIES = 12
+"""Sines of an angle that are tried."""
+
+LAST_BLOCKS = 40
+"""Blocks before the save whose output is shown with what the frozen module says later."""
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """What a frozen module says about its own stream.
+
+    Attributes:
+        t: (n,) frames at which that stream was watched after the save.
+        y: (n,) its first output there.
+        truth: (n, D) what the world knows at these frames; D may be 0.
+        angles: columns of truth that go round in the run; None: those that do at these frames.
+    """
+
+    module: int
+    stream: int
+    t: NDArray[np.int64]
+    y: Float
+    truth: Float
+    angles: tuple[int, ...] | None = None
+
+    def follows(self, names: Sequence[str]) -> Following | None:
+        """What the world knows that the output follows most; None where it knows nothing.
+
+        Of a long output the last `KEPT` frames count.
+
+        Args:
+            names: of the columns of truth.
+        """
+        truth, y = self.truth[-KEPT:], self.y[-KEPT:]
+        round_ = _that_go_round(truth) if self.angles is None else self.angles
+        found = [
+            fit
+            for column, name in enumerate(names[: truth.shape[1]])
+            if (fit := follow(truth[:, column], y, column, name, angle=column in round_))
+        ]
+        return max(found, key=lambda fit: fit.r, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Following:
+    """A function of something true that an output follows.
+
+    Attributes:
+        column: of the truth.
+        function: in words, of the truth's name.
+        r: correlation of the output with the function, 0 to 1.
+        weights: (K,) of the terms.
+        terms: (n,) truth -> (n, K).
+    """
+
+    column: int
+    function: str
+    r: float
+    weights: Float
+    terms: Callable[[Float], Float]
+
+    def __call__(self, truth: Float) -> Float:
+        """The function's values."""
+        return np.asarray(self.terms(truth) @ self.weights)
+
+
+def follow(truth: Float, y: Float, column: int, name: str, *, angle: bool) -> Following | None:
+    """The simplest function of a true quantity that an output follows.
+
+    Of an angle these are its sines, of all others a straight line or, where
+    that is better by `BETTER`, a parabola: a slow feature need not be the quantity itself.
+
+    Args:
+        truth: (n,) its values.
+        y: (n,) the output.
+        column: number of the quantity.
+        name: its name.
+        angle: it is one that goes round.
+    """
+    if len(truth) < 3 or np.std(truth) == 0 or np.std(y) == 0:
+        return None
+    powers = range(1, min(len(np.unique(truth)), 3))
+    tried = [
+        (name if k == 1 else f"a parabola of {name}", partial(_powers, degree=k)) for k in powers
+    ]
+    if angle:
+        tried += [
+            (f"sin({name if k == 1 else f'{k} {name}'} + c)", partial(_sines, frequency=k))
+            for k in range(1, FREQUENCIES + 1)
+        ]
+    best: Following | None = None
+    for function, terms in tried:
+        table = terms(truth)
+        weights: Float = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
+        fit = table @ weights
+        r = float(np.corrcoef(fit, y)[0, 1]) if np.std(fit) > 0 else 0.0
+        if best is None or r > best.r + BETTER:
+            best = Following(column, function, r, weights, terms)
+    return best
+
+
+def _powers(x: Float, degree: int) -> Float:
+    return np.stack([x**k for k in range(degree + 1)], axis=1)
+
+
+def _sines(x: Float, frequency: int) -> Float:
+    return np.stack([np.ones_like(x), np.sin(frequency * x), np.cos(frequency * x)], axis=1)
+
+
+def _that_go_round(truth: Float) -> tuple[int, ...]:
+    """Columns of (n, D) truth that are angles of all around a circle, in radians."""
+    if not len(truth):
+        return ()
+    turn = 2 * np.pi
+    low, high = truth.min(axis=0), truth.max(axis=0)
+    return tuple(np.flatnonzero((low >= 0) & (high <= turn) & (high - low > 0.9 * turn)).tolist())
+
+
+def read_outputs(
+    path: Path, outline: Outline, modules: int, most: int = KEPT
+) -> tuple[Output, ...]:
+    """What the first modules of a run say about their own streams; see `read_stretches`.
+
+    Of a module whose stream was not watched any more after its save it is what the module says of
+    its last frames before, where it was kept; otherwise what the abstraction said of them while
+    it was still changing.
+
+    Args:
+        path: of the run.
+        outline: the run in short.
+        modules: how many, at most.
+        most: last frames of each.
+    """
+    header = outline.header
+    heard = [
+        _OutputCollector(save.module, save.stream, alone=header.by_progress)
+        for save in outline.saved[:modules]
+    ]
+    for columns in read_columns(path, header) if heard else ():
+        for module in heard:
+            module.add(columns)
+    truth = read_truth(path, header) if heard else None
+    spoken = {module.number: module.said(most) for module in heard if module.blocks}
+    silent = {m.number: spoken[m.number][0] for m in heard if m.blocks and m.is_silent}
+    spoken |= _of_kept_modules(path, header, silent)
+    angles = _that_go_round(truth[1]) if truth is not None else None
+    return tuple(
+        Output(module.number, module.stream, t, y, _known_at(t, truth), angles)
+        for module in heard
+        for t, y in [spoken.get(module.number, (np.empty(0, np.int64), np.empty(0)))]
+        if len(t)
+    )
+
+
+def _of_kept_modules(
+    path: Path, header: RunHeader, silent: Mapping[int, NDArray[np.int64]]
+) -> dict[int, Frames]:
+    """What modules that were kept say of frames that the log holds."""
+    log = run_log(path)
+    if not silent or not (log.parent / MODULES_FILE).is_file():
+        return {}
+    kept = {m.index: m for m in load_modules(log.parent) if m.index in silent}
+    found: dict[int, list[Frames]] = {number: [] for number in kept}
+    for stretch in read_stretches(path, header, topics=(WATCHED_TOPIC,)):
+        for frames, shown in stretch.watched:
+            for number, module in kept.items():
+                own = np.isin(frames, silent[number])
+                if own.any():
+                    found[number].append((frames[own], module.transform(shown[own])[:, 0]))
+    return {
+        number: (np.concatenate([t for t, _ in parts]), np.concatenate([y for _, y in parts]))
+        for number, parts in found.items()
+        if parts
+    }
+
+
+def _known_at(t: NDArray[np.int64], truth: Frames | None) -> Float:
+    """(n, D) what the world knew at n frames; D is 0 where it is not known of all of them."""
+    if truth is not None and len(t):
+        frames, values = truth
+        at = np.searchsorted(frames, t)
+        if at.max() < len(frames) and (frames[at] == t).all():
+            return values[at]
+    return np.empty((len(t), 0))
+
+
+def read_truth(path: Path, header: RunHeader) -> Frames | None:
+    """What the world knew at each frame that was watched; None where it knows nothing."""
+    if not header.spec.truth:
+        return None
+    stretches = read_stretches(path, header, topics=(TRUTH_TOPIC,))
+    pieces = [piece for stretch in stretches for piece in stretch.truth]
+    if not pieces:
+        return None
+    frames, values = zip(*pieces, strict=True)
+    return np.concatenate(frames), np.concatenate(values)
+
+
+class _OutputCollector:
+    """What a module says whenever its own stream is watched; at its save, what it last said.
+
+    Args:
+        module: its number.
+        stream: its own.
+        alone: it was learned from its own stream alone, while others were learned from theirs.
+    """
+
+    def __init__(self, module: int, stream: int, *, alone: bool) -> None:
+        self.number, self.stream, self._alone = module, stream, alone
+        self.is_silent = True
+        self.blocks: list[tuple[int, Float]] = []
+
+    def add(self, columns: SignalColumns) -> None:
+        own, frozen = columns["stream"] == self.stream, columns["y_frozen"]
+        if frozen.shape[1] >= self.number:
+            said = frozen[own, self.number - 1, :, 0]
+            self.is_silent &= not own.any()
+            self.blocks += zip(columns.frames[own].tolist(), said, strict=True)
+            return
+        # Before it is frozen the abstraction still changes: only its last blocks count.
+        own &= self._alone | (columns["module"] == self.number)
+        own &= np.isfinite(columns["y"]).all(axis=(1, 2))
+        self.blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
+        del self.blocks[: -LAST_BLOCKS - int(columns["saved"][own].any())]
+
+    def said(self, most: int) -> Frames:
+        """The last `most` frames that were heard, and the output at each."""
+        blocks = self.blocks[-max(most // max(len(self.blocks[0][1]), 1), 1) :]
+        t = np.concatenate([start + np.arange(len(y)) for start, y in blocks])
+        return t, np.concatenate([y for _, y in blocks])

@@ -1,0 +1,100 @@
+"""Which world a run or a recording was in, as far as the logs that are there say it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
+from recorder.log.viewlog import CONFIG_NAME
+from replay.mcap.reader import LogReader
+from replay.recordings.poses import head_poses
+from replay.runs.log import RunHeader
+from replay.storage.listing import log_files
+
+PRESET = (
+    "the recording that it learned from is not where it was: the table, the eyes and the sizes of "
+    "the objects are those of the scene's preset"
+)
+
+
+def world_of_run(
+    header: RunHeader, log: Path, recording: Path | None
+) -> tuple[Scenery | None, str | None]:
+    """What stood where in a run, and what is not sure about it.
+
+    Args:
+        header: of its log.
+        log: the file.
+        recording: which it learned from, where that is known.
+
+    Returns:
+        No world where the run was in none that is described here.
+    """
+    source = _table(header.manifest.get("source"))
+    if source.get("kind") == KIND:
+        return _told(_table(source.get("scene")))
+    if source.get("scene") != KIND:
+        return None, None
+    for place in _places(header, log, recording):
+        with contextlib.suppress(CdmisfaError, OSError):
+            found = world_of_recording(place, sha256=str(source.get("config_sha256")))
+            if found is not None:
+                return found, None
+    scenery, _ = _told(_table(_table(header.manifest.get("config")).get("scene")))
+    return scenery, PRESET if scenery is not None else None
+
+
+def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
+    """What stood where in a recording.
+
+    Args:
+        path: of the recording.
+        sha256: the checksum that its configuration must have.
+
+    Returns:
+        None of other scenes and recordings.
+
+    Raises:
+        UsageError: there is no such recording.
+        LogDamagedError: it cannot be read.
+    """
+    file = log_files(path)[0]
+    with LogReader(file) as reader:
+        own = [entry for entry in reader.attachments if entry.name == CONFIG_NAME]
+        data = bytes(reader.attachment_data(own[0])) if own else b"{}"
+    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
+        return None
+    try:
+        config = _table(_table(json.loads(data)).get("scene"))
+    except (ValueError, RecursionError) as error:
+        raise LogDamagedError(f"{file}: its {CONFIG_NAME} is broken ({error})") from error
+    poses = head_poses(path)
+    return scenery_of(config, next((p.position for p in poses.values()), NECK))
+
+
+def _places(header: RunHeader, log: Path, recording: Path | None) -> Iterator[Path]:
+    """Where the recording may be that a run learned from."""
+    if recording is not None:
+        yield recording
+    named = _table(header.manifest.get("command")).get("source")
+    for name in named if isinstance(named, list) else []:
+        with contextlib.suppress(OSError, ValueError):
+            if (place := log.parent / str(name)).exists():
+                yield place
+
+
+def _told(config: Mapping[str, Any]) -> tuple[Scenery | None, str | None]:
+    try:
+        return scenery_of(config), None
+    except LogDamagedError as error:
+        return None, str(error)
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}

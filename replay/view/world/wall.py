@@ -1,0 +1,158 @@
+"""The streams of a run as a wall of pictures: what each showed last, and what became of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from cdmisfa.core.signals import STATES
+from replay.palette import colour, packed_all
+from replay.runs.columns import SignalColumns
+from replay.runs.log import RunHeader
+from replay.runs.stretches import Stretch
+from replay.view.columns import ImageColumn, time_columns
+from replay.view.labels import label, part
+
+WALL = "wall"
+FRAME = f"{WALL}/frame"
+
+SHAPE = 1.7
+"""How much wider than high the wall is, as near as whole pictures allow."""
+
+ROOM, BETWEEN = 0.3, 0.06
+"""Room below a picture for its words, and between two, in heights of a picture."""
+
+
+class WallView:
+    """Writes the streams of a run as pictures on a wall.
+
+    Each shows the last picture of the last block in which its stream was watched. The stream that
+    is watched is framed.
+
+    Args:
+        recording: where they go.
+        header: of the run's log.
+        streams: those that are shown.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, header: RunHeader, streams: Sequence[int]
+    ) -> None:
+        self._recording, self._spec, self._streams = recording, header.spec, list(streams)
+        self._by_progress = header.by_progress
+        height, width = self._spec.frame_shape
+        self._places = places(len(self._streams), width, height)
+        self._pictures: dict[int, ImageColumn] = {}
+        self._waiting: dict[int, tuple[int, NDArray[Any]]] = {}
+        self._watched: dict[int, int] = {}
+        self._last, self._said = -1, dict.fromkeys(self._streams, "")
+        for s, (x, y) in zip(self._streams, self._places, strict=True):
+            path = f"{WALL}/{part(self._spec.streams, s)}"
+            recording.log(path, rr.Transform3D(translation=[x, y, 0.0]), static=True)
+            self._pictures[s] = ImageColumn(recording, self._spec, path)
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Ranges of x and y that hold the wall."""
+        height, width = self._spec.frame_shape
+        x, y = (max(place[i] for place in self._places) for i in (0, 1))
+        margin = BETWEEN * height
+        return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
+
+    def take(self, stretch: Stretch) -> None:
+        """Take what a log holds of some iterations."""
+        for columns in stretch.signals:
+            self._watched |= zip(
+                columns.iterations.tolist(), columns["stream"].tolist(), strict=True
+            )
+            self._frame(columns)
+            self._say(columns)
+        tau = max((columns.tau for columns in stretch.signals), default=1)
+        for frames, images in stretch.watched:
+            blocks = frames // tau
+            ends = np.flatnonzero(np.diff(blocks, append=blocks[-1] + 1))
+            self._waiting |= {int(blocks[i]): (int(frames[i]), images[i]) for i in ends}
+        for block in [b for b in self._waiting if b in self._watched]:
+            t, image = self._waiting.pop(block)
+            if (column := self._pictures.get(self._watched[block])) is not None:
+                column.add(np.array([t]), block, image[None])
+        newest = max(self._watched, default=0)
+        self._watched = {b: s for b, s in self._watched.items() if b >= newest}
+
+    def flush(self) -> None:
+        """Hand over what waits."""
+        for column in self._pictures.values():
+            column.flush()
+
+    def _frame(self, columns: SignalColumns) -> None:
+        """Put the frame around what is watched."""
+        streams = columns["stream"].astype(np.int64)
+        turns = np.flatnonzero(np.diff(streams, prepend=self._last))
+        self._last = int(streams[-1])
+        if not len(turns):
+            return
+        height, width = self._spec.frame_shape
+        place = dict(zip(self._streams, self._places, strict=True))
+        watched = streams[turns].tolist()
+        boxes = rr.Boxes2D.columns(  # of a stream that is not shown the frame has no size
+            half_sizes=[(width / 2, height / 2) if s in place else (0.0, 0.0) for s in watched],
+            centers=[
+                (place[s][0] + width / 2, place[s][1] + height / 2) if s in place else (0.0, 0.0)
+                for s in watched
+            ],
+            colors=packed_all([colour(s) for s in watched]),
+            radii=[height / 80] * len(watched),
+        )
+        times = time_columns(self._spec, columns.frames[turns], columns.iterations[turns])
+        self._recording.send_columns(FRAME, times, boxes)
+
+    def _say(self, columns: SignalColumns) -> None:
+        """Write below each picture its stream's name and what became of it."""
+        height, width = self._spec.frame_shape
+        for s in self._streams:
+            rows, texts = [], []
+            for i, text in self._states(columns, s):
+                if text != self._said[s]:
+                    self._said[s] = text
+                    rows.append(i)
+                    texts.append(text)
+            if not rows:
+                continue
+            path = f"{WALL}/{part(self._spec.streams, s)}/state"
+            words = rr.Points2D.columns(
+                positions=[(width / 2, (1 + ROOM / 2) * height)] * len(rows),
+                labels=texts,
+                colors=packed_all([colour(s)] * len(rows)),
+                radii=[0.0] * len(rows),
+                show_labels=[True] * len(rows),
+            )
+            times = time_columns(self._spec, columns.frames[rows], columns.iterations[rows])
+            self._recording.send_columns(path, times, words)
+
+    def _states(self, columns: SignalColumns, s: int) -> list[tuple[int, str]]:
+        """Where a stream's state may change, and how it is told from there on."""
+        name = label(self._spec.streams[s])
+        if self._by_progress:
+            codes = columns["state"][:, s].astype(np.int64)
+            places = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist()]
+            words = {i: STATES[code].replace("_", " ") for i in places if (code := codes[i]) >= 0}
+            return [(i, f"{name}: {words[i]}" if i in words else name) for i in places]
+        saves = np.flatnonzero(columns["saved"] & (columns["stream"] == s)).tolist()
+        learned = [(i, f"{name}: module {int(columns['module'][i])}") for i in saves]
+        return learned if self._said[s] else [(0, name), *learned]
+
+
+def places(count: int, width: int, height: int) -> list[tuple[float, float]]:
+    """Where on a wall so many pictures of a size hang, in rows: x and y of their corners."""
+    across, down = width + BETWEEN * height, (1 + ROOM) * height
+
+    def badness(columns: int) -> float:
+        return abs(math.log(columns * across / (math.ceil(count / columns) * down) / SHAPE))
+
+    columns = min(range(1, count + 1), key=badness)
+    return [(i % columns * across, i // columns * down) for i in range(count)]

@@ -1,0 +1,233 @@
+"""The first tab: the robot and the objects where they were, what was learned, or the streams."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from run_data import IMAGE, VECTOR, write_run
+from test_view import rows_of, scalars
+
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.config import as_table
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import STATES
+from recorder.log.scenery import NECK, scenery_of, turned
+from recorder.world.icub.config import IcubConfig
+from recorder.world.icub.eyes import eye_matrix
+from recorder.world.icub.source import TRUTH
+from replay.following import read_outputs
+from replay.mcap.reader import LogReader
+from replay.palette import colour, packed
+from replay.runs.modules import save_modules
+from replay.runs.outline import read_outline
+from replay.view.build import build_view
+from replay.view.world.known import PRESET, world_of_run
+from replay.view.world.wall import places
+
+CONFIG = as_table(IcubConfig())
+SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)
+LIVE = {"kind": "icub", "seed": 0, "scene": CONFIG}
+ITERATIONS, TAU, EVERY = 12, 40, 20
+
+
+@pytest.fixture(autouse=True)
+def _strict(monkeypatch):
+    monkeypatch.setenv("RERUN_STRICT", "1")
+
+
+def without_models(monkeypatch):
+    """As on a machine without the robots' models; it is also quicker."""
+    monkeypatch.setitem(sys.modules, "icub_models", None)
+
+
+def layout_names(path):
+    """What the views and containers of a layout are called."""
+    reader = RrdReader(str(path))
+    (store,) = reader.blueprints()
+    names = []
+    for chunk in reader.stream(store=store):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith("Blueprint:display_name"):
+                names += [text for row in batch.column(name).to_pylist() for text in row]
+    return names
+
+
+@pytest.mark.parametrize("yaw", [45.0, 0.0, -20.0])
+def test_eyes_stand_where_those_of_the_simulator_stand(yaw):
+    config = IcubConfig(eyes=dataclasses.replace(IcubConfig().eyes, yaw=(yaw,), views=("a",)))
+    (gaze,) = scenery_of(as_table(config)).gazes
+    for side, eye in zip((1, -1), gaze.eyes, strict=True):
+        view = np.array(eye_matrix(config.eyes, np.array(NECK), yaw, side)).reshape(4, 4).T
+        right, up, back = view[:3, :3]
+        np.testing.assert_allclose(-view[:3, :3].T @ view[:3, 3], eye.place, atol=1e-12)
+        for axis, there in (((1, 0, 0), right), ((0, 1, 0), -up), ((0, 0, 1), -back)):
+            np.testing.assert_allclose(turned(eye.turn, axis), there, atol=1e-12)
+        half = math.atan(eye.height / 2 / eye.focal)
+        assert math.degrees(2 * half) == pytest.approx(config.eyes.vertical_fov)
+    np.testing.assert_allclose(np.mean([e.place for e in gaze.eyes], axis=0), gaze.middle.place)
+
+
+def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_watched(tmp_path):
+    records = write_run(tmp_path / "run.mcap", SCENE, ITERATIONS, source=LIVE)
+    build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
+    rows = rows_of(tmp_path / "run.rrd")
+    t = np.arange(0, ITERATIONS * TAU, EVERY)
+    truth = np.sin(t[:, None] / 50 + np.arange(len(TRUTH)))
+    for i, name in enumerate(("box", "cylinder", "ball")):
+        assert rows[f"/scene/{name}"]["frame"] == t.tolist()
+        found = np.array([p for (p,) in rows[f"/scene/{name}"]["Transform3D:translation"]])
+        expected = truth[:, 2 * i : 2 * i + 2] * (1, -1)
+        np.testing.assert_allclose(found[:, :2], expected, atol=1e-6)
+    turns = [
+        r for b, r in zip([None, *records], records, strict=False) if not b or b.stream != r.stream
+    ]
+    scenery = scenery_of(CONFIG)
+    watching, neck = rows["/scene/watching"], rows["/scene/neck"]
+    assert watching["frame"] == neck["frame"] == [r.t for r in turns]
+    for i, record in enumerate(turns):
+        gaze = scenery.gazes[record.stream]
+        np.testing.assert_allclose(
+            watching["Transform3D:quaternion"][i][0], gaze.middle.turn, atol=1e-6
+        )
+        edges = rows["/scene/watching/edges"]
+        assert set(edges["LineStrips3D:colors"][i]) == {packed(colour(record.stream))}
+        angle = 2 * math.acos(min(neck["Transform3D:quaternion"][i][0][3], 1.0))
+        assert math.degrees(angle) == pytest.approx(abs(gaze.yaw), abs=0.1)
+    assert "World" in layout_names(tmp_path / "run.rrd")
+
+
+def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp_path, monkeypatch):
+    without_models(monkeypatch)
+    write_run(tmp_path / "run.mcap", SCENE, 3, source=LIVE)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    rows = rows_of(tmp_path / "run.rrd")
+    said = [text for (text,) in rows["/events"]["TextLog:text"]]
+    assert "the robot's body is not shown: `pip install icub-models` for it" in said
+    assert "/scene/box" in rows
+    assert "/scene/neck" not in rows
+
+
+def test_a_recording_that_is_gone_is_said_and_one_that_is_there_is_read(tmp_path):
+    source = {"kind": "recording", "scene": "icub", "config_sha256": "0" * 64}
+    manifest = {
+        "source": source,
+        "config": {"scene": CONFIG},
+        "command": {"source": ["../gone", 3]},
+    }
+    write_run(tmp_path / "run.mcap", SCENE, 1)
+    header = dataclasses.replace(read_outline(tmp_path).header, manifest=manifest)
+    scenery, unsure = world_of_run(header, tmp_path / "run.mcap", None)
+    assert (scenery, unsure) == (scenery_of(CONFIG), PRESET)
+    for broken in ({"kind": "icub", "scene": {"kind": "icub", "eyes": 3}}, {"kind": "icub"}, 7):
+        header = dataclasses.replace(header, manifest={"source": broken})
+        assert world_of_run(header, tmp_path / "run.mcap", None)[0] is None
+
+
+def test_the_recording_says_what_stood_where(tmp_path):
+    """The sample recording is one of before there were channels for it."""
+    sample = Path(__file__).parents[1] / "sample_logs" / "icub"
+    with LogReader(sample / "left.mcap") as reader:
+        data = bytes(reader.attachment_data(reader.attachments[0]))
+    digest = hashlib.sha256(data).hexdigest()
+    source = {"kind": "recording", "scene": "icub", "config_sha256": digest}
+    write_run(tmp_path / "run.mcap", SCENE, 1, source=source)
+    header = read_outline(tmp_path).header
+    assert world_of_run(header, tmp_path / "run.mcap", sample) == (scenery_of(CONFIG), None)
+
+
+def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
+    """Of a module whose stream is not watched after its save, it is what the module says."""
+    records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
+    outline = read_outline(tmp_path)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    rows, names = rows_of(tmp_path / "run.rrd"), layout_names(tmp_path / "run.rrd")
+    outputs = {o.module: o for o in read_outputs(tmp_path, outline, 6)}
+    assert set(outputs) == {1, 2, 3}
+    for number in (1, 2):
+        output = outputs[number]
+        found = output.follows(VECTOR.truth)
+        said = scalars(rows[f"/learned/{number}/output"])[:, 0]
+        frames = np.array(rows[f"/learned/{number}/output"]["frame"])
+        own = np.isfinite(said)
+        np.testing.assert_array_equal(frames[own], output.t)
+        np.testing.assert_array_equal(said[own], output.y)
+        followed = scalars(rows[f"/learned/{number}/followed"])[:, 0]
+        assert len(followed) == len(records) * TAU
+        r = np.corrcoef(followed[np.isin(frames, output.t)], output.y)[0, 1]
+        assert r == pytest.approx(found.r)
+        assert [n for n in names if f"module {number} has learned" in n and f"{found.r:.2f}" in n]
+
+
+def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):
+    records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
+    last = records[-1]
+    module = Module(
+        index=last.module,
+        stream=VECTOR.streams[last.stream],
+        stream_index=last.stream,
+        iteration=last.iteration,
+        phi=np.array([[2.0, 0.0]]),
+        mean=np.zeros(2),
+        band_mean=np.zeros(1),
+        band_sd=np.ones(1),
+        eta=np.ones(1),
+        policy=np.zeros(3, dtype=int),
+    )
+    modules = [dataclasses.replace(module, index=i) for i in (1, 2, 3)]
+    save_modules(tmp_path / "modules.npz", modules)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    watched = rows_of(tmp_path / "run.rrd")["/world/watched"]
+    shown = dict(zip(watched["frame"], (v[0] for v in watched["Scalars:scalars"]), strict=True))
+    *_, output = read_outputs(tmp_path, read_outline(tmp_path), 6)
+    assert output.module == last.module
+    np.testing.assert_allclose(output.y, [2 * shown[t] for t in output.t.tolist()])
+
+
+@pytest.mark.parametrize("algorithm", ["2.0", "progress"])
+def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
+    learner = {"algorithm": algorithm, "settled": 0.05, "agreement": 0.25}
+    records = write_run(tmp_path / "run.mcap", IMAGE, 15, saves=True, learner=learner)
+    build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
+    rows = rows_of(tmp_path / "run.rrd")
+    height, width = IMAGE.frame_shape
+    hang = places(3, width, height)
+    for s, name in enumerate(IMAGE.streams):
+        own = [r for r in records if r.stream == s]
+        pictures = rows[f"/wall/{s + 1}_{name}"]
+        assert pictures["frame"] == [r.t + EVERY for r in own]  # the last one of each block
+        for (image,) in pictures["Image:buffer"]:
+            assert {40 * s + 20, 250} == set(image)
+        texts = rows[f"/wall/{s + 1}_{name}/state"]
+        said = dict(zip(texts["frame"], (x for (x,) in texts["Points2D:labels"]), strict=True))
+        state = None
+        for record in records:
+            state = said.get(record.t, state)
+            if algorithm == "progress":
+                code = record.state[s]
+                word = f": {STATES[code].replace('_', ' ')}" if code >= 0 else ""
+                assert state == f"{name}{word}"
+        saves = [r.module for r in own if r.saved]
+        if algorithm == "2.0":
+            assert state == (f"{name}: module {saves[-1]}" if saves else name)
+    framed, frame = rows["/wall/frame"], None
+    centres = dict(zip(framed["frame"], (c for (c,) in framed["Boxes2D:centers"]), strict=True))
+    for record in records:
+        frame = centres.get(record.t, frame)
+        x, y = hang[record.stream]
+        assert frame == pytest.approx([x + width / 2, y + height / 2])
+
+
+def test_a_wall_is_wider_than_high_and_no_picture_hangs_over_another():
+    for count in (1, 2, 5, 16):
+        hang = places(count, 128, 48)
+        assert len(set(hang)) == count
+        for i, (x, y) in enumerate(hang):
+            assert all(abs(x - a) >= 128 or abs(y - b) >= 48 for a, b in hang[:i])
