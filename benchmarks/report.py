@@ -15,6 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.experiments.documents import markdown
 
 RESULTS = Path(__file__).parent / "results"
@@ -104,8 +105,18 @@ def section(document: Mapping[str, Any]) -> str:
 
 
 def write_page() -> Path:
-    """Write docs/benchmarks.md from the results there are."""
+    """Write docs/benchmarks.md from the results there are.
+
+    Raises:
+        CdmisfaError: those of one contradict each other.
+    """
     documents = [json.loads(p.read_text(encoding="utf-8")) for p in sorted(RESULTS.glob("*.json"))]
+    for document in documents:
+        for text in document.get("contradictions", ()):
+            raise CdmisfaError(
+                f"results/{document['benchmark']}.json contradicts itself ({text}): measure it "
+                f"again with python -m benchmarks {document['benchmark']}"
+            )
     head = (
         "# Benchmarks\n\n`make bench` measures all of it and makes this page from "
         "`benchmarks/results/*.json`; `python -m benchmarks NAME [--quick]` measures one part, "

@@ -5,9 +5,21 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks import kernels, learn, long_recordings, reader, recorder, report, scaling
+from benchmarks import (
+    kernels,
+    learn,
+    long_recordings,
+    modules,
+    reader,
+    recorder,
+    recursive,
+    report,
+    scaling,
+)
+from cdmisfa.core.errors import CdmisfaError
 
 
 @pytest.fixture
@@ -34,10 +46,44 @@ def test_long_recordings_take_no_more_memory(tmp_path: Path, work: str) -> None:
 
 
 def test_learn(tmp_path: Path) -> None:
-    times = learn.timed(learn.learning(tmp_path / "run", rerun=True), 2)
+    times = learn.timed(
+        learn.learning(learn.CONFIGS["preset icub"], tmp_path / "run", rerun=True), 2
+    )
     assert set(times) == set(learn.CLOCKS)
     assert 0 < times["learning thread"] <= times["all threads"] + 1000
     assert {"run.mcap", "run.rrd"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_the_page_refuses_a_run_that_contradicts_itself(results: Path) -> None:
+    fine = [["all", "no log", 100, "", 100, "", 3], ["all", "run.mcap", 110, "", 105, "", 9]]
+    assert learn.contradictions(fine) == []
+    wrong = [["all", "no log", 100, "", 100, "", -95], ["all", "run.mcap", 90, "", 90, "", 9]]
+    assert len(learn.contradictions(wrong)) == 2
+    assert learn.fixed([1300.0], [100.0], 10) == 300
+    report.save("learn", "Learning", "", [], contradictions=learn.contradictions(wrong))
+    with pytest.raises(CdmisfaError, match=r"learn\.json contradicts itself .*fixed -95 ms"):
+        report.write_page()
+
+
+def test_modules(results: Path) -> None:
+    modules.main(quick=True)
+    rows = json.loads((results / "modules.json").read_text())["tables"][0]["rows"]
+    assert [row[0] for row in rows] == [0, 1, 10]
+
+
+def test_recursive() -> None:
+    """What is compared finds the same slow features."""
+    mixing = np.random.default_rng(0).standard_normal((5, 300))
+    frames = np.sin(np.arange(120)[:, None] * np.array([0.05, 0.21, 0.5, 0.9, 1.4])) @ mixing
+    frames.flags.writeable = False
+    ours, plain = recursive.RecursiveSFA(300, 5), recursive.PlainNumpy(300, 5)
+    for start in range(0, 120, 40):
+        ours.update(frames[start : start + 40])
+        slow = plain.update(frames[start : start + 40])
+    one, other = ours.phi[0], slow[0]
+    assert abs(one @ other) / np.linalg.norm(one) / np.linalg.norm(other) > 0.99999
+    for call in recursive.candidates(frames, 5).values():
+        assert call() >= 1
 
 
 def test_recorder(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ import json
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -87,19 +88,28 @@ def encode_signals(signals: BlockSignals) -> bytes:
     values = _FIELDS.values(signals)
     scalars = list(_TAGGED)
     scalars[1::2] = values[: len(_SCALARS)]
+    arrays = values[len(_SCALARS) :]
+    before, sizes = _around(tuple(array.shape for array in arrays))
     parts = [_STRUCT.pack(*scalars)]
-    shapes = []
-    for tag, value in zip(_ARRAY_TAGS, values[len(_SCALARS) :], strict=True):
-        shapes.append(value.shape)
-        if value.size:
-            parts.append(_length_prefix(tag, value.nbytes))
-            parts.append(value.tobytes())
-    key = tuple(shapes)
-    if key not in _SHAPE_BYTES:
-        sizes = b"".join(varint(size) for shape in key for size in shape)
-        _SHAPE_BYTES[key] = _length_prefix(_tag(SHAPES, _LENGTH_DELIMITED), len(sizes)) + sizes
-    parts.append(_SHAPE_BYTES[key])
+    for prefix, array in zip(before, arrays, strict=True):
+        if prefix:
+            parts += (prefix, array.tobytes())
+    parts.append(sizes)
     return b"".join(parts)
+
+
+@lru_cache
+def _around(shapes: tuple[tuple[int, ...], ...]) -> tuple[list[bytes], bytes]:
+    """What stands before each array in a message, nothing where it is empty, and behind all."""
+    counts = [math.prod(shape) for shape in shapes]
+    before = [
+        _length_prefix(_tag(s.name, _LENGTH_DELIMITED), n * np.dtype(s.dtype).itemsize)
+        if n
+        else b""
+        for s, n in zip(_ARRAYS, counts, strict=True)
+    ]
+    sizes = b"".join(varint(size) for shape in shapes for size in shape)
+    return before, _length_prefix(_tag(SHAPES, _LENGTH_DELIMITED), len(sizes)) + sizes
 
 
 def encode_matrix(t: int, matrix: NDArray[np.float64]) -> bytes:
@@ -334,7 +344,7 @@ def _tag(name: str, wire_type: int) -> bytes:
 
 
 def _length_prefix(tag: bytes, length: int) -> bytes:
-    return tag + (bytes((length,)) if length < 0x80 else varint(length))
+    return tag + varint(length)
 
 
 def _message_class(file: descriptor_pb2.FileDescriptorProto, name: str) -> Any:
@@ -377,6 +387,4 @@ _TAGGED: tuple[Any, ...] = tuple(
 )
 _LAYOUT = (f"{len(tag)}s{CODES[s.dtype]}" for tag, s in zip(_TAGGED[::2], _SCALARS, strict=True))
 _STRUCT = struct.Struct("<" + "".join(_LAYOUT))
-_ARRAY_TAGS = tuple(_tag(s.name, _LENGTH_DELIMITED) for s in _ARRAYS)
 _FIELDS = Fields((*_SCALARS, *_ARRAYS))
-_SHAPE_BYTES: dict[tuple[tuple[int, ...], ...], bytes] = {}
