@@ -20,6 +20,7 @@ bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks
 
 fuzz: $(INSTALLED)
+	$(BIN)/python tests/fuzz_coverage.py --seconds $(or $(SECONDS),60)
 	$(BIN)/python tests/fuzz.py --cases 1000000 --jobs 2
 
 # The streams of the arena take minutes to make: they are kept.

@@ -15,6 +15,7 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.opening import open_images
 from replay.camera_logs.source import ForeignSource
 
 pytest.importorskip("rosbags")
@@ -137,3 +138,23 @@ def test_a_bag_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -
     assert cdmisfa("convert", *words, "-o", tmp_path / "rec").code == 0
     again = cdmisfa("learn", tmp_path / "rec", *quick)
     assert again.json["signals_sha256"] == learned.json["signals_sha256"]
+
+
+@pytest.mark.parametrize("kind", ["BZ2", "LZ4"])
+def test_a_packed_bag_is_the_same_and_unpacks_to_no_more_than_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    whole, packed = open_images(ros1_bag(tmp_path), TOPICS[0]), tmp_path / "packed.bag"
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = rosbag1.Writer(packed)
+    writer.set_compression(rosbag1.Writer.CompressionFormat[kind])
+    with writer:
+        fill(writer, store, store.serialize_ros1, True)
+    images = open_images(packed, TOPICS[0])
+    for row in range(COUNT):
+        np.testing.assert_array_equal(images.image(row), whole.image(row))
+    images.close()
+    whole.close()
+    monkeypatch.setattr("replay.camera_logs.formats.bag.MAX_CHUNK", 28_000)
+    with pytest.raises(LogDamagedError, match="unpacks to more than 28000 bytes"):
+        open_images(packed, TOPICS[0])

@@ -1,11 +1,15 @@
-"""Ten thousand broken logs, and every one that ever broke the reader; tests/fuzz.py has more."""
+"""Broken logs and other inputs, and all that ever broke something; `make fuzz` has more."""
 
 from __future__ import annotations
 
 from collections import Counter
+from itertools import islice
 from pathlib import Path
+from random import Random
 
 import fuzz
+import fuzz_coverage
+import fuzz_decoders
 import fuzz_mutations
 import fuzz_oracle
 import numpy as np
@@ -102,3 +106,48 @@ def test_a_job_goes_on_where_it_was_stopped(
     assert sorted(set(seen)) == list(range(20))
     assert seen.count(9) == 1
     assert "1 found" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", fuzz_decoders.available())
+def test_what_is_decoded_may_be_anything(tmp_path: Path, name: str) -> None:
+    rng, whole = Random(name), fuzz_decoders.seeds(name)
+    for data in whole:
+        fuzz_decoders.DECODERS[name].read(written(tmp_path, name, data))
+    text = fuzz_decoders.DECODERS[name].text
+    for _ in range(10 if name == "lerobot" else 60):
+        data = fuzz_decoders.mutated(rng, rng.choice(whole), rng.choice(whole), text=text)
+        fuzz_decoders.check(name, data, tmp_path / "case")
+
+
+def written(folder: Path, name: str, data: bytes) -> Path:
+    place = folder / "whole"
+    place.mkdir(exist_ok=True)
+    path = place / fuzz_decoders.DECODERS[name].name
+    path.write_bytes(data)
+    return path
+
+
+def test_what_once_broke_a_decoder_does_so_no_more(tmp_path: Path) -> None:
+    for path in fuzz.KEPT.glob("*/*"):
+        fuzz_decoders.check(path.parent.name.replace("-", " "), path.read_bytes(), tmp_path / "c")
+
+
+def test_inputs_that_go_a_new_way_lead_further() -> None:
+    """A fault behind four conditions is found, as each is a new way; by chance it is not."""
+
+    def check(data: bytes) -> None:
+        if len(data) < 12 or data[0] % 4 != 1:
+            return
+        if data[4] % 8 != 3:
+            return
+        if data[8] % 8 != 5:
+            return
+        if data[11] % 8 == 6:
+            raise KeyError("found")
+
+    def broken(ours: tuple[str, ...]) -> bool:
+        cases = fuzz_coverage.guided(check, [b"." * 16], Random(4), text=False, ours=ours)
+        return any(isinstance(broke, KeyError) for _, _, broke in islice(cases, 3000))
+
+    assert broken((__file__,))
+    assert not broken(())

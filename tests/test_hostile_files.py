@@ -23,10 +23,10 @@ from recorder.config import RecordConfig
 from recorder.log.logfile import LogFile
 from recorder.log.resume import frames_held
 from recorder.recording import record_scene
-from replay.camera_logs import picture_folder
+from replay.camera_logs.formats import picture_folder
 from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
-from replay.runs.folders import REQUEST, RUN_METADATA, runs_in
+from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json, runs_in
 from replay.runs.log import read_header
 from replay.runs.messages import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
@@ -72,6 +72,24 @@ def test_a_huge_picture_is_refused_unread(tmp_path: Path) -> None:
         file.truncate(picture_folder.MAX_BYTES + 1)
     with pytest.raises(CdmisfaError, match=r"2\.png: \d+ bytes.*limit"):
         open_images(tmp_path / "pictures", None)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_only_regular_files_are_read_of_a_run(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    for name in ("run.json", "modules.npz"):
+        make(tmp_path / name)
+    assert read_run_json(tmp_path) == {}
+    with pytest.raises(LogDamagedError, match="no regular file"):
+        load_modules(tmp_path)
+
+
+def test_a_huge_document_or_file_of_modules_is_refused_unread(tmp_path: Path) -> None:
+    for name, size in (("run.json", 1 << 33), ("modules.npz", 1 << 33)):
+        with (tmp_path / name).open("xb") as file:
+            file.truncate(size)
+    assert read_run_json(tmp_path) == {}
+    with pytest.raises(LogDamagedError, match="above the limit"):
+        load_modules(tmp_path)
 
 
 def test_compressed_modules_are_refused(tmp_path: Path) -> None:

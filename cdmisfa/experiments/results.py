@@ -54,11 +54,13 @@ def results(folder: Path) -> list[PointResult]:
         LogDamagedError: its files are damaged.
     """
     path = folder / REQUEST
+    if not path.is_file():
+        raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep")
     try:
         request = json.loads(path.read_text("utf-8"))
         trials = [(str(t["id"]), dict(t["point"])) for t in request["trials"]]
     except OSError as error:
-        raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep") from error
+        raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise LogDamagedError(f"{path} is damaged: run the sweep again to write it") from error
     rows = {row["id"]: row for row in read_rows(folder)}

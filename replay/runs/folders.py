@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.log.whole import partial_path
 from replay.mcap.reader import LogReader
+from replay.storage.regular import read_regular
 
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
@@ -28,6 +29,9 @@ RUN_METADATA = "cdmisfa.run"
 
 FINAL_METADATA = "cdmisfa.final"
 """Name of the metadata record by which a finished run proves itself; see `final`."""
+
+MAX_JSON: Final = 16 * 1024 * 1024
+"""Largest run.json that is read, in bytes; in memory it may take twenty times as much."""
 
 REQUEST = "sweep.json"
 """File of a sweep that names the trials it was asked for last."""
@@ -66,8 +70,8 @@ def is_run(path: Path) -> bool:
 def read_run_json(folder: Path) -> Mapping[str, Any]:
     """How a run was begun and what came of it; empty where nothing readable says so."""
     try:
-        document = json.loads((folder / RUN_JSON).read_text("utf-8"))
-    except (OSError, ValueError, RecursionError):
+        document = json.loads(read_regular(folder / RUN_JSON, MAX_JSON).decode("utf-8"))
+    except (CdmisfaError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, Mapping) else {}
 

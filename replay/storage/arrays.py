@@ -5,18 +5,23 @@ from __future__ import annotations
 import math
 import os
 import re
+import stat
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import one_line
+
+MAX_BYTES: Final = 192 * 1024 * 1024
+"""Largest file of arrays that is read."""
 
 _END = struct.Struct("<4s4H2LH")
 _PLAIN = re.compile(r"[<|][bifuU]\d{1,6}")
@@ -36,7 +41,12 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         OSError: the file cannot be opened.
         ValueError: it holds something else; it says what in one short line.
     """
-    with open(path, "rb") as file:
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise ValueError("it is no regular file")
+        if found.st_size > MAX_BYTES:
+            raise ValueError(f"it has {found.st_size} bytes, above the limit of {MAX_BYTES}")
         try:
             with np.load(file, allow_pickle=False) as stored:
                 _refuse_packed(stored.zip)
@@ -47,6 +57,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             raise ValueError(one_line(error)) from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise ValueError("not all of it are arrays")
+    for array in arrays.values():
+        _check_text(array)
     return arrays
 
 
@@ -73,13 +85,24 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
             size = dtype.itemsize * math.prod(shape)
             if min(shape, default=0) < 0 or at + size > len(data):
                 raise ValueError(f"{str(name)[:40]!r} is no array of it")
-            arrays[str(name)] = np.ndarray(shape, dtype, data, at).copy()
+            arrays[str(name)] = array = np.ndarray(shape, dtype, data, at).copy()
+            _check_text(array)
             at += size
     except (*_IMPOSSIBLE, TypeError, LookupError) as error:
         raise ValueError("an impossible array") from error
     if at != len(data):
         raise ValueError(f"its arrays have {at} bytes, and it has {len(data)}")
     return arrays
+
+
+def _check_text(array: NDArray[Any]) -> None:
+    """Refuse text of what are no characters, which Python cannot take over."""
+    for name in array.dtype.names or ("",):
+        texts = np.ascontiguousarray(array[name] if name else array)
+        if texts.dtype.kind == "U" and texts.nbytes:
+            codes = texts.view(np.dtype(np.uint32).newbyteorder(texts.dtype.byteorder))
+            if codes.max() > sys.maxunicode:
+                raise ValueError("its text holds what is no character")
 
 
 def _plain_type(kind: Any) -> np.dtype[Any]:

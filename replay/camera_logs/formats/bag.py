@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import bz2
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import lz4.frame
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.messages import Decoder
 from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
-from replay.mcap.records import Bytes
+from replay.mcap.records import MAX_CHUNK, Bytes
 
 BAGS: Final = (".bag", ".db3")
 
@@ -91,6 +94,33 @@ def _opened(path: Path, *, ros1: bool) -> Any:
             f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
     with explained(path, "rosbags"):
-        reader = Rosbag1(path) if ros1 else Rosbag2(path)
+        reader: Any = Rosbag1(path) if ros1 else Rosbag2(path)
         reader.open()
+        try:
+            if ros1:
+                reader.chunks = {place: _bounded(chunk) for place, chunk in reader.chunks.items()}
+        except BaseException:
+            reader.close()
+            raise
         return reader
+
+
+def _bounded(chunk: Any) -> Any:
+    """A chunk of a ROS 1 bag that unpacks to no more than one of an MCAP log may."""
+    from rosbags.rosbag1.reader import decompressors
+
+    if chunk.datasize > MAX_CHUNK:
+        raise ValueError(f"a chunk of {chunk.datasize} bytes, above the limit of {MAX_CHUNK}")
+    bounded = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
+    for name, kind in bounded.items():
+        if chunk.decompressor is decompressors[name]:
+            return chunk._replace(decompressor=partial(_unpacked, kind))
+    return chunk
+
+
+def _unpacked(kind: Callable[[], Any], data: bytes) -> bytes:
+    unpacking = kind()
+    found = bytes(unpacking.decompress(data, max_length=MAX_CHUNK))
+    if not unpacking.eof:
+        raise ValueError(f"a chunk is cut short, or unpacks to more than {MAX_CHUNK} bytes")
+    return found
