@@ -56,6 +56,7 @@ FORBIDDEN = {
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
     "replay.camera_logs.formats": ("replay.recordings.source", "replay.runs.log", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
+    "replay.inputs": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.images", "replay.viewer.program", "rerun"),
     "replay.mcap": ("replay.runs.log", "replay.recordings.source", "cdmisfa.agents.learner"),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),

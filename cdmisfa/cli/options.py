@@ -187,8 +187,18 @@ def _fetched(
     ctx: click.Context, param: click.Parameter, value: str | tuple[str, ...]
 ) -> Path | tuple[Path, ...]:
     if isinstance(value, tuple):
-        return tuple(_copy_of(ctx, word) for word in value)
+        return tuple(_copy_of(ctx, word) for word in _matched(value))
     return _copy_of(ctx, value)
+
+
+def _matched(words: tuple[str, ...]) -> tuple[str, ...]:
+    """Words with patterns as what matches them."""
+    if not any(letter in word for word in words for letter in "*?["):
+        return words
+    from replay.inputs.words import places
+    from replay.storage.location import Url
+
+    return tuple(p.address if isinstance(p, Url) else str(p) for p in places(words))
 
 
 def _copy_of(ctx: click.Context, word: str) -> Path:

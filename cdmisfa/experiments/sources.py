@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.arithmetic.choice import portable_bits
@@ -17,10 +15,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.scenes import SCENES
-
-if TYPE_CHECKING:
-    from replay.camera_logs.source import Align, ForeignSource
-    from replay.storage.location import Location
+from replay.camera_logs.options import CameraOptions
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -53,24 +48,6 @@ class Configuration:
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
         return {"scene": as_table(self.scene), "record": as_table(self.record)}
-
-
-@dataclass(frozen=True, slots=True)
-class CameraOptions:
-    """How images of other people's logs become streams of frames.
-
-    Attributes:
-        topics: the topics, a stream each.
-        size: (height, width) of a frame, or None for that of the paper, (48, 128).
-        align: how streams of unequal length, start or rate are put on one clock: "index",
-            "time", or None to refuse them.
-        rate: frames a second; None for the rate of the first stream.
-    """
-
-    topics: tuple[str, ...] = ()
-    size: tuple[int, int] | None = None
-    align: Align | None = None
-    rate: float | None = None
 
 
 def configure(
@@ -177,7 +154,7 @@ def open_source(
 
     Args:
         words: the name of a scene, or paths or URLs: the folder of a recording or its views'
-            files, or MCAP logs, ROS bags, videos or folders of pictures of others.
+            files, or camera logs of others, or patterns of their names.
         preset: instead of the source's own.
         settings: `section.key=value` words.
         seed: of the scene, where `scene.seed` is not set.
@@ -206,9 +183,11 @@ def open_source(
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
-    from replay.storage.location import Url, location
+    from replay.inputs.opening import open_log
+    from replay.inputs.words import places
+    from replay.storage.location import Url
 
-    paths = [location(word) for word in words]
+    paths = places(words)
     for path in paths:
         if not isinstance(path, Url) and not path.exists() and follow is None:
             raise UsageError(
@@ -223,7 +202,7 @@ def open_source(
             raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
         source = FollowedSource(paths[0], timeout=follow)
     else:
-        source = _open_log(paths, cameras, loop=loop, salvage=salvage)
+        source = open_log(paths, cameras, loop=loop, salvage=salvage)
     try:
         described = source.describe()
         kind = scene_kind_for(source.spec, described, preset)
@@ -232,85 +211,3 @@ def open_source(
     except BaseException:
         source.close()
         raise
-
-
-def _open_log(
-    paths: Sequence[Location], cameras: CameraOptions, *, loop: bool, salvage: bool
-) -> SeekableSource:
-    """Open a recording of ours, or what else holds images."""
-    from replay.camera_logs.opening import only_foreign
-    from replay.recordings.source import RecordedSource
-    from replay.recordings.view_file import NoRecordingError
-
-    if cameras == CameraOptions():
-        for path in paths:
-            _refuse_what_is_no_log(path)
-        if not any(map(only_foreign, paths)):
-            with contextlib.suppress(NoRecordingError):
-                return RecordedSource(paths, loop=loop, salvage=salvage)
-            for path in paths:
-                _refuse_remote_run(path)
-    return open_cameras(paths, cameras, loop=loop, salvage=salvage)
-
-
-def _refuse_what_is_no_log(path: Location) -> None:
-    """Refuse a run, and a file of another kind, neither of which is a damaged recording."""
-    from replay.camera_logs.opening import only_foreign
-    from replay.mcap.identity import starts_as_log
-    from replay.runs.folders import RUN_FILE, is_run
-    from replay.storage.location import Url
-
-    if isinstance(path, Url):  # opened only once: see `_refuse_remote_run`
-        return
-    if path.is_dir():
-        run = is_run(path)
-    elif starts_as_log(path):
-        run = path.name.startswith(RUN_FILE) and is_run(path)
-    elif only_foreign(path) or ".mcap" in path.suffixes:  # the latter is a damaged log
-        run = False
-    else:
-        raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
-    if run:
-        raise _a_run(path)
-
-
-def _refuse_remote_run(path: Location) -> None:
-    """Refuse a run behind a URL, once it is known to be no recording."""
-    from replay.integrity.survey import kind_of
-    from replay.mcap.reader import LogReader
-    from replay.storage.location import Url
-
-    if isinstance(path, Url) and not path.folder:
-        with LogReader(path) as reader:
-            if kind_of(reader) == "run":
-                raise _a_run(path)
-
-
-def _a_run(path: Location) -> UsageError:
-    return UsageError(
-        f"{path} is a run, not a recording: look at it with cdmisfa view {shlex.quote(str(path))}, "
-        "or learn from what it learned from"
-    )
-
-
-def open_cameras(
-    paths: Sequence[str | Location],
-    cameras: CameraOptions,
-    *,
-    loop: bool = False,
-    salvage: bool = False,
-    goal: tuple[str, str] = ("learn", "RUN"),
-) -> ForeignSource:
-    """Open the camera logs of others as streams on one clock; see `ForeignSource`."""
-    from replay.camera_logs.source import FRAME_SIZE, ForeignSource
-
-    return ForeignSource(
-        paths,
-        cameras.topics,
-        size=cameras.size or FRAME_SIZE,
-        align=cameras.align,
-        rate=cameras.rate,
-        loop=loop,
-        salvage=salvage,
-        goal=goal,
-    )

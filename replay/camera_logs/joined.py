@@ -43,11 +43,18 @@ class JoinedImages(ImageStream):
 
 def join_parts(streams: Sequence[ImageStream]) -> list[ImageStream]:
     """Join logs with one topic of which each begins after another ends; others stay streams."""
+    found: list[ImageStream] = []
+    for topic in dict.fromkeys(stream.topic for stream in streams):
+        found += _joined([stream for stream in streams if stream.topic == topic])
+    return found if len(found) < len(streams) else list(streams)
+
+
+def _joined(streams: Sequence[ImageStream]) -> list[ImageStream]:
     ordered = sorted(streams, key=lambda s: int(s.times[0]) if len(s.times) else 0)
     follow = all(
         len(one.times) and len(two.times) and int(one.times[-1]) < int(two.times[0])
         for one, two in itertools.pairwise(ordered)
     )
-    if len(streams) < 2 or not follow or len({s.topic for s in streams}) > 1:
+    if len(streams) < 2 or not follow:
         return list(streams)
     return [JoinedImages(ordered[0].path, ordered)]

@@ -9,6 +9,7 @@ from typing import Any
 
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.formats.bag import BAGS, BagImages
+from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
 from replay.camera_logs.formats.mcap_log import McapImages
 from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
@@ -33,13 +34,15 @@ def open_images(path: Location, topic: str | None, *, salvage: bool = False) -> 
         LogDamagedError: the log is damaged.
     """
     if isinstance(path, Path):
-        if _is_bag(path):
+        if is_dataset(path):
+            return LeRobotImages(path, topic)
+        if is_bag(path):
             return BagImages(path, topic)
-        if _is_split(path):
+        if is_split(path):
             return _open_parts(path, topic, salvage=salvage)
         if path.is_dir():
             return FolderImages(path, topic)
-        if path.suffix.lower() in VIDEOS:
+        if is_video(path):
             return VideoImages(path, topic)
     return McapImages(path, topic, salvage=salvage)
 
@@ -48,7 +51,7 @@ def image_logs(paths: Sequence[str | Location]) -> list[Location]:
     """The logs that paths mean, one at least: a folder of MCAP files is each, a rosbag2 one log."""
     found: list[Location] = []
     for path in map(location, paths):
-        if only_foreign(path) or (isinstance(path, Path) and _is_split(path)):
+        if only_foreign(path) or (isinstance(path, Path) and is_split(path)):
             found.append(path)
         else:
             found += log_files(path)
@@ -59,8 +62,7 @@ def only_foreign(path: Location) -> bool:
     """Whether a path can be no recording of ours, by its kind."""
     if isinstance(path, Url):
         return False
-    video = path.suffix.lower() in VIDEOS and path.is_file()
-    return video or _is_bag(path) or _is_picture_folder(path)
+    return is_video(path) or is_dataset(path) or is_bag(path) or is_picture_folder(path)
 
 
 def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any]:
@@ -72,8 +74,11 @@ def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any
         reads = (s.reader for s in streams if isinstance(s, McapImages) and s.path == path)
         return identity(path, next(reads, None))
     whole = hashlib.sha256()
-    for file in sorted(p for p in path.iterdir() if p.is_file()):
-        whole.update(f"{file.name}\0{sha256(file)}\n".encode("utf-8", "surrogateescape"))
+    files = path.rglob("*") if is_dataset(path) else path.iterdir()
+    for file in sorted(p for p in files if p.is_file()):
+        whole.update(
+            f"{file.relative_to(path)}\0{sha256(file)}\n".encode("utf-8", "surrogateescape")
+        )
     return {"file": path.name, "sha256": whole.hexdigest()}
 
 
@@ -99,14 +104,20 @@ def _open_parts(path: Path, topic: str | None, *, salvage: bool) -> ImageStream:
     return JoinedImages(path, parts)
 
 
-def _is_bag(path: Path) -> bool:
+def is_video(path: Path) -> bool:
+    """Whether a file is a video, by its name."""
+    return path.suffix.lower() in VIDEOS and path.is_file()
+
+
+def is_bag(path: Path) -> bool:
     """A ROS bag that is not in MCAP files."""
     if path.is_dir():
         return (path / "metadata.yaml").exists() and not any(path.glob("*.mcap"))
     return path.suffix in BAGS
 
 
-def _is_picture_folder(path: Path) -> bool:
+def is_picture_folder(path: Path) -> bool:
+    """Whether a folder holds pictures, and no log."""
     return (
         path.is_dir()
         and not any(path.glob("*.mcap*"))
@@ -114,6 +125,6 @@ def _is_picture_folder(path: Path) -> bool:
     )
 
 
-def _is_split(path: Path) -> bool:
+def is_split(path: Path) -> bool:
     """Whether a folder is a rosbag2 of MCAP files, which are parts of one log."""
     return (path / "metadata.yaml").is_file() and any(path.glob("*.mcap"))

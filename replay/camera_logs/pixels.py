@@ -105,15 +105,21 @@ def _high_bytes(pixels: NDArray[Any]) -> Bytes:
     return found
 
 
-def shrink(image: Bytes, height: int, width: int) -> Bytes:
+def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> Bytes:
     """Average the areas of a gray image into fewer pixels.
+
+    Args:
+        image: (rows, columns) uint8.
+        height: rows of the result.
+        width: columns of the result.
+        enlarge: repeat the pixels of a smaller image instead of refusing it.
 
     Raises:
         UsageError: the image is smaller.
     """
     if image.shape == (height, width):
         return image
-    if image.shape[0] < height or image.shape[1] < width:
+    if not enlarge and (image.shape[0] < height or image.shape[1] < width):
         raise UsageError(
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
             "choose a smaller --size"

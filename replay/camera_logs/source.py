@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -23,18 +23,19 @@ from replay.camera_logs.alignment import (
     step_of,
     unlike,
 )
+from replay.camera_logs.catalogue import named_streams
+from replay.camera_logs.framing import Size, cut_or_added, default_size, fitted
 from replay.camera_logs.joined import join_parts
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
-from replay.camera_logs.pixels import shrink
+from replay.camera_logs.options import Align, Fit
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
 
-FRAME_SIZE = (48, 128)
-"""Height and width of the paper's frames, which images are shrunk to where nothing is said."""
 
-Align = Literal["index", "time"]
+class UnequalError(UsageError):
+    """Streams that are on no common clock unless they are aligned."""
 
 
 class ForeignSource(ClockedSource):
@@ -43,8 +44,9 @@ class ForeignSource(ClockedSource):
     Args:
         paths: one log, or one log, video or folder of pictures a stream. Logs that follow one
             another in time are parts of one stream, unless they are aligned by index.
-        topics: the topics, a stream each; none where each log has one topic of images.
-        size: (height, width) of a frame.
+        topics: the topics, a stream each, or patterns; see `named_streams`.
+        size: (height, width) of a frame; by default `default_size` of the first image.
+        fit: how images of another aspect ratio become frames: see `fitted`.
         align: how streams of unequal length, start or rate are put on one clock: "index"
             takes the i-th image of each, "time" the last image at or before each tick.
             None refuses such streams.
@@ -56,6 +58,9 @@ class ForeignSource(ClockedSource):
     Attributes:
         alignment: for each stream the counts of its messages, of repeated frames and of
             dropped messages.
+        shapes: for each stream how an image becomes a frame, in words.
+        changes: for each stream whose images change their size, a line that says so; as soon as
+            one was shown.
         warnings: what the user should know: logs that were cut, damage that was left out.
     """
 
@@ -64,7 +69,8 @@ class ForeignSource(ClockedSource):
         paths: str | Location | Sequence[str | Location],
         topics: Sequence[str] = (),
         *,
-        size: tuple[int, int] = FRAME_SIZE,
+        size: tuple[int, int] | None = None,
+        fit: Fit = "crop",
         align: Align | None = None,
         rate: float | None = None,
         loop: bool = False,
@@ -81,18 +87,20 @@ class ForeignSource(ClockedSource):
         slowest, fastest = RECORDED_FPS
         if rate is not None and not slowest <= rate <= fastest:
             raise UsageError(f"--rate is {rate}: it must be in [{slowest:g}, {fastest:.0f}]")
-        if min(size) < 1:
+        if size is not None and min(size) < 1:
             raise UsageError(f"--size is {size[1]}x{size[0]}: it must be above 0")
         named = [paths] if isinstance(paths, str | Path | Url) else paths
         self._files = image_logs(named)
         self._loop = loop
         self._hashes: list[dict[str, Any]] | None = None
-        self._size = size
+        self._fit = fit
+        self._asked_size = size
         self._goal = goal
         self._streams: list[ImageStream] = []
+        self.changes: dict[int, str] = {}
         self._shown: dict[int, tuple[int, Bytes]] = {}
         try:
-            for path, topic in _pairs(self._files, topics):
+            for path, topic in named_streams(self._files, topics):
                 self._streams.append(open_images(path, topic, salvage=salvage))
             if align != "index":
                 self._streams = join_parts(self._streams)
@@ -102,6 +110,9 @@ class ForeignSource(ClockedSource):
                 s.times if len(s.times) else even_times(s.count, self._fps) for s in self._streams
             ]
             start_ns, self._rows = self._put_on_clock(align)
+            firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
+            self._sizes = [_size_of(image) for image in firsts]
+            self._size = size or default_size(self._sizes[0])
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
         except BaseException:
@@ -109,10 +120,27 @@ class ForeignSource(ClockedSource):
             raise
         self._count = len(self._rows[0])
         names, length = stream_names(self._streams), None if loop else self._count
-        self._spec = SourceSpec(names, size, "uint8", (), self._fps, start_ns, length)
+        self._spec = SourceSpec(names, self._size, "uint8", (), self._fps, start_ns, length)
         found = map(counts, self._times, self._rows)
         self.alignment = dict(zip(names, found, strict=True))
+        self.shapes = {
+            name: self._shape(size) for name, size in zip(names, self._sizes, strict=True)
+        }
         self.warnings = tuple(dict.fromkeys(w for s in self._streams for w in s.warnings))
+
+    @property
+    def frames(self) -> int:
+        """Frames that every stream has."""
+        return self._count
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the first frame."""
+        return 0
+
+    def scene(self) -> Mapping[str, str]:
+        """What was recorded: nobody says."""
+        return {}
 
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a stream shows at t .. t+n-1; moves t by n.
@@ -182,15 +210,42 @@ class ForeignSource(ClockedSource):
         shown = self._shown.get(stream)
         if shown is not None and shown[0] == row:
             return shown[1]
+        image = self._image(stream, row)
+        changed = _size_of(image) != self._sizes[stream]
+        if changed:
+            self._say_change(stream, row, _size_of(image))
+        try:
+            frame = fitted(image, self._size, self._fit, enlarge=changed)
+        except UsageError as error:
+            raise UsageError(f"{self._streams[stream].path}: {error}") from None
+        self._shown[stream] = (row, frame)
+        return frame
+
+    def _shape(self, size: Size) -> str:
+        words = [f"{size[1]}x{size[0]}", cut_or_added(size, self._size, self._fit)]
+        if size != self._size:
+            words.append(f"shown as {self._size[1]}x{self._size[0]}")
+        return ", ".join(filter(None, words))
+
+    def _image(self, stream: int, row: int) -> Bytes:
+        """A stream's image as it is."""
         images = self._streams[stream]
         try:
-            frame = shrink(images.image(row), *self._size)
+            return images.image(row)
         except MalformedRecord as error:
             raise LogDamagedError(f"{images.where(row)}: {error}") from None
         except UsageError as error:
             raise UsageError(f"{images.path}: {error}") from None
-        self._shown[stream] = (row, frame)
-        return frame
+
+    def _say_change(self, stream: int, row: int, size: Size) -> None:
+        """Note once that a stream has images of another size than its first."""
+        if stream in self.changes:
+            return
+        before = self._sizes[stream]
+        self.changes[stream] = (
+            f"{self._streams[stream].where(row)}: images change from {before[1]}x{before[0]} to "
+            f"{size[1]}x{size[0]}; each is made a frame of {self._size[1]}x{self._size[0]}"
+        )
 
     def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows]]:
         """When frame 0 is, and which image of each stream every frame shows."""
@@ -211,13 +266,13 @@ class ForeignSource(ClockedSource):
         for stream, times in zip(self._streams[1:], self._times[1:], strict=True):
             reason = unlike(first, times)
             if reason:
-                raise UsageError(
+                raise UnequalError(
                     f"{self._streams[0].topic} and {stream.topic} have {reason}: put them on one "
                     f"clock, as with: {self._command()}"
                 )
         for stream, times in zip(self._streams, self._times, strict=True):
             if of_other_rate(times, self._fps):
-                raise UsageError(
+                raise UnequalError(
                     f"{stream.topic} has {1 / step_of(times):g} images a second, not "
                     f"{self._fps:g}: choose images by their times, as with: {self._command()}"
                 )
@@ -228,22 +283,16 @@ class ForeignSource(ClockedSource):
         for stream in self._streams:
             words += ["--topic", stream.topic]
         start, stop = overlap(self._times)
-        words += ["--size", f"{self._size[1]}x{self._size[0]}"]
+        if self._asked_size is not None:
+            words += ["--size", f"{self._asked_size[1]}x{self._asked_size[0]}"]
+        if self._fit != "crop":
+            words += ["--fit", self._fit]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
 
 
-def _pairs(files: Sequence[Location], topics: Sequence[str]) -> list[tuple[Location, str | None]]:
-    if len(files) == 1:
-        return [(files[0], topic) for topic in topics or (None,)]
-    if len(topics) < 2:
-        return [(file, topics[0] if topics else None) for file in files]
-    if len(topics) != len(files):
-        raise UsageError(
-            f"{len(files)} logs and {len(topics)} topics: name one log, or one --topic for each; "
-            "parts of one log with several topics go in a folder with their metadata.yaml"
-        )
-    return list(zip(files, topics, strict=True))
+def _size_of(image: Bytes) -> Size:
+    return image.shape[0], image.shape[1]
 
 
 def _rate(streams: Sequence[ImageStream]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Final, TypeVar
 
 import numpy as np
@@ -22,6 +23,29 @@ LAST_NS: Final = 2**62
 Found = TypeVar("Found")
 
 
+@dataclass(frozen=True, slots=True)
+class ChannelFacts:
+    """What a log states of one topic.
+
+    Attributes:
+        topic: its name, or what stands for it.
+        encoding: of its messages: "cdr", "ros1", the codec of a video, "png".
+        schema: type of its messages.
+        messages: how many there are.
+        start_ns: time of the first, nanoseconds; None where nobody knows.
+        end_ns: time of the last.
+        images: whether they are images that are read.
+    """
+
+    topic: str
+    encoding: str
+    schema: str
+    messages: int
+    start_ns: int | None
+    end_ns: int | None
+    images: bool = True
+
+
 class ImageStream(ABC):
     """The images of one camera, in the order of time.
 
@@ -30,6 +54,7 @@ class ImageStream(ABC):
         topic: the topic, or what stands for it.
         times: (n,) uint64, when each was taken, in nanoseconds; empty where nobody knows,
             in which case they are `count` images at any even rate.
+        encoding: how its images are stored, where they are no messages of a log.
         recipe: how an image becomes a frame, for the record.
         warnings: what the user should know: what was cut or left out.
     """
@@ -37,6 +62,7 @@ class ImageStream(ABC):
     path: Location
     topic: str
     times: NDArray[np.uint64]
+    encoding: str = ""
     recipe: str = RECIPE
     warnings: Sequence[str] = ()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
@@ -11,8 +12,7 @@ from replay.export.images import write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
 from replay.export.videos import write_film, write_films
-from replay.recordings.source import RecordedSource
-from replay.runs.folders import is_run
+from replay.inputs.opening import holds_run, open_to_look
 
 RECORDINGS = ("images", "mp4", "lerobot")
 """What a recording can be written as."""
@@ -24,15 +24,24 @@ WRITTEN = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
 """Endings of the files that exports of recordings write; a folder with others is not theirs."""
 
 
-def export(path: Path, out: Path, form: str, *, force: bool = False, lossless: bool = False) -> int:
+def export(
+    path: Path | Sequence[Path],
+    out: Path,
+    form: str,
+    *,
+    force: bool = False,
+    lossless: bool = False,
+    rate: float | None = None,
+) -> int:
     """Write a run's signals, or a recording's frames, in another form.
 
     Args:
-        path: a run; for a form of `RECORDINGS` a recording.
+        path: a run; for a form of `RECORDINGS` a recording, or camera logs.
         out: the file; for those forms the folder, or for one view's video a file *.mp4.
         form: one of `FORMS`; see `export_signals`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
+        rate: frames a second of camera logs; by default the first stream's.
 
     Returns:
         The number of iterations, or of images or frames, written.
@@ -50,17 +59,23 @@ def export(path: Path, out: Path, form: str, *, force: bool = False, lossless: b
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     refuse_special(out)
+    paths = [path] if isinstance(path, Path) else list(path)
     if form in RECORDINGS:
-        return _export_recording(path, out, form, lossless)
+        return _export_recording(paths, out, form, lossless, rate)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
-    return export_signals(path, out, form, force=force)
+    if len(paths) > 1:
+        raise UsageError(f"signals are of one run, {len(paths)} were named")
+    return export_signals(paths[0], out, form, force=force)
 
 
-def _export_recording(path: Path, out: Path, form: str, lossless: bool) -> int:
-    if is_run(path):
+def _export_recording(
+    paths: list[Path], out: Path, form: str, lossless: bool, rate: float | None
+) -> int:
+    path = paths[0]
+    if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
-    with contextlib.closing(RecordedSource(path)) as source:
+    with contextlib.closing(open_to_look(paths, rate)) as source:
         if form != "lerobot" and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from replay.recordings.source import RecordedSource
+from replay.inputs.opening import Logged
 
 PIECE = 1000
 """Most frames that are held at once."""
@@ -22,7 +22,7 @@ PIECE_BYTES = 64 * 2**20
 _UNSAFE = re.compile(r"[^\w.-]|^\.")
 
 
-def pieces(source: RecordedSource, stream: int) -> Iterator[Block]:
+def pieces(source: Logged, stream: int) -> Iterator[Block]:
     """Every frame of one view, in order.
 
     The source's clock is moved.
@@ -47,7 +47,7 @@ def file_names(spec: SourceSpec) -> tuple[str, ...]:
     return tuple(names)
 
 
-def write_images(source: RecordedSource, folder: Path) -> int:
+def write_images(source: Logged, folder: Path) -> int:
     """Write every frame of every view as VIEW/FRAME.png, and return how many there are."""
     for stream, name in enumerate(file_names(source.spec)):
         (folder / name).mkdir()

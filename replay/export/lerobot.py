@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import UsageError
 from replay.export.images import file_names, pieces
 from replay.export.videos import pixel_format, write_film
-from replay.recordings.source import RecordedSource
+from replay.inputs.opening import Logged
 
 VERSION = "v3.0"
 FILE = "chunk-000/file-000"
@@ -51,7 +51,7 @@ Feature = dict[str, Any]
 Stats = dict[str, list[Any]]
 
 
-def write_lerobot(source: RecordedSource, folder: Path, *, name: str, lossless: bool) -> int:
+def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) -> int:
     """Write a recording as a LeRobot dataset, and return how many frames it has.
 
     Images become videos `observation.images.VIEW`, values `observation.VIEW`; numbers become
@@ -90,9 +90,7 @@ def write_lerobot(source: RecordedSource, folder: Path, *, name: str, lossless: 
     return source.frames
 
 
-def _columns(
-    source: RecordedSource, fps: int
-) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
+def _columns(source: Logged, fps: int) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
     """All numbers, (n,) or (n, k), and what they are."""
     spec, n = source.spec, source.frames
     columns: dict[str, NDArray[Any]] = {}
@@ -153,7 +151,7 @@ def _number_stats(values: NDArray[Any]) -> Stats:
     return {key: value.tolist() for key, value in stats.items()}
 
 
-def _image_stats(source: RecordedSource, stream: int) -> Stats:
+def _image_stats(source: Logged, stream: int) -> Stats:
     """Statistics of a view's pixels from 0 to 1, (3, 1, 1) each, from how often each value is."""
     counts = np.zeros(256, dtype=np.int64)
     for block in pieces(source, stream):

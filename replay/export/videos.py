@@ -17,7 +17,7 @@ import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.export.images import file_names, pieces
-from replay.recordings.source import RecordedSource
+from replay.inputs.opening import Logged
 
 LOSSY = {"crf": "18", "preset": "medium"}
 """Compression at which a difference is hardly seen."""
@@ -32,7 +32,7 @@ FULL_RANGE = 2
 """FFmpeg's number for luma from 0 to 255."""
 
 
-def write_films(source: RecordedSource, folder: Path, *, lossless: bool) -> int:
+def write_films(source: Logged, folder: Path, *, lossless: bool) -> int:
     """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
     for stream, name in enumerate(file_names(source.spec)):
         write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
@@ -40,7 +40,7 @@ def write_films(source: RecordedSource, folder: Path, *, lossless: bool) -> int:
 
 
 def write_film(
-    source: RecordedSource, stream: int, file: Path, *, lossless: bool, key_every: int = 0
+    source: Logged, stream: int, file: Path, *, lossless: bool, key_every: int = 0
 ) -> None:
     """Write one view as a video of the recording's frame rate.
 
@@ -83,7 +83,7 @@ def write_film(
         raise CdmisfaError(f"{file} cannot be written: {error}") from error
 
 
-def _pictures(av: Any, source: RecordedSource, stream: int) -> Iterator[Any]:
+def _pictures(av: Any, source: Logged, stream: int) -> Iterator[Any]:
     """The frames of a view as PyAV's, in one buffer."""
     height, width = source.spec.frame_shape
     kind = pixel_format(source.spec.frame_shape)

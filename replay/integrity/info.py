@@ -9,6 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from replay.camera_logs.catalogue import channels_of
+from replay.camera_logs.opening import only_foreign
+from replay.inputs.words import places
 from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.mcap.reader import Check, LogReader
 from replay.mcap.records import Channel
@@ -17,7 +20,7 @@ from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
 from replay.runs.messages import missing
 from replay.storage.listing import log_files
-from replay.storage.location import Location, location
+from replay.storage.location import Location
 
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
@@ -76,24 +79,24 @@ class LogInfo:
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def describe(path: str | Location) -> LogInfo:
-    """Describe a recording's or run's folder, or any MCAP file.
+def describe(*words: str | Location) -> LogInfo:
+    """Describe a recording's or run's folder, any MCAP file, or camera logs; several as one.
 
     Torn and damaged files are described as far as they can be read. Of a URL whose summary
     accounts for every message no more than that is read, and `crc` is "unchecked".
 
     Raises:
         UsageError: no such log.
-        LogDamagedError: not an MCAP file.
+        LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
-    path = location(path)
-    files = [_describe_file(file) for file in log_files(path)]
+    named = places(words)
+    files = [found for place in named for found in _describe_place(place)]
     kinds, states = {f.kind for f in files}, {f.crc for f in files}
     worst: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
     metadata = {name: records for f in files for name, records in f.metadata.items()}
     records = [values for found in metadata.values() for values in found.values()]
     return LogInfo(
-        path=str(path),
+        path=" ".join(map(str, named)),
         kind=kinds.pop() if len(kinds) == 1 else "foreign",
         channels=tuple(c for f in files for c in f.channels),
         chunks=sum(f.chunks for f in files),
@@ -102,9 +105,19 @@ def describe(path: str | Location) -> LogInfo:
         problems=tuple(p for f in files for p in f.problems),
         metadata=metadata,
         seed=_seed(records),
-        ended=_ended(path) if isinstance(path, Path) else None,
+        ended=_ended(named[0]) if len(named) == 1 and isinstance(named[0], Path) else None,
         signals=next((f.signals for f in files if f.signals is not None), None),
     )
+
+
+def _describe_place(place: Location) -> list[LogInfo]:
+    if not isinstance(place, Path) or not only_foreign(place):
+        return [_describe_file(file) for file in log_files(place)]
+    channels = [
+        ChannelInfo(c.topic, c.encoding, c.schema, c.messages, c.start_ns, c.end_ns, place.name)
+        for c in channels_of(place)
+    ]
+    return [LogInfo(str(place), "foreign", tuple(channels), 0, True, "absent", (), {})]
 
 
 def _describe_file(path: Location) -> LogInfo:

@@ -10,9 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
+from replay.camera_logs.catalogue import channels_of
+from replay.camera_logs.opening import only_foreign, open_images
+from replay.camera_logs.stream import ImageStream
+from replay.inputs.words import places
 from replay.integrity.run_files import check_run, read_final, view_again
 from replay.integrity.survey import SCHEMA, Crc, Kind, kind_of, moved, survey
 from replay.mcap.reader import LogReader
+from replay.mcap.records import MalformedRecord
 from replay.mcap.segments import Problem, Segment
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
@@ -48,6 +53,16 @@ class LogCheck:
         return {"schema": SCHEMA, "ok": self.ok, **asdict(self)}
 
 
+def check_logs(*words: str | Location) -> LogCheck:
+    """Check several logs, each by itself; see `check_log`."""
+    checks = [check_log(place) for place in places(words)]
+    return LogCheck(
+        tuple(problem for check in checks for problem in check.problems),
+        tuple(file for check in checks for file in check.files),
+        tuple(note for check in checks for note in check.notes),
+    )
+
+
 def check_log(path: str | Location) -> LogCheck:
     """Check a log, or all logs of a folder, by decoding everything in them, in one pass of each.
 
@@ -57,10 +72,15 @@ def check_log(path: str | Location) -> LogCheck:
     final record states. Of a recording also: each view has every frame once; of a folder, that
     the views have the same frames and none is missing.
 
+    Of a camera log that is not in MCAP files every image is decoded.
+
     Raises:
         UsageError: no such log.
+        CdmisfaError: a package that reads it is missing.
     """
     place = location(path)
+    if isinstance(place, Path) and only_foreign(place):
+        return _check_images(place)
     problems: list[Problem] = []
     files: list[FileCheck] = []
     views: list[_ViewPass] = []
@@ -83,6 +103,29 @@ def check_log(path: str | Location) -> LogCheck:
             problems += _check_views(views, alone=copy.is_file())
     unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
     return LogCheck(tuple(unique), tuple(files), tuple(notes))
+
+
+def _check_images(path: Path) -> LogCheck:
+    """Decode every image of a camera log that has no checksums."""
+    problems: list[Problem] = []
+    notes: dict[str, None] = {}
+    try:
+        for channel in channels_of(path):
+            if channel.images and channel.messages:
+                with contextlib.closing(open_images(path, channel.topic)) as images:
+                    problems += _broken(images)
+                    notes |= dict.fromkeys(images.warnings)
+    except LogDamagedError as error:
+        problems.append(_said(path, error))
+    return LogCheck(tuple(problems), (FileCheck(str(path), "absent"),), tuple(notes))
+
+
+def _broken(images: ImageStream) -> Iterator[Problem]:
+    for row in range(images.count):
+        try:
+            images.image(row)
+        except (MalformedRecord, LogDamagedError) as error:
+            yield Problem(images.where(row), str(error))
 
 
 class _ViewPass:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import rerun as rr
@@ -15,7 +15,8 @@ from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, whole
-from replay.runs.folders import MODULES_FILE, is_run, run_log
+from replay.inputs.opening import holds_run
+from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules
 from replay.runs.outline import Tally, read_outline
@@ -40,16 +41,20 @@ def build_view(
     force: bool = True,
     all_views: Path | None = None,
     tab: str | None = None,
+    beside: Sequence[Path] = (),
+    rate: float | None = None,
 ) -> None:
-    """Write the view of a run or a recording as an .rrd file, whole or not at all.
+    """Write the view of a run, a recording or camera logs as an .rrd file, whole or not at all.
 
     Args:
-        path: a run's folder or its run.mcap, or a recording.
+        path: a run's folder or its run.mcap, a recording, or a camera log.
         out: the file.
         every: show every so many watched frames, of those that were kept.
         force: replace an existing file.
         all_views: the recording that the run learned from, to show what was not watched too.
         tab: name of the tab that is open; by default the first.
+        beside: more camera logs, or files of the recording.
+        rate: frames a second of camera logs; by default the first stream's.
 
     Raises:
         UsageError: there is no such run or recording, `every` is below 1, `out` exists and
@@ -61,7 +66,9 @@ def build_view(
     out, path = Path(out), Path(path)
     if every < 1:
         raise UsageError(f"every {every} frames: it must be at least 1")
-    if is_run(path):
+    if any(map(holds_run, (path, *beside))):
+        if beside:
+            raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
         log = run_log(path)
         with recording_to(out, _name(log), log, force=force) as recording:
             _write_run(recording, log, every, all_views, tab)
@@ -69,7 +76,7 @@ def build_view(
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path, force=force) as recording:
-            write_recording(recording, path, every, tab)
+            write_recording(recording, [path, *beside], every, tab, rate)
 
 
 @contextlib.contextmanager

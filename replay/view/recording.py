@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
+from replay.inputs.opening import Logged, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
 from replay.runs.outline import Outline
@@ -26,21 +27,26 @@ BLOCK = 500
 
 
 def write_recording(
-    recording: rr.RecordingStream, path: Path, every: int, tab: str | None = None
+    recording: rr.RecordingStream,
+    paths: Sequence[Path],
+    every: int,
+    tab: str | None = None,
+    rate: float | None = None,
 ) -> None:
     """Write a recording's views and ground truth, and the layout for them.
 
     Args:
         recording: where they go.
-        path: the recording's folder, or a file of one view.
+        paths: the recording's folder, or files of its views; or camera logs of others.
         every: show images of every this many frames; values are all shown.
         tab: name of the tab that is open.
+        rate: frames a second of camera logs; by default the first stream's.
 
     Raises:
         UsageError: there is no such recording or tab.
         LogDamagedError: it cannot be read.
     """
-    with contextlib.closing(RecordedSource(path)) as source:
+    with contextlib.closing(open_to_look(paths, rate)) as source:
         first, count, spec = source.t, source.frames, source.spec
         write_views(recording, source, count, every)
         for warning in source.warnings:
@@ -52,13 +58,15 @@ def write_recording(
         "fps": spec.fps,
     }
     recording.send_property("recording", rr.AnyValues(**properties))
-    head = write_heads(recording, spec.streams, head_poses(path))
+    ours = isinstance(source, RecordedSource)
+    poses = {name: pose for p in paths for name, pose in head_poses(p).items()} if ours else {}
+    head = write_heads(recording, spec.streams, poses)
     recording.send_blueprint(_layout(spec, first + count, head, tab))
 
 
 def write_views(
     recording: rr.RecordingStream,
-    source: RecordedSource,
+    source: Logged,
     count: int,
     every: int,
     tau: int | None = None,

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from replay.recordings.source import RecordedSource
-from replay.runs.folders import is_run
+from replay.camera_logs.source import ForeignSource
+from replay.inputs.opening import holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_header
 from replay.runs.stretches import read_columns, read_stretches
 
@@ -35,7 +35,7 @@ def frame_at(path: Path, at: str) -> int:
         if path.suffix != ".rrd" and frame > (last := _last_frame(path)):
             raise UsageError(f"--at {at}: there is no such frame, the last of {path} is {last}")
         return frame
-    if path.suffix == ".rrd" or not is_run(path):
+    if path.suffix == ".rrd" or not holds_run(path):
         raise UsageError(f"--at {at}: only a run has iterations and events, say a frame")
     found = ITERATION.fullmatch(at.strip())
     return _of_iteration(path, int(found[1])) if found else _of_event(path, at)
@@ -63,8 +63,10 @@ def _of_event(run: Path, words: str) -> int:
 
 
 def _last_frame(path: Path) -> int:
-    if is_run(path):
+    if holds_run(path):
         ends = (int(piece.frames[-1]) + piece.tau - 1 for piece in read_columns(path))
         return max(ends, default=0)
-    with contextlib.closing(RecordedSource(path, salvage=True)) as source:
+    with contextlib.closing(open_to_look([path], salvage=True)) as source:
+        if isinstance(source, ForeignSource):
+            return source.frames - 1
         return max(ranges[-1][1] for ranges in source.coverage().values()) - 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
@@ -12,10 +12,6 @@ from cdmisfa.cli import options
 from cdmisfa.cli.cameras import camera_options, say_about
 from cdmisfa.cli.commands.record import print_recording, recording_stoppable
 from cdmisfa.cli.progress import bar
-from cdmisfa.core.errors import UsageError
-
-if TYPE_CHECKING:
-    from replay.camera_logs.source import Align
 
 
 @click.command("convert")
@@ -31,37 +27,37 @@ if TYPE_CHECKING:
 @click.pass_context
 def convert_command(
     ctx: click.Context,
+    /,
     source: tuple[str, ...],
     out: Path,
-    topics: tuple[str, ...],
-    size: tuple[int, int] | None,
-    align: Align | None,
-    rate: float | None,
     salvage: bool,
     resume: bool,
     fsync_every: float | None,
     force: bool,
     as_json: bool,
+    **cameras: Any,
 ) -> None:
     """Write camera logs of others as a recording.
 
-    SOURCE is MCAP files or their URLs, ROS bags, or a video or a folder of pictures for each
-    stream. What was interrupted is resumed with --resume.
+    SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, or a video or a folder of
+    pictures for each stream; several, or a pattern such as 'logs/*.mcap'. What was
+    interrupted is resumed with --resume.
     """
     from cdmisfa.experiments.convert import convert
-    from cdmisfa.experiments.sources import CameraOptions, open_cameras
     from recorder.log.folder import refuse_existing
-    from replay.storage.location import Url, location
+    from replay.camera_logs.options import CameraOptions
+    from replay.inputs.opening import open_cameras, refuse_what_is_no_log
+    from replay.inputs.words import places
 
-    places = [location(word) for word in source]
-    for place in places:
-        if not isinstance(place, Url) and not place.exists():
-            raise UsageError(f"{place}: no such file or folder")
+    named = places(source)
+    for place in named:
+        refuse_what_is_no_log(place)
     if not resume:
         refuse_existing(out, force=force)
-    cameras = CameraOptions(topics, size, align, rate)
+    options_given = CameraOptions(**cameras)
     goal = ("convert", str(out))
-    with contextlib.closing(open_cameras(places, cameras, salvage=salvage, goal=goal)) as frames:
+    opened = open_cameras(named, options_given, salvage=salvage, goal=goal)
+    with contextlib.closing(opened) as frames:
         say_about(frames)
         length = frames.spec.length or 0
         with bar("converting", "frames") as shown, recording_stoppable(ctx, out) as stop:

@@ -112,7 +112,8 @@ def learn_command(
         return
     from cdmisfa.experiments.resume import command_of
     from cdmisfa.experiments.runs import RunExhaustedError, run
-    from cdmisfa.experiments.sources import CameraOptions, open_source
+    from cdmisfa.experiments.sources import open_source
+    from replay.camera_logs.options import CameraOptions
 
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")

@@ -16,34 +16,35 @@ if TYPE_CHECKING:
 
 
 @click.command("info")
-@click.argument("path")
+@click.argument("path", nargs=-1, required=True)
 @options.server_limits
 @options.as_json
 @click.pass_context
-def info_command(ctx: click.Context, path: str, as_json: bool) -> None:
-    """Say what is in a recording, a run or any MCAP file.
+def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
+    """Say what is in a recording, a run, any MCAP file, or a camera log.
 
-    Exits with 3 when a checksum is wrong.
+    PATH may be several, a pattern such as 'logs/*.mcap', or a URL. Exits with 3 when a checksum
+    is wrong.
     """
     from replay.integrity.info import describe
 
-    found = describe(path)
+    found = describe(*path)
     if as_json:
         options.print_json(found.as_json())
     else:
-        _print_info(path, found)
+        _print_info(found)
     if found.crc == "bad":
         ctx.exit(LogDamagedError.exit_code)
 
 
-def _print_info(path: str, found: LogInfo) -> None:
+def _print_info(found: LogInfo) -> None:
     state = "complete" if found.complete else "cut short"
     words = [found.kind, state, f"checksums {found.crc}"]
     if found.seed is not None:
         words.append(f"seed {found.seed}")
     if found.ended is not None:
         words.append(f"ended: {found.ended}")
-    click.echo(f"{path}: {', '.join(words)}")
+    click.echo(f"{found.path}: {', '.join(words)}")
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
         click.echo(f"signals of version {version}: {lacks} are not in it, read as NaN")
@@ -66,22 +67,23 @@ def _clock(ns: int | None) -> str:
 
 
 @click.command("verify")
-@click.argument("path")
+@click.argument("path", nargs=-1, required=True)
 @options.server_limits
 @options.as_json
 @click.pass_context
-def verify_command(ctx: click.Context, path: str, as_json: bool) -> None:
+def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
     """Check that a log is whole: structure, checksums, no gaps.
 
-    Exits with 3 when anything is wrong.
+    Of a camera log without checksums every image is decoded. PATH may be several, a pattern such
+    as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong.
     """
-    from replay.integrity.verify import check_log
+    from replay.integrity.verify import check_logs
 
-    found = check_log(path)
+    found = check_logs(*path)
     if as_json:
         options.print_json(found.as_json())
     elif found.ok:
-        click.echo(f"{path}: whole")
+        click.echo(f"{' '.join(path)}: whole")
         for note in found.notes:
             click.echo(note)
     else:

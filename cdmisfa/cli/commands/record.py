@@ -24,7 +24,7 @@ CONVERTED = ("foreign",)
 
 
 @click.command("record")
-@click.argument("scene", required=False)
+@click.argument("scene", nargs=-1)
 @options.out("Folder of the recording.")
 @click.option(
     "--frames",
@@ -55,7 +55,7 @@ CONVERTED = ("foreign",)
 @click.pass_context
 def record_command(
     ctx: click.Context,
-    scene: str | None,
+    scene: tuple[str, ...],
     out: Path | None,
     frames: int,
     seed: int,
@@ -79,29 +79,30 @@ def record_command(
     from recorder.log.begun import Begun, read_recording
     from recorder.world.scenes import SCENES
 
+    _refuse_logs(scene)
     begun = read_recording(out) if resume and out is not None else Begun()
     if begun.source == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
-    scene = scene or "".join(begun.source)
-    if resume and out is not None and not (scene or frames or given_seed or split):
+    named = "".join(scene or begun.source)
+    if resume and out is not None and not (named or frames or given_seed or split):
         from recorder.recording import recorded
 
         if files := recorded(out):
             _say_complete(out)
             print_recording(out, files, as_json=as_json)
             return
-    if not scene:
+    if not named:
         where = f"{out} does not say of what it is: " if resume and out is not None else ""
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     if not given_seed:
         seed = begun.options.get("seed", seed)
-    configuration = configure(scene, preset, settings, seed)
+    configuration = configure(named, preset, settings, seed)
     if scene_picture is not None:
         from recorder.recording import save_picture
 
-        save_picture(scene, configuration.scene, scene_picture, force=force)
+        save_picture(named, configuration.scene, scene_picture, force=force)
         click.echo(f"picture {scene_picture}", err=True)
         if out is None:
             if as_json:
@@ -122,7 +123,7 @@ def record_command(
 
     with bar("recording", "frames") as shown, recording_stoppable(ctx, out, notice="") as stop:
         files = record_scene(
-            scene,
+            named,
             out,
             configuration.scene,
             configuration.record,
@@ -143,6 +144,18 @@ def record_command(
 
 def _say_complete(folder: Path) -> None:
     click.echo(f"{folder} is complete: nothing was left to record", err=True)
+
+
+def _refuse_logs(words: tuple[str, ...]) -> None:
+    """Refuse what is recorded already, and more than one scene."""
+    from recorder.world.scenes import SCENES
+
+    logs = [w for w in words if w not in SCENES and (Path(w).exists() or set("*?:") & set(w))]
+    if logs:
+        convert = f"cdmisfa convert {shlex.join(logs)} -o REC"
+        raise UsageError(f"{logs[0]} is a log, no scene: write it as a recording with {convert}")
+    if len(words) > 1:
+        raise UsageError(f"{' '.join(words)}: record one scene at a time")
 
 
 @contextlib.contextmanager

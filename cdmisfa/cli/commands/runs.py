@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.cameras import rate_option
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.experiments.documents import markdown
 
@@ -102,7 +103,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 
 
 @click.command("export")
-@options.fetched_argument("path")
+@options.fetched_argument("path", nargs=-1)
 @click.option(
     "--to",
     "form",
@@ -111,17 +112,25 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 )
 @options.out("The file to write, for a recording the folder.", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
+@rate_option
 @options.server_limits
 @options.force
 @options.as_json
 def export_command(
-    path: Path, form: str | None, out: Path, lossless: bool, force: bool, as_json: bool
+    path: tuple[Path, ...],
+    form: str | None,
+    out: Path,
+    lossless: bool,
+    rate: float | None,
+    force: bool,
+    as_json: bool,
 ) -> None:
     """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
 
     Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
-    PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0.
+    PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
+    camera logs of others, several at once, too.
     """
     from replay.export.forms import RECORDINGS, export
     from replay.export.tables import CSV_LEAVES_OUT
@@ -129,7 +138,7 @@ def export_command(
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, force=force, lossless=lossless)
+    rows = export(path, out, form, force=force, lossless=lossless, rate=rate)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)
@@ -137,7 +146,12 @@ def export_command(
         click.echo("H.264 changes pixels a little: --lossless keeps them all", err=True)
     if as_json:
         options.print_json(
-            {"schema": options.SCHEMA, "path": str(path), "file": str(out), "rows": rows}
+            {
+                "schema": options.SCHEMA,
+                "path": " ".join(map(str, path)),
+                "file": str(out),
+                "rows": rows,
+            }
         )
         return
     kind = "iterations" if form not in RECORDINGS else "images" if form == "images" else "frames"

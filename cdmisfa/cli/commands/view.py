@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.cameras import rate_option
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
 
 @click.command("view")
-@options.fetched_argument("run")
+@options.fetched_argument("run", nargs=-1)
 @click.option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file and end.")
 @click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
 @click.option(
@@ -41,14 +44,16 @@ from cdmisfa.core.errors import UsageError
     help="Also show what was not watched, from the recording that the run learned from.",
 )
 @click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
+@rate_option
 @options.server_limits
 @options.force
 def view_command(
-    run: Path,
+    run: tuple[Path, ...],
     save: Path | None,
     web: bool,
     screenshot: Path | None,
     at: str | None,
+    rate: float | None,
     size: str | None,
     port: int | None,
     memory_limit: str,
@@ -57,9 +62,9 @@ def view_command(
 ) -> None:
     """Open a run in the Rerun viewer, or save, serve or picture it.
 
-    RUN is the folder of a run, or its run.mcap, a recording, or an .rrd file; of a log behind
-    a URL a copy is made. A sweep that kept its logs is served as a table, one row per run
-    that it was asked for last, until interrupted.
+    RUN is the folder of a run, or its run.mcap, a recording, an .rrd file, or one or several
+    camera logs; of a log behind a URL a copy is made. A sweep that kept its logs is served as a
+    table, one row per run that it was asked for last, until interrupted.
     """
     if sum((save is not None, web, screenshot is not None)) > 1:
         raise click.UsageError("choose one of --save, --web and --screenshot")
@@ -71,15 +76,16 @@ def view_command(
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)
-    if runs_in(run):
+    path, *beside = run
+    if not beside and runs_in(path):
         if save is not None:
-            raise click.UsageError(f"{run} holds many runs, which --save cannot: name one run")
+            raise click.UsageError(f"{path} holds many runs, which --save cannot: name one run")
         if at is not None:
-            raise click.UsageError(f"{run} holds many runs: --at is a moment of one")
-        _view_sweep(run, screenshot, size, shown["tab"], web=web, port=port, force=force)
+            raise click.UsageError(f"{path} holds many runs: --at is a moment of one")
+        _view_sweep(path, screenshot, size, shown["tab"], web=web, port=port, force=force)
         return
-    if is_sweep(run):
-        raise UsageError(f"{run}: this sweep kept no logs: sweep again with --keep-logs")
+    if not beside and is_sweep(path):
+        raise UsageError(f"{path}: this sweep kept no logs: sweep again with --keep-logs")
     if port is not None and not web:
         raise click.UsageError("--port goes with --web, or with a sweep")
     # Only here: they take half a second.
@@ -89,15 +95,22 @@ def view_command(
     from replay.viewer.window import open_window, serve
 
     if save is not None:
-        build_view(run, save, force=force, **shown)
+        build_view(path, save, force=force, beside=beside, rate=rate, **shown)
         click.echo(f"view {save}", err=True)
-    elif screenshot is not None:
-        draw(run, screenshot, at=at, force=force, window=size or WINDOW, **shown)
-        click.echo(f"picture {screenshot}", err=True)
-    elif web:
-        serve(run, memory_limit=memory_limit, port=port, **shown)
-    else:
-        open_window(run, memory_limit=memory_limit, size=size, **shown)
+        return
+    with contextlib.ExitStack() as until_seen:
+        if beside or rate is not None:
+            folder = until_seen.enter_context(tempfile.TemporaryDirectory(prefix="cdmisfa-view-"))
+            built = Path(folder) / f"{path.resolve().stem}.rrd"
+            build_view(path, built, beside=beside, rate=rate, **shown)
+            path, shown = built, {}
+        if screenshot is not None:
+            draw(path, screenshot, at=at, force=force, window=size or WINDOW, **shown)
+            click.echo(f"picture {screenshot}", err=True)
+        elif web:
+            serve(path, memory_limit=memory_limit, port=port, **shown)
+        else:
+            open_window(path, memory_limit=memory_limit, size=size, **shown)
 
 
 def _view_sweep(

@@ -14,12 +14,13 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, LearnerState
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.resume import FORK, read_command, restore
-from cdmisfa.experiments.sources import CameraOptions, open_source
+from cdmisfa.experiments.sources import open_source
 from recorder.world.scenes import SCENES
+from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_keyframe
 
-CAMERAS = ("topics", "size", "align", "rate")
+CAMERAS = ("topics", "size", "fit", "align", "rate")
 """Options of a command that say how images of others become frames."""
 
 

@@ -6,6 +6,7 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "replay.camera_logs.formats.bag": "BagImages",
+        "replay.camera_logs.formats.lerobot": "LeRobotImages",
         "replay.camera_logs.formats.mcap_log": "McapImages",
         "replay.camera_logs.formats.picture_folder": "FolderImages",
         "replay.camera_logs.formats.video": "VideoImages",

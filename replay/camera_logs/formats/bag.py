@@ -12,8 +12,14 @@ import lz4.frame
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.messages import Decoder
-from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
+from replay.camera_logs.messages import Decoder, image_decoder
+from replay.camera_logs.stream import (
+    ChannelFacts,
+    ImageStream,
+    choose_images,
+    explained,
+    sorted_times,
+)
 from replay.mcap.records import MAX_CHUNK, Bytes
 
 BAGS: Final = (".bag", ".db3")
@@ -32,7 +38,7 @@ class BagImages(ImageStream):
         self.path = path
         self._messages: Iterator[tuple[int, bytes]] = iter(())
         self._next = -1
-        ros1 = path.suffix == ".bag" and path.is_file()
+        ros1 = _is_ros1(path)
         self._reader = _opened(path, ros1=ros1)
         try:
             self._connections, self._decode = self._find(topic, ros1=ros1)
@@ -74,15 +80,61 @@ class BagImages(ImageStream):
             yield stamp, data
 
     def _find(self, topic: str | None, *, ros1: bool) -> tuple[list[Any], Decoder]:
-        # Several publishers on one topic are several connections of a ROS 1 bag.
-        kinds = {str(c.topic): str(c.msgtype) for c in self._reader.connections}
+        kinds = _kinds(self._reader, ros1=ros1)
         encoding = "ros1" if ros1 else "cdr"
-        channels = [
-            (name, kind.replace("/msg/", "/") if ros1 else kind, encoding, name)
-            for name, kind in kinds.items()
-        ]
+        channels = [(name, kind, encoding, name) for name, kind in kinds.items()]
         chosen, decode = choose_images(self.path, topic, channels)
         return [c for c in self._reader.connections if c.topic == chosen], decode
+
+
+def bag_channels(path: Path) -> list[ChannelFacts]:
+    """What is on each topic of a bag, of which every message is read.
+
+    Raises:
+        CdmisfaError: the package rosbags is missing.
+        LogDamagedError: rosbags cannot read it.
+    """
+    ros1 = _is_ros1(path)
+    reader = _opened(path, ros1=ros1)
+    try:
+        kinds, encoding = _kinds(reader, ros1=ros1), "ros1" if ros1 else "cdr"
+        stamps: dict[str, list[int]] = {name: [] for name in kinds}
+        with explained(path, "rosbags"):
+            for connection, stamp, _ in reader.messages():
+                stamps[str(connection.topic)].append(stamp)
+    finally:
+        reader.close()
+    return [
+        ChannelFacts(
+            name,
+            encoding,
+            kind,
+            len(stamps[name]),
+            min(stamps[name], default=None),
+            max(stamps[name], default=None),
+            image_decoder(kind, encoding) is not None,
+        )
+        for name, kind in kinds.items()
+    ]
+
+
+def bag_topics(path: Path) -> list[str]:
+    """The topics of images in a bag; raises as `bag_channels` does."""
+    ros1 = _is_ros1(path)
+    reader = _opened(path, ros1=ros1)
+    kinds, encoding = _kinds(reader, ros1=ros1), "ros1" if ros1 else "cdr"
+    reader.close()
+    return [name for name, kind in kinds.items() if image_decoder(kind, encoding)]
+
+
+def _is_ros1(path: Path) -> bool:
+    return path.suffix == ".bag" and path.is_file()
+
+
+def _kinds(reader: Any, *, ros1: bool) -> dict[str, str]:
+    """The type of each topic's messages; several publishers of ROS 1 are several connections."""
+    kinds = {str(c.topic): str(c.msgtype) for c in reader.connections}
+    return {name: kind.replace("/msg/", "/") if ros1 else kind for name, kind in kinds.items()}
 
 
 def _opened(path: Path, *, ros1: bool) -> Any:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
+from replay.camera_logs.messages import image_decoder
 from replay.camera_logs.stream import ImageStream, choose_images, sorted_times
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Bytes, MalformedRecord
@@ -100,3 +101,19 @@ class McapImages(ImageStream):
             pairs = np.concatenate([p for c, p in self.reader.index(segment) if c == number])
             pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
             yield segment, pairs[:, 0], np.arange(len(pairs))
+
+
+def mcap_topics(path: Location) -> list[str]:
+    """The topics of images in an MCAP log.
+
+    Raises:
+        LogDamagedError: it is no MCAP file.
+    """
+    with LogReader(path, salvage=True) as reader:
+        kinds = {number: schema.name for number, schema in reader.schemas.items()}
+        channels = reader.channels.values()
+        return list(
+            dict.fromkeys(
+                c.topic for c in channels if image_decoder(kinds.get(c.schema_id, ""), c.encoding)
+            )
+        )

@@ -33,6 +33,7 @@ class FolderImages(ImageStream):
         )
         for file in self._files:
             check_regular(file, MAX_BYTES)
+        self.encoding = " ".join(sorted({p.suffix.lower()[1:] for p in self._files}))
         self.times = np.empty(0, np.uint64)
 
     @property

@@ -97,6 +97,7 @@ class VideoImages(ImageStream):
         pixels = stream.codec_context.width * stream.codec_context.height
         if not 0 < pixels <= MAX_PIXELS:
             raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")
+        self.encoding = str(stream.codec_context.name)
         self._tick = Fraction(stream.time_base)
         stamps: list[int] = []
         packets = 0

@@ -1,0 +1,174 @@
+"""LeRobot datasets, layout v3.0: a camera's images of all episodes, one after the other.
+
+The layout is read as it is published (github.com/huggingface/lerobot), with PyArrow and PyAV.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.camera_logs.formats.video import VideoImages
+from replay.camera_logs.pixels import compressed_gray
+from replay.camera_logs.stream import ChannelFacts, ImageStream, explained
+from replay.mcap.records import Bytes, MalformedRecord
+
+INFO: Final = "meta/info.json"
+PAUSE: Final = 20
+"""Frames that would fit between two episodes, of which nobody knows when they were."""
+
+
+class LeRobotImages(ImageStream):
+    """The images of one camera of a dataset, the episodes in their order.
+
+    Raises:
+        UsageError: no such camera, or another version of the layout.
+        LogDamagedError: its tables cannot be read, or contradict each other.
+        CdmisfaError: the package av is missing.
+    """
+
+    def __init__(self, path: Path, topic: str | None) -> None:
+        self.path = path
+        self._info = _info(path)
+        cameras = dataset_cameras(path)
+        if topic is None and len(cameras) == 1:
+            topic = cameras[0]
+        if topic not in cameras:
+            wrong = "name one --topic" if topic is None else f"no topic {topic}"
+            known = ", ".join(cameras) or "none"
+            raise UsageError(f"{path}: {wrong}; it has images on: {known}")
+        self.topic = topic
+        self._video = self._info["features"][topic]["dtype"] == "video"
+        self._fps = float(self._info["fps"])
+        place = f"videos/{topic}/" if self._video else "data/"
+        keys = [f"{place}chunk_index", f"{place}file_index"]
+        start = f"{place}from_timestamp" if self._video else "dataset_from_index"
+        rows = _episodes(path, ["episode_index", "length", *keys, start])
+        self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
+        scale = self._fps if self._video else 1
+        self._first = [round(float(row[start]) * scale) for row in rows]
+        lengths = np.array([int(row["length"]) for row in rows], np.int64)
+        self._starts = np.concatenate([[0], np.cumsum(lengths)])
+        ticks = np.arange(self._starts[-1]) + np.repeat(np.arange(len(rows)) * PAUSE, lengths)
+        self.times = np.round(ticks * (NANOSECONDS / self._fps)).astype(np.uint64)
+        if not len(self.times):
+            raise UsageError(f"{path}: there is no frame in it")
+        self._open: tuple[Path, Any] | None = None
+        if len(rows) > 1:
+            self.warnings = [f"{path}: {topic} is of {len(rows)} episodes, with pauses between"]
+        if self._video:
+            self.recipe = VideoImages.recipe
+
+    def image(self, row: int) -> Bytes:
+        episode = int(np.searchsorted(self._starts, row, side="right")) - 1
+        place = self._first[episode] + row - int(self._starts[episode])
+        chunk, number = self._files[episode]
+        template = self._info["video_path" if self._video else "data_path"]
+        with explained(self.path, "LeRobot's layout"):
+            name = template.format(video_key=self.topic, chunk_index=chunk, file_index=number)
+            file = self.path / name
+        if self._open is None or self._open[0] != file:
+            self.close()
+            if not file.is_file():
+                raise LogDamagedError(f"{file}: there is no such file, its dataset names it")
+            self._open = (file, VideoImages(file, None) if self._video else self._table(file))
+        images = self._open[1]
+        if not self._video:
+            return self._picture(images, place)
+        if not (
+            place < images.count
+            and abs(int(images.times[place]) / NANOSECONDS * self._fps - place) < 0.5
+        ):
+            raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
+        found: Bytes = images.image(place)
+        return found
+
+    def close(self) -> None:
+        opened, self._open = self._open, None
+        if opened is not None and self._video:
+            opened[1].close()
+
+    def _table(self, file: Path) -> Any:
+        import pyarrow.parquet as pq
+
+        with explained(file, "PyArrow"):
+            return pq.read_table(file, columns=["index", self.topic])
+
+    def _picture(self, table: Any, index: int) -> Bytes:
+        row = index - int(table["index"][0].as_py())
+        if not 0 <= row < table.num_rows:
+            raise MalformedRecord(f"its table has no frame {index}")
+        value = table[self.topic][row].as_py()
+        data = value.get("bytes") if isinstance(value, Mapping) else None
+        if not isinstance(data, bytes):
+            raise MalformedRecord("its table holds no picture there")
+        return compressed_gray(data)
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is a LeRobot dataset."""
+    return (path / INFO).is_file()
+
+
+def dataset_cameras(path: Path) -> list[str]:
+    """The features of a dataset that are images."""
+    features = _info(path)["features"]
+    return [name for name, feature in features.items() if feature.get("dtype") in _IMAGES]
+
+
+def dataset_channels(path: Path) -> list[ChannelFacts]:
+    """What a dataset states of each of its features, one value a frame."""
+    info = _info(path)
+    return [
+        ChannelFacts(
+            name,
+            str(feature.get("dtype")),
+            "x".join(map(str, feature.get("shape", ()))),
+            int(info["total_frames"]),
+            None,
+            None,
+            feature.get("dtype") in _IMAGES,
+        )
+        for name, feature in info["features"].items()
+    ]
+
+
+_IMAGES: Final = ("video", "image")
+
+
+def _info(path: Path) -> Any:
+    try:
+        info = json.loads((path / INFO).read_text("utf-8"))
+        version = str(info["codebase_version"])
+        sound = all(isinstance(f, dict) for f in info["features"].values()) and info["fps"] > 0
+        int(info["total_frames"])
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+        sound, version = False, "v3"
+    if not version.startswith("v3"):
+        raise UsageError(
+            f"{path} is a LeRobot dataset {version}, v3.0 is read: convert it with LeRobot's "
+            "convert_dataset_v21_to_v30"
+        )
+    if not sound:
+        raise LogDamagedError(f"{path / INFO}: it describes no LeRobot dataset")
+    return info
+
+
+def _episodes(path: Path, columns: list[str]) -> list[dict[str, Any]]:
+    """The rows of the tables of episodes, in their order."""
+    import pyarrow.parquet as pq
+
+    rows: list[dict[str, Any]] = []
+    files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
+    if not files:
+        raise LogDamagedError(f"{path}: there is no table of its episodes")
+    for file in files:
+        with explained(file, "PyArrow"):
+            rows += pq.ParquetFile(file).read(columns=columns).to_pylist()
+    return sorted(rows, key=lambda row: int(row["episode_index"]))

@@ -1,0 +1,29 @@
+"""How images of other people's logs become streams of frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Align = Literal["index", "time"]
+Fit = Literal["crop", "pad", "stretch"]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOptions:
+    """How images of other people's logs become streams of frames.
+
+    Attributes:
+        topics: the topics, a stream each; patterns as of file names mean all that match.
+        size: (height, width) of a frame, or None for one from the images' own.
+        align: how streams of unequal length, start or rate are put on one clock: "index",
+            "time", or None to refuse them.
+        rate: frames a second; None for the rate of the first stream.
+        fit: how images of another aspect ratio become frames: see `fitted`.
+    """
+
+    topics: tuple[str, ...] = ()
+    size: tuple[int, int] | None = None
+    align: Align | None = None
+    rate: float | None = None
+    fit: Fit = "crop"

@@ -1,0 +1,7 @@
+"""What words of a command line name: recordings, runs, and logs of others, opened alike."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__, {"replay.inputs.opening": "open_log", "replay.inputs.words": "places"}
+)

@@ -1,0 +1,192 @@
+"""Every command takes every kind of log, or says in one line why it does not."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, START_MS, WIDTH, pictures, write_cameras, write_pictures
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from mcap.writer import Writer
+from PIL import Image
+from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
+from test_foreign import raw_json, ros1
+from web_server import serving
+
+COUNT = 60
+STEP_MS = 20
+PICTURES = ("png folder", "jpeg folder")
+FORMATS = (
+    "recording",
+    "run",
+    "foxglove mcap",
+    "compressed mcap",
+    "json mcap",
+    "ros1 mcap",
+    "ros2 mcap folder",
+    "bag",
+    "db3",
+    "db3 folder",
+    "video",
+    *PICTURES,
+    "lerobot",
+    "url",
+    "several",
+    "glob",
+)
+BAGS = ("ros2 mcap folder", "bag", "db3", "db3 folder")
+COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record")
+REFUSED = {
+    ("export", "run"): "name the recording",
+    ("learn", "run"): "is a run, not a recording",
+    ("convert", "run"): "is a run, not a recording",
+    **{("record", kind): "cdmisfa convert" for kind in FORMATS},
+}
+"""Cells that make no sense, and words of the line that says so."""
+
+
+def write_mcap(path: Path, schema: str, encoding: str, messages: Iterator[bytes]) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        kind = writer.register_schema(schema, "", b"")
+        channel = writer.register_channel("/cam", encoding, kind)
+        for i, message in enumerate(messages):
+            time = (START_MS + i * STEP_MS) * 1_000_000
+            writer.add_message(channel, time, message, time)
+        writer.finish()
+    return path
+
+
+def png(image: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def raw(image: np.ndarray) -> dict[str, object]:
+    fields = {"height": HEIGHT, "width": WIDTH, "encoding": "mono8", "step": WIDTH}
+    return {**fields, "big": 0, "data": image.tobytes()}
+
+
+def write_video(path: Path) -> Path:
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=50)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for image in pictures(COUNT):
+            frame = av.VideoFrame.from_ndarray(np.stack([image] * 3, axis=2), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[object]]]:
+    """Words that name a log of each kind."""
+    from cdmisfa.cli import run
+
+    pytest.importorskip("rosbags")
+    base = tmp_path_factory.mktemp("logs")
+    for name in ("ros1", "ros2", "db", "mcap", "jpeg"):
+        (base / name).mkdir()
+    write_cameras(base / "a.mcap", {"/cam": (COUNT, STEP_MS)})
+    write_cameras(base / "part-1.mcap", {"/left": (COUNT, STEP_MS)})
+    write_cameras(base / "part-2.mcap", {"/right": (COUNT, STEP_MS)})
+    write_pictures(base / "png", COUNT)
+    for i, image in enumerate(pictures(COUNT)):
+        Image.fromarray(image).save(base / "jpeg" / f"{i}.jpg")
+    made = ("a.mcap", "rec", "run", "lerobot/")
+    for words in (
+        ["convert", "a.mcap", "-o", "rec"],
+        ["learn", "rec", "-o", "run", "--max-iterations", "1", "--no-rerun"],
+        ["export", "rec", "--to", "lerobot", "-o", "lerobot/"],
+    ):
+        assert run([str(base / word) if word in made else word for word in words]) == 0
+    images = list(pictures(COUNT))
+    packed = (CompressedImage(data=png(i), format="png").SerializeToString() for i in images)
+    with serving() as web:
+        web.files["/a.mcap"] = (base / "a.mcap").read_bytes()
+        yield {
+            "recording": [base / "rec"],
+            "run": [base / "run"],
+            "foxglove mcap": [base / "a.mcap"],
+            "compressed mcap": [
+                write_mcap(base / "c.mcap", "foxglove.CompressedImage", "protobuf", packed)
+            ],
+            "json mcap": [
+                write_mcap(
+                    base / "j.mcap",
+                    "foxglove.RawImage",
+                    "json",
+                    (raw_json(**raw(i)) for i in images),
+                )
+            ],
+            "ros1 mcap": [
+                write_mcap(
+                    base / "r.mcap", "sensor_msgs/Image", "ros1", (ros1(**raw(i)) for i in images)
+                )
+            ],
+            "ros2 mcap folder": [ros2_mcap(base / "mcap")],
+            "bag": [ros1_bag(base / "ros1")],
+            "db3": [ros2_database(base / "db")],
+            "db3 folder": [ros2_bag(base / "ros2")],
+            "video": [write_video(base / "film.mp4")],
+            "png folder": [base / "png"],
+            "jpeg folder": [base / "jpeg"],
+            "lerobot": [base / "lerobot"],
+            "url": [web.url("/a.mcap")],
+            "several": [base / "part-1.mcap", base / "part-2.mcap"],
+            "glob": [base / "part-*.mcap"],
+        }
+
+
+def command_line(command: str, kind: str, words: list[object], out: Path) -> list[object]:
+    """The command, with what every kind of log needs."""
+    rate = ["--rate", "50"] if kind in PICTURES else []
+    topics = ["--topic", "/cam_*"] if kind in BAGS else []
+    return {
+        "info": ["info", *words, "--json"],
+        "verify": ["verify", *words, "--json"],
+        "view": ["view", *words, "--save", out / "view.rrd", *rate],
+        "export": ["export", *words, "--to", "images", "-o", out / "images", *rate],
+        "learn": ["learn", *words, "--max-iterations", "1", "--json", *topics, *rate],
+        "convert": ["convert", *words, "-o", out / "rec", "--json", *topics, *rate],
+        "record": ["record", *words, "-o", out / "rec", "--frames", "5"],
+    }[command]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_takes_a_log_or_says_why_not(
+    command: str, kind: str, logs: dict[str, list[object]], cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    done = cdmisfa(*command_line(command, kind, logs[kind], tmp_path))
+    refused = REFUSED.get((command, kind))
+    if refused is not None:
+        assert done.code == 2
+        assert refused in done.err
+        assert (done.err[:9], done.err.count("\n")) == ("cdmisfa: ", 1)
+        assert not list(tmp_path.iterdir())
+        return
+    assert done.code == 0, done.err
+    streams = 2 if kind in (*BAGS, "several", "glob") else 1
+    match command:
+        case "info":
+            messages = [channel["messages"] for channel in done.json["channels"]]
+            assert kind == "run" or messages.count(COUNT) >= streams
+        case "verify":
+            assert done.json["ok"]
+            assert done.json["files"]
+        case "view":
+            assert (tmp_path / "view.rrd").stat().st_size > 1000
+        case "export":
+            assert len(list((tmp_path / "images").rglob("*.png"))) == streams * COUNT
+        case "learn":
+            assert done.json["iterations"] == 1
+        case "convert":
+            assert [view["frames"] for view in done.json["views"]] == [COUNT] * streams
