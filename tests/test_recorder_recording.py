@@ -74,6 +74,10 @@ def test_every_view_of_every_frame_is_there_and_equals_live(icub):
                 f"/view/{view}": "foxglove.RawImage",
                 "/truth": "cdmisfa.GroundTruth",
                 "/head_pose": "foxglove.PoseInFrame",
+                f"/calibration/{view}/left_eye": "foxglove.CameraCalibration",
+                f"/calibration/{view}/right_eye": "foxglove.CameraCalibration",
+                "/tf": "foxglove.FrameTransforms",
+                "/scene": "foxglove.SceneUpdate",
             }
             messages = list(reader.iter_messages(topics=[f"/view/{view}"]))
             images = [RawImage_pb2.RawImage.FromString(m.data) for _, _, m in messages]

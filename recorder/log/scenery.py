@@ -206,6 +206,12 @@ def times(first: Quaternion, second: Quaternion) -> Quaternion:
     )
 
 
+def inverse(turn: Quaternion) -> Quaternion:
+    """The turn back."""
+    x, y, z, w = turn
+    return -x, -y, -z, w
+
+
 def turned(turn: Quaternion, vector: Sequence[float]) -> NDArray[np.float64]:
     """(3,) a vector after a turn."""
     axis, straight = np.array(turn[:3]), np.array(vector, dtype=np.float64)

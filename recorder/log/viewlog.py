@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,16 @@ from recorder.log.messages import (
     view_topic,
 )
 from recorder.log.resume import aside_path, messages
+from recorder.log.scenemessages import (
+    OBJECTS_TOPIC,
+    SIDES,
+    TRANSFORMS_TOPIC,
+    CalibrationEncoder,
+    ObjectsEncoder,
+    TransformsEncoder,
+    calibration_topic,
+)
+from recorder.log.scenery import scenery_of
 from recorder.log.split import Split
 from recorder.log.viewfacts import MAX_FRAMES, Identity, version
 
@@ -31,7 +42,9 @@ ROOT_FRAME = "root"
 
 
 class ViewLog:
-    """Writes one view of a recording: frames, ground truth and the head's pose.
+    """Writes one view of a recording: frames, ground truth, the head's pose, and the world.
+
+    Cameras and frames are written with the pose, the objects at every frame.
 
     The frame is the last message of its time, so that a frame that can be read has its
     truth, too.
@@ -77,6 +90,10 @@ class ViewLog:
             encoders[TRUTH_TOPIC] = TruthEncoder(spec.truth)
         if pose is not None:
             encoders[POSE_TOPIC] = PoseEncoder(ROOT_FRAME)
+        world = _world_of(view, identity, pose)
+        self._standing = tuple(topic for topic in world if topic != OBJECTS_TOPIC)
+        self._moving = OBJECTS_TOPIC in world
+        encoders |= world
         self.file = log = LogFile(
             folder / (name or part_name(view, None)),
             library=f"cdmisfa {version('cdmisfa')}",
@@ -109,6 +126,10 @@ class ViewLog:
         for frame, values in zip(block.frames, block.truth, strict=True):
             if pose is not None and (self.t % self._pose_every == 0 or self.t == self._first):
                 self._write(POSE_TOPIC, pose.position, pose.quaternion)
+                for topic in self._standing:
+                    self._write(topic)
+            if self._moving:
+                self._write(OBJECTS_TOPIC, values)
             if self._spec.truth:
                 self._write(TRUTH_TOPIC, values)
             self._write(self._topic, frame)
@@ -136,6 +157,26 @@ class ViewLog:
         number, encode = self._channels[topic]
         time = self._spec.time_ns(self.t)
         self.file.write(number, time, encode(time, *values), self.t)
+
+
+def _world_of(view: str, identity: Identity, pose: HeadPose | None) -> dict[str, Any]:
+    """What encodes the world of a scene that is described, by topic; nothing of others."""
+    config = identity.config.get("scene")
+    if pose is None or not isinstance(config, Mapping):
+        return {}
+    scenery = scenery_of(config, pose.position)
+    gaze = scenery.gaze(view) if scenery is not None else None
+    if scenery is None or gaze is None:
+        return {}
+    eyes = zip(SIDES, gaze.eyes, strict=True)
+    found: dict[str, Any] = {
+        calibration_topic(view, side): CalibrationEncoder(eye, f"{view}/{side}")
+        for side, eye in eyes
+    }
+    found[TRANSFORMS_TOPIC] = TransformsEncoder(gaze, ROOT_FRAME)
+    if all(set(thing.truth) <= set(identity.spec.truth) for thing in scenery.objects):
+        found[OBJECTS_TOPIC] = ObjectsEncoder(scenery, identity.spec.truth, ROOT_FRAME)
+    return found
 
 
 class ViewParts:
