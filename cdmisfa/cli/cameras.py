@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -30,6 +31,19 @@ rate_option = click.option(
     metavar="HZ",
     help="Frames a second of camera logs; by default the first stream's.",
 )
+
+
+def _seconds(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
+    if value is None:
+        return None
+    found = re.fullmatch(r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d{1,9})?)", value, re.ASCII)
+    if found is None:
+        raise click.BadParameter(
+            f"{value!r} is no time: write seconds, or MINUTES:SECONDS, as 1:30", ctx, param
+        )
+    hours, minutes, seconds = (float(part or 0) for part in found.groups())
+    return hours * 3600 + minutes * 60 + seconds
+
 
 camera_options = options.together(
     click.option(
@@ -62,6 +76,30 @@ camera_options = options.together(
         "last image at each time. By default they are refused.",
     ),
     rate_option,
+    click.option(
+        "--gaps",
+        type=click.Choice(["skip", "hold"]),
+        default="skip",
+        show_default=True,
+        help="Where a camera paused for more than ten of its steps: skip it, so that nothing is "
+        "learned across, or hold the last image.",
+    ),
+    click.option(
+        "--from",
+        "start",
+        callback=_seconds,
+        default="0",
+        metavar="TIME",
+        help="Leave out images before this time of the log, in seconds or as MINUTES:SECONDS.",
+    ),
+    click.option(
+        "--to", "stop", callback=_seconds, metavar="TIME", help="Leave out images from then on."
+    ),
+    click.option(
+        "--dry-run",
+        is_flag=True,
+        help="Say what would be read from camera logs, and write nothing.",
+    ),
 )
 
 
@@ -69,11 +107,45 @@ def say_about(source: FrameSource) -> None:
     """Say on stderr what the user should know of a source, and how images became frames."""
     for warning in getattr(source, "warnings", ()):
         click.echo(f"warning: {warning}", err=True)
-    for name, shape in getattr(source, "shapes", {}).items():
-        click.echo(f"{name}: {shape}", err=True)
+    shapes = getattr(source, "shapes", {})
     for name, counts in getattr(source, "alignment", {}).items():
         click.echo(
-            f"{name}: {counts['messages']} images, "
+            f"{name}: {shapes[name]}; {counts['messages']} images, "
             f"{counts['repeated']} frames repeated, {counts['dropped']} images dropped",
             err=True,
         )
+
+
+def say_changes(source: FrameSource) -> None:
+    """Say on stderr which streams changed the size of their images while they were read."""
+    for line in getattr(source, "changes", {}).values():
+        click.echo(f"warning: {line}", err=True)
+
+
+def print_plan(source: FrameSource, *, as_json: bool) -> None:
+    """Print what would be read: streams, sizes, rates, gaps and drops.
+
+    Raises:
+        UsageError: it is no camera log.
+    """
+    from replay.camera_logs.source import ForeignSource
+
+    if not isinstance(source, ForeignSource):
+        raise UsageError("--dry-run is for camera logs: cdmisfa info says what is in a recording")
+    rows = source.plan()
+    if as_json:
+        size = list(source.spec.frame_shape)
+        plan = {"frames": source.frames, "rate": source.spec.fps, "size": size, "streams": rows}
+        options.print_json({"schema": options.SCHEMA, **plan, "warnings": source.warnings})
+        return
+    head = ("stream", "images", "rate", "size", "missing", "gaps", "repeated", "dropped")
+    cells = [
+        (row["stream"], row["images"], "-" if row["rate"] is None else f"{row['rate']:.6g}",
+         row["shape"], row["missing"], len(row["gaps"]), row["repeated"], row["dropped"])
+        for row in rows
+    ]  # fmt: skip
+    options.print_table(head, cells)
+    seconds = source.frames / source.spec.fps
+    click.echo(f"{source.frames} frames at {source.spec.fps:g} a second, {seconds:.6g} s")
+    for warning in source.warnings:
+        click.echo(f"warning: {warning}", err=True)

@@ -13,6 +13,8 @@ from cdmisfa.core.errors import UsageError
 
 MAX_FRAMES: Final = 2**31
 """Most frames that streams are aligned to."""
+GAP_STEPS: Final = 10
+"""A pause between two images of more than so many median steps is a gap."""
 _UNEVEN: Final = 0.01
 """By how much of itself a rate may differ from another that counts as the same."""
 
@@ -23,10 +25,18 @@ Rows = NDArray[np.int64]
 """Which image of a stream each frame shows, (frames,)."""
 
 
-def counts(times: Times, rows: Rows) -> dict[str, int]:
-    """Images of a stream, frames that show one again, and images that no frame shows."""
+Gap = tuple[int, int]
+"""Frames [start, stop) in which a stream has no image, and shows the last before."""
+
+
+def counts(times: Times, rows: Rows, gaps: Sequence[Gap] = ()) -> dict[str, int]:
+    """Images of a stream, frames that show one again, and images that no frame shows.
+
+    Frames within gaps are not counted.
+    """
     shown = len(np.unique(rows))
-    repeated, dropped = len(rows) - shown, len(times) - shown
+    held = sum(stop - start for start, stop in gaps)
+    repeated, dropped = len(rows) - held - shown, len(times) - shown
     return {"messages": len(times), "repeated": repeated, "dropped": dropped}
 
 
@@ -84,3 +94,88 @@ def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list
         raise UsageError(f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one")
     clock = times_of(np.arange(int(ticks)), fps, start).astype(np.uint64)
     return [np.searchsorted(times, clock, side="right") - 1 for times in streams]
+
+
+def pauses(times: Times) -> Rows:
+    """The images before which a stream paused for more than `GAP_STEPS` of its steps, (n,)."""
+    step = step_of(times) * NANOSECONDS
+    return np.flatnonzero(np.diff(times) > GAP_STEPS * step) + 1 if step > 0 else np.empty(0, int)
+
+
+def missing(times: Times) -> int:
+    """How many images a stream lacks between its first and last that its rate would have had."""
+    step = step_of(times) * NANOSECONDS
+    if not step > 0:
+        return 0
+    return int(np.maximum(np.round(np.diff(times) / step) - 1, 0).sum())
+
+
+def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows], list[Gap]]:
+    """Put frames that show the last image again where all streams pause together.
+
+    Args:
+        rows: which image of each stream each frame shows, the i-th each.
+        first: the times of the first stream.
+        fps: frames a second.
+
+    Returns:
+        As `rows`, so long as the streams last by their times; and the frames put in.
+    """
+    count = len(rows[0])
+    begins = [int(i) for i in pauses(first) if i < count]
+    ticks = np.ones(count, np.int64)
+    for i in begins:
+        ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
+    frame = np.cumsum(ticks) - ticks[0]
+    if count and frame[-1] > MAX_FRAMES:
+        raise UsageError(f"its images are {frame[-1]} frames apart: choose a part of the log")
+    shows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
+    gaps = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
+    return [stream[shows] for stream in rows], gaps
+
+
+def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Gap]:
+    """The frames in which a stream that is aligned by time pauses.
+
+    Args:
+        times: of its images, nanoseconds.
+        start: time of frame 0.
+        frames: how many there are.
+        fps: frames a second.
+    """
+    clock = times_of(np.arange(frames), fps, start).astype(np.uint64)
+    step = step_of(times) * NANOSECONDS
+    found = []
+    for i in pauses(times):
+        begins = int(np.searchsorted(clock, int(times[i - 1]) + int(step / 2), side="right"))
+        ends = int(np.searchsorted(clock, times[i], side="left"))
+        if begins < ends:
+            found.append((begins, ends))
+    return found
+
+
+def between(gaps: Sequence[Gap], period: int, start: int, stop: int) -> list[tuple[int, int]]:
+    """The stretches [low, high) of the frames [start, stop) that lie between gaps.
+
+    Args:
+        gaps: in their order.
+        period: frames after which they come again.
+        start: the first frame.
+        stop: the frame after the last.
+    """
+    found: list[tuple[int, int]] = []
+    low = start
+    for lap in range(start // period, (stop - 1) // period + 1) if gaps else ():
+        for begins, ends in gaps:
+            high = min(begins + lap * period, stop)
+            if low < high:
+                found.append((low, high))
+            low = max(low, ends + lap * period)
+    return [*found, (low, stop)] if low < stop else found
+
+
+def in_words(gaps: Sequence[Gap], fps: float) -> str:
+    """How many gaps there are, how long the longest is, and when it begins."""
+    start, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
+    many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
+    return f"{many} of {(stop - start) / fps:.3g} s after {(start - 1) / fps:.6g} s"

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import UsageError
+from replay.camera_logs.alignment import Times
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 from replay.storage.location import Location
@@ -39,6 +42,59 @@ class JoinedImages(ImageStream):
     def close(self) -> None:
         for part in self.parts:
             part.close()
+
+
+class Excerpt(ImageStream):
+    """The images of a stream from one to another."""
+
+    def __init__(self, images: ImageStream, start: int, stop: int) -> None:
+        self.path, self.topic = images.path, images.topic
+        self.recipe, self.warnings = images.recipe, images.warnings
+        self.parts = getattr(images, "parts", [images])
+        self.times = images.times[start:stop]
+        self._images, self._start, self._length = images, start, stop - start
+
+    @property
+    def count(self) -> int:
+        return self._length
+
+    def image(self, row: int) -> Bytes:
+        return self._images.image(self._start + row)
+
+    def where(self, row: int) -> str:
+        return self._images.where(self._start + row)
+
+    def close(self) -> None:
+        self._images.close()
+
+
+def excerpts(
+    streams: Sequence[ImageStream], times: Sequence[Times], start: float, stop: float | None
+) -> list[ImageStream]:
+    """What streams show from one moment to another, in seconds after the first image of all.
+
+    Args:
+        streams: the streams.
+        times: of their images, (n,) nanoseconds each.
+        start: of the first images.
+        stop: no image is so late; None for all.
+
+    Raises:
+        UsageError: a stream has no image there.
+    """
+    zero = min(int(t[0]) for t in times)
+    ends = [None if s is None else zero + round(s * NANOSECONDS) for s in (start, stop)]
+    found: list[ImageStream] = []
+    for images, own in zip(streams, times, strict=True):
+        low, high = (len(own) if e is None else int(np.searchsorted(own, e)) for e in ends)
+        if low >= high:
+            lasts = (int(own[-1]) - zero) / NANOSECONDS
+            raise UsageError(
+                f"{images.path}: {images.topic} has no images there, its last is at {lasts:g} s: "
+                "choose another --from or --to"
+            )
+        found.append(Excerpt(images, low, high))
+    return found
 
 
 def join_parts(streams: Sequence[ImageStream]) -> list[ImageStream]:

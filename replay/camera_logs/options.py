@@ -7,6 +7,7 @@ from typing import Literal
 
 Align = Literal["index", "time"]
 Fit = Literal["crop", "pad", "stretch"]
+Gaps = Literal["skip", "hold"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +21,10 @@ class CameraOptions:
             "time", or None to refuse them.
         rate: frames a second; None for the rate of the first stream.
         fit: how images of another aspect ratio become frames: see `fitted`.
+        gaps: what frames show in which a stream pauses: "skip" for nothing, so that no block
+            reaches across, "hold" for the last image before.
+        start: seconds after the first image of all, before which images are left out.
+        stop: seconds after it from which on they are left out; None for never.
     """
 
     topics: tuple[str, ...] = ()
@@ -27,3 +32,6 @@ class CameraOptions:
     align: Align | None = None
     rate: float | None = None
     fit: Fit = "crop"
+    gaps: Gaps = "skip"
+    start: float = 0.0
+    stop: float | None = None

@@ -13,22 +13,29 @@ from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request,
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from replay.camera_logs.alignment import (
+    Gap,
     Rows,
+    Times,
+    between,
     by_index,
     by_time,
     counts,
     even_times,
+    gaps_by_time,
+    in_words,
+    missing,
     of_other_rate,
     overlap,
     step_of,
     unlike,
+    with_gaps,
 )
 from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.framing import Size, cut_or_added, default_size, fitted
-from replay.camera_logs.joined import join_parts
+from replay.camera_logs.joined import excerpts, join_parts
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
-from replay.camera_logs.options import Align, Fit
+from replay.camera_logs.options import Align, Fit, Gaps
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
@@ -50,6 +57,10 @@ class ForeignSource(ClockedSource):
         align: how streams of unequal length, start or rate are put on one clock: "index"
             takes the i-th image of each, "time" the last image at or before each tick.
             None refuses such streams.
+        gaps: whether the frames of a pause are left out, so that no block reaches across, or
+            show the last image; see `pauses`.
+        start: seconds after the first image of all, before which images are left out.
+        stop: seconds after it from which on they are left out.
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged.
@@ -58,6 +69,8 @@ class ForeignSource(ClockedSource):
     Attributes:
         alignment: for each stream the counts of its messages, of repeated frames and of
             dropped messages.
+        gaps: whether streams lack frames: then `take` gives the next n that follow one another.
+        pauses: for each stream the frames [start, stop) of its gaps.
         shapes: for each stream how an image becomes a frame, in words.
         changes: for each stream whose images change their size, a line that says so; as soon as
             one was shown.
@@ -72,6 +85,9 @@ class ForeignSource(ClockedSource):
         size: tuple[int, int] | None = None,
         fit: Fit = "crop",
         align: Align | None = None,
+        gaps: Gaps = "skip",
+        start: float = 0.0,
+        stop: float | None = None,
         rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
@@ -106,10 +122,11 @@ class ForeignSource(ClockedSource):
                 self._streams = join_parts(self._streams)
             self._align_by = align
             self._fps = rate or _rate(self._streams)
-            self._times = [
-                s.times if len(s.times) else even_times(s.count, self._fps) for s in self._streams
-            ]
-            start_ns, self._rows = self._put_on_clock(align)
+            self._times = _times(self._streams, self._fps)
+            if start or stop is not None:
+                self._streams = excerpts(self._streams, self._times, start, stop)
+                self._times = _times(self._streams, self._fps)
+            start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
             self._sizes = [_size_of(image) for image in firsts]
             self._size = size or default_size(self._sizes[0])
@@ -121,12 +138,16 @@ class ForeignSource(ClockedSource):
         self._count = len(self._rows[0])
         names, length = stream_names(self._streams), None if loop else self._count
         self._spec = SourceSpec(names, self._size, "uint8", (), self._fps, start_ns, length)
-        found = map(counts, self._times, self._rows)
+        found = map(counts, self._times, self._rows, self._gaps)
         self.alignment = dict(zip(names, found, strict=True))
+        self.pauses = dict(zip(names, self._gaps, strict=True))
+        self.gaps = gaps == "skip" and any(self._gaps)
         self.shapes = {
             name: self._shape(size) for name, size in zip(names, self._sizes, strict=True)
         }
-        self.warnings = tuple(dict.fromkeys(w for s in self._streams for w in s.warnings))
+        warnings = [w for s in self._streams for w in s.warnings]
+        warnings += [self._said_of_gaps(stream) for stream, own in enumerate(self._gaps) if own]
+        self.warnings = tuple(dict.fromkeys(warnings))
 
     @property
     def frames(self) -> int:
@@ -145,6 +166,8 @@ class ForeignSource(ClockedSource):
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a stream shows at t .. t+n-1; moves t by n.
 
+        Of a stream with gaps the next n that follow one another; moves t behind them.
+
         Raises:
             LogExhaustedError: fewer than n frames are left; t stays.
             LogDamagedError: a message is no image; t stays.
@@ -152,18 +175,52 @@ class ForeignSource(ClockedSource):
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
-        if not self._loop and self._t + n > self._count:
-            raise LogExhaustedError(
-                f"{self._files[0]}: {self._count - self._t} frames are left at frame {self._t}, "
-                f"{n} are needed; begin again at the end with --loop"
-            )
+        t = self._unbroken(stream, n)
         frames = np.empty((n, *self._spec.frame_shape), np.uint8)
         rows = self._rows[stream]
         for i in range(n):
-            frames[i] = self._frame(stream, int(rows[(self._t + i) % self._count]))
-        block = Block(stream, self._t, freeze(frames), freeze(np.empty((n, 0))))
-        self._t += n
-        return block
+            frames[i] = self._frame(stream, int(rows[(t + i) % self._count]))
+        self._t = t + n
+        return Block(stream, t, freeze(frames), freeze(np.empty((n, 0))))
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """What every stream shows in the next n frames; with gaps each unbroken stretch."""
+        if not self.gaps:
+            return super().take_all(n)
+        check_request(self._spec, 0, n)
+        start, stop = self._t, self._t + n
+        if not self._loop and stop > self._count:
+            raise self._exhausted(n)
+        blocks = []
+        for stream in range(len(self._spec.streams)):
+            for low, high in self.spans(stream, start, stop):
+                self._t = low
+                blocks.append(self.take(stream, high - low))
+        self._t = stop
+        return tuple(blocks)
+
+    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        gaps = self._gaps[stream] if self.gaps else []
+        return between(gaps, self._count, start, stop)
+
+    def _unbroken(self, stream: int, n: int) -> int:
+        """Where the next n frames of a stream begin that follow one another."""
+        if not self.gaps and (self._loop or self._t + n <= self._count):
+            return self._t
+        # Looping, a stretch that holds them is in the rest of this lap or in the next two.
+        end = self._t + 3 * self._count if self._loop else self._count
+        for low, high in self.spans(stream, self._t, end):
+            if high - low >= n:
+                return low
+        raise self._exhausted(n)
+
+    def _exhausted(self, n: int) -> LogExhaustedError:
+        unbroken = " without a gap" if self.gaps else ""
+        return LogExhaustedError(
+            f"{self._files[0]}: {max(self._count - self._t, 0)} frames are left at frame "
+            f"{self._t}, {n} are needed{unbroken}; begin again at the end with --loop"
+        )
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t.
@@ -196,10 +253,33 @@ class ForeignSource(ClockedSource):
             "recipe": "; ".join(dict.fromkeys(s.recipe for s in self._streams)),
             "align": self._align_by,
             "rate": self._fps,
+            **self._chosen(),
             "alignment": self.alignment,
             "frames": self._count,
             "loop": self._loop,
         }
+
+    def plan(self) -> list[dict[str, Any]]:
+        """What would be read of each stream, as JSON values."""
+        rows = []
+        for name, images, times in zip(self._spec.streams, self._streams, self._times, strict=True):
+            step = step_of(times)
+            row: dict[str, Any] = {"stream": name, "log": str(images.path), "topic": images.topic}
+            row |= {"images": images.count, "rate": 1 / step if step > 0 else None}
+            row |= {"shape": self.shapes[name], "missing": missing(times)}
+            row |= {"gaps": [list(gap) for gap in self.pauses[name]], **self.alignment[name]}
+            rows.append(row)
+        return rows
+
+    def _chosen(self) -> dict[str, Any]:
+        """What of the options changed the frames, as JSON values."""
+        chosen: dict[str, Any] = {}
+        if any(self._gaps):
+            chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
+            chosen["gaps_are"] = "left out" if self.gaps else "the last image"
+        if any(cut_or_added(size, self._size, self._fit) for size in self._sizes):
+            chosen["fit"] = self._fit
+        return chosen
 
     def close(self) -> None:
         for stream in self._streams:
@@ -247,18 +327,31 @@ class ForeignSource(ClockedSource):
             f"{size[1]}x{size[0]}; each is made a frame of {self._size[1]}x{self._size[0]}"
         )
 
-    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows]]:
-        """When frame 0 is, and which image of each stream every frame shows."""
+    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Gap]]]:
+        """When frame 0 is, which image of each stream every frame shows, and each one's gaps."""
+        first = self._times[0]
         if align == "time":
             start, stop = overlap(self._times)
             if stop < start:
                 raise UsageError(
                     f"{self._files[0]}: its streams have no time in common; use --align index"
                 )
-            return start, by_time(self._times, start, stop, self._fps)
-        if align is None:
-            self._refuse_unequal()
-        return int(self._times[0][0]), by_index(self._times)
+            rows = by_time(self._times, start, stop, self._fps)
+            gaps = [gaps_by_time(t, start, len(rows[0]), self._fps) for t in self._times]
+            return start, rows, gaps
+        rows = by_index(self._times)
+        if align == "index" and len(rows) > 1:
+            return int(first[0]), rows, [[] for _ in rows]
+        self._refuse_unequal()
+        rows, shared = with_gaps(rows, first, self._fps)
+        return int(first[0]), rows, [shared for _ in rows]
+
+    def _said_of_gaps(self, stream: int) -> str:
+        """What the user should know of a stream's gaps."""
+        held = "no block reaches across" if self.gaps else "the last image is shown"
+        images = self._streams[stream]
+        said = in_words(self._gaps[stream], self._fps)
+        return f"{images.path}: {images.topic} has {said}: {held}"
 
     def _refuse_unequal(self) -> None:
         """Refuse streams that are not on one clock, or not of the rate asked for."""
@@ -293,6 +386,11 @@ class ForeignSource(ClockedSource):
 
 def _size_of(image: Bytes) -> Size:
     return image.shape[0], image.shape[1]
+
+
+def _times(streams: Sequence[ImageStream], fps: float) -> list[Times]:
+    """When each stream's images were taken; where nobody knows, at an even rate."""
+    return [s.times if len(s.times) else even_times(s.count, fps) for s in streams]
 
 
 def _rate(streams: Sequence[ImageStream]) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import camera_options, say_about
+from cdmisfa.cli.cameras import camera_options, print_plan, say_about, say_changes
 from cdmisfa.cli.commands.record import print_recording, recording_stoppable
 from cdmisfa.cli.progress import bar
 
@@ -35,6 +35,7 @@ def convert_command(
     fsync_every: float | None,
     force: bool,
     as_json: bool,
+    dry_run: bool,
     **cameras: Any,
 ) -> None:
     """Write camera logs of others as a recording.
@@ -52,12 +53,17 @@ def convert_command(
     named = places(source)
     for place in named:
         refuse_what_is_no_log(place)
-    if not resume:
+    if not resume and not dry_run:
         refuse_existing(out, force=force)
+    if not dry_run:
+        cameras["gaps"] = "hold"  # a recording has every frame, and says which are of a gap
     options_given = CameraOptions(**cameras)
     goal = ("convert", str(out))
     opened = open_cameras(named, options_given, salvage=salvage, goal=goal)
     with contextlib.closing(opened) as frames:
+        if dry_run:
+            print_plan(frames, as_json=as_json)
+            return
         say_about(frames)
         length = frames.spec.length or 0
         with bar("converting", "frames") as shown, recording_stoppable(ctx, out) as stop:
@@ -70,4 +76,5 @@ def convert_command(
                 stop=stop,
                 progress=lambda done: shown.update(done, length),
             )
+        say_changes(frames)
     print_recording(out, files, as_json=as_json)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,7 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import camera_options, say_about
+from cdmisfa.cli.cameras import camera_options, print_plan, say_about, say_changes
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.learning import Sink
@@ -93,6 +94,7 @@ def learn_command(
     fsync_every: float | None,
     force: bool,
     as_json: bool,
+    dry_run: bool,
     **cameras: Any,
 ) -> None:
     """Learn slow feature modules from a scene or a recording.
@@ -129,6 +131,10 @@ def learn_command(
         cameras=CameraOptions(**cameras),
         follow=follow_timeout if follow else None,
     )
+    if dry_run:
+        with contextlib.closing(frames):
+            print_plan(frames, as_json=as_json)
+        return
     say_about(frames)
     try:
         with bar("learning", "blocks") as shown, stoppable() as stop:
@@ -158,6 +164,7 @@ def learn_command(
         show(error.result, as_json=as_json)
         raise
     finally:
+        say_changes(frames)
         frames.close()
     if resume and not reporter.told and not stop():
         click.echo("nothing was left to do: the run had come as far before", err=True)

@@ -1,0 +1,203 @@
+"""Pauses of cameras are found, said, and never learned across; parts and sizes are as asked."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from source_contract import SourceContract
+
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import LogExhaustedError
+from replay.camera_logs.alignment import between
+from replay.camera_logs.framing import FRAME_PIXELS, default_size, fitted
+from replay.camera_logs.options import Align, Fit
+from replay.camera_logs.source import ForeignSource
+
+STEP_MS = 20
+PAUSED = (*range(0, 2000, STEP_MS), *range(5000, 9000, STEP_MS))
+"""Times of 100 images, a gap of three seconds, and 200 images, in milliseconds."""
+
+
+def write_log(
+    path: Path, times_ms: Sequence[int], shapes: Sequence[tuple[int, int]] = ((12, 16),)
+) -> Path:
+    """A log whose i-th image has the value i % 256 and the i-th shape, the last for the rest."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4096)
+        writer.start()
+        schema = writer.register_schema("foxglove.RawImage", "protobuf", b"")
+        channel = writer.register_channel("/cam", "protobuf", schema)
+        for i, ms in enumerate(times_ms):
+            height, width = shapes[min(i, len(shapes) - 1)]
+            data = bytes([i % 256]) * (height * width)
+            image = RawImage(height=height, width=width, step=width, encoding="mono8", data=data)
+            writer.add_message(channel, ms * 10**6, image.SerializeToString(), ms * 10**6)
+        writer.finish()
+    return path
+
+
+class TestWithoutGaps(SourceContract):
+    ends = True
+
+    @pytest.fixture(autouse=True)
+    def _log(self, tmp_path: Path) -> None:
+        self.path = write_log(tmp_path / "log.mcap", PAUSED)
+
+    def open(self) -> FrameSource:
+        return ForeignSource(self.path, gaps="hold")
+
+
+def values(source: ForeignSource, n: int) -> tuple[int, list[int]]:
+    block = source.take(0, n)
+    return block.t, block.frames[:, 0, 0].tolist()
+
+
+@pytest.mark.parametrize("align", [None, "time"])
+def test_no_block_reaches_across_a_gap(tmp_path: Path, align: Align | None) -> None:
+    source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), align=align)
+    assert (source.frames, source.pauses) == (450, {"/cam": [(100, 250)]})
+    assert values(source, 90) == (0, list(range(90)))
+    assert values(source, 90) == (250, [i % 256 for i in range(100, 190)])
+    assert source.spec.time_ns(250) == 5 * 10**9
+    assert [(b.t, len(b)) for b in (source.seek(80), source.take_all(300))[1]] == [
+        (80, 20),
+        (250, 130),
+    ]
+    with pytest.raises(LogExhaustedError, match="without a gap"):
+        source.take(0, 90)
+    assert "a gap of 3 s after 1.98 s: no block reaches across" in source.warnings[0]
+    assert source.alignment["/cam"] == {"messages": 300, "repeated": 0, "dropped": 0}
+
+
+def test_a_gap_comes_again_with_every_turn(tmp_path: Path) -> None:
+    source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), loop=True)
+    assert [values(source, 150)[0] for _ in range(4)] == [250, 400, 700, 850]
+    with pytest.raises(LogExhaustedError, match="without a gap"):
+        source.take(0, 500)
+
+
+def test_held_gaps_show_the_last_image(tmp_path: Path) -> None:
+    source = ForeignSource(write_log(tmp_path / "log.mcap", PAUSED), gaps="hold")
+    source.seek(90)
+    assert values(source, 170) == (90, [*range(90, 100), *[99] * 150, *range(100, 110)])
+    assert "the last image is shown" in source.warnings[0]
+
+
+@given(
+    gaps=st.lists(st.integers(1, 6), min_size=2, max_size=6).map(np.cumsum),
+    start=st.integers(0, 60),
+    length=st.integers(1, 60),
+)
+def test_stretches_are_the_frames_outside_gaps(gaps: np.ndarray, start: int, length: int) -> None:
+    pairs = [(int(a), int(b)) for a, b in zip(gaps[::2], gaps[1::2], strict=False)]
+    period = int(gaps[-1]) + 3
+    missing = {f for a, b in pairs for f in range(a, b)}
+    wanted = [f for f in range(start, start + length) if f % period not in missing]
+    found = between(pairs, period, start, start + length)
+    assert [f for low, high in found for f in range(low, high)] == wanted
+    assert all(a[1] < b[0] for a, b in itertools.pairwise(found))
+
+
+def test_a_few_images_that_are_late_are_no_gap(tmp_path: Path) -> None:
+    times = [*range(0, 1000, STEP_MS), *range(1180, 2000, STEP_MS)]
+    source = ForeignSource(write_log(tmp_path / "log.mcap", times))
+    assert (source.gaps, source.frames) == (False, len(times))
+    assert source.plan()[0]["missing"] == 9
+
+
+def test_a_part_of_a_log_is_taken(tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.mcap", range(0, 4000, STEP_MS))
+    source = ForeignSource(log, start=1.0, stop=2.0)
+    assert (source.frames, source.spec.start_ns) == (50, 10**9)
+    assert values(source, 50) == (0, list(range(50, 100)))
+
+
+def test_a_plan_is_printed_and_nothing_written(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.mcap", PAUSED, [(240, 320)])
+    for words in (["learn", log], ["convert", log, "-o", tmp_path / "rec"]):
+        done = cdmisfa(*words, "--dry-run", "--json", "--from", "1", "--to", "0:08")
+        assert done.code == 0
+        plan = done.json
+        assert (plan["frames"], plan["rate"], plan["size"]) == (350, 50.0, [60, 80])
+        stream = plan["streams"][0]
+        assert (stream["images"], stream["gaps"]) == (200, [[50, 200]])
+        assert stream["shape"] == "320x240, shown as 80x60"
+        assert cdmisfa(*words, "--dry-run").code == 0
+    assert list(tmp_path.iterdir()) == [log]
+    assert cdmisfa("learn", log, "--from", "later").code == 2
+    assert "choose another --from" in cdmisfa("learn", log, "--from", "1:00").err
+
+
+def test_a_run_across_a_gap_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log, run = write_log(tmp_path / "log.mcap", range(0, 20000, STEP_MS)), tmp_path / "run"
+    paused = write_log(
+        tmp_path / "paused.mcap", [t if t < 9000 else t + 97000 for t in range(0, 20000, STEP_MS)]
+    )
+    words = ["learn", paused, "--no-rerun", "--json", "-o"]
+    whole = cdmisfa(*words, run, "--max-iterations", "12").json["signals_sha256"]
+    part = tmp_path / "part"
+    assert cdmisfa(*words, part, "--max-iterations", "5").code == 0
+    resumed = cdmisfa("learn", "--resume", "-o", part, "--max-iterations", "12", "--json")
+    assert resumed.json["signals_sha256"] == whole
+    assert cdmisfa("check", run).code == 0
+    other = cdmisfa("learn", log, "--json", "--max-iterations", "12").json["signals_sha256"]
+    assert other != whole
+
+
+def test_a_conversion_keeps_its_clock_and_says_where_gaps_are(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    log = write_log(tmp_path / "log.mcap", PAUSED)
+    done = cdmisfa("convert", log, "-o", tmp_path / "rec", "--json")
+    assert "the last image is shown" in done.err
+    assert done.json["frames"] == 450
+    assert cdmisfa("verify", tmp_path / "rec").code == 0
+
+
+def test_images_that_change_their_size_are_said_and_shown(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log = write_log(tmp_path / "log.mcap", range(0, 2000, STEP_MS), [(12, 16)] * 50 + [(6, 8)])
+    done = cdmisfa("learn", log, "--max-iterations", "1", "--json")
+    assert done.code == 0
+    done = cdmisfa("convert", log, "-o", tmp_path / "rec")
+    assert "at 1000000000 ns: images change from 16x12 to 8x6" in done.err
+
+
+IMAGE = np.arange(24 * 32, dtype=np.uint32).reshape(24, 32).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("fit", "expected"),
+    [
+        ("crop", IMAGE[6:18]),
+        ("stretch", (IMAGE[::2].astype(float) + IMAGE[1::2]) / 2),
+    ],
+)
+def test_other_ratios_are_cut_or_stretched(fit: Fit, expected: np.ndarray) -> None:
+    frame = fitted(IMAGE, (12, 32), fit)
+    assert abs(frame.astype(float) - expected).max() <= 0.5
+
+
+def test_a_padded_frame_holds_all_of_the_image() -> None:
+    frame = fitted(np.full((24, 32), 200, np.uint8), (12, 32), "pad")
+    assert (frame[:, 8:24] == 200).all()
+    assert frame.sum() == 200 * 12 * 16
+
+
+@pytest.mark.parametrize(
+    ("image", "frame"),
+    [((48, 128), (48, 128)), ((240, 320), (60, 80)), ((480, 640), (60, 80)), ((12, 16), (12, 16))],
+)
+def test_a_frame_keeps_the_ratio_of_the_sides(
+    image: tuple[int, int], frame: tuple[int, int]
+) -> None:
+    assert default_size(image) == frame
+    assert frame[0] * frame[1] <= FRAME_PIXELS
