@@ -88,7 +88,8 @@ def test_files_at_the_same_time_stay_streams(parts: list[Path]) -> None:
 def test_a_part_may_lack_a_topic(parts: list[Path]) -> None:
     write_part(parts[3], range(30, 40), ("/left",))
     source = ForeignSource(parts[0].parent, ["/right"], size=SIZE, align="time", rate=50)
-    assert source.alignment["/right"] == {"messages": 110, "repeated": 10, "dropped": 0}
+    assert source.alignment["/right"] == {"messages": 110, "repeated": 0, "dropped": 0}
+    assert [stop - start for start, stop in source.pauses["/right"]] == [10]
     with pytest.raises(UsageError, match="no topic /up"):
         ForeignSource(parts[0].parent, ["/up"], size=SIZE)
     with pytest.raises(UsageError, match="name one --topic"):

@@ -107,10 +107,12 @@ def say_about(source: FrameSource) -> None:
     """Say on stderr what the user should know of a source, and how images became frames."""
     for warning in getattr(source, "warnings", ()):
         click.echo(f"warning: {warning}", err=True)
-    shapes = getattr(source, "shapes", {})
+    for name, shape in getattr(source, "shapes", {}).items():
+        if "," in shape:  # not the image itself
+            click.echo(f"{name}: {shape}", err=True)
     for name, counts in getattr(source, "alignment", {}).items():
         click.echo(
-            f"{name}: {shapes[name]}; {counts['messages']} images, "
+            f"{name}: {counts['messages']} images, "
             f"{counts['repeated']} frames repeated, {counts['dropped']} images dropped",
             err=True,
         )

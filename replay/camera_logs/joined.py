@@ -9,7 +9,7 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.alignment import Times
+from replay.camera_logs.alignment import Times, even_times
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 from replay.storage.location import Location
@@ -66,6 +66,11 @@ class Excerpt(ImageStream):
 
     def close(self) -> None:
         self._images.close()
+
+
+def known_times(streams: Sequence[ImageStream], fps: float) -> list[Times]:
+    """When each stream's images were taken; where nobody knows, at an even rate."""
+    return [s.times if len(s.times) else even_times(s.count, fps) for s in streams]
 
 
 def excerpts(

@@ -15,12 +15,10 @@ from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from replay.camera_logs.alignment import (
     Gap,
     Rows,
-    Times,
     between,
     by_index,
     by_time,
     counts,
-    even_times,
     gaps_by_time,
     in_words,
     missing,
@@ -32,7 +30,7 @@ from replay.camera_logs.alignment import (
 )
 from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.framing import Size, cut_or_added, default_size, fitted
-from replay.camera_logs.joined import excerpts, join_parts
+from replay.camera_logs.joined import excerpts, join_parts, known_times
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
 from replay.camera_logs.options import Align, Fit, Gaps
@@ -122,10 +120,10 @@ class ForeignSource(ClockedSource):
                 self._streams = join_parts(self._streams)
             self._align_by = align
             self._fps = rate or _rate(self._streams)
-            self._times = _times(self._streams, self._fps)
+            self._times = known_times(self._streams, self._fps)
             if start or stop is not None:
                 self._streams = excerpts(self._streams, self._times, start, stop)
-                self._times = _times(self._streams, self._fps)
+                self._times = known_times(self._streams, self._fps)
             start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
             self._sizes = [_size_of(image) for image in firsts]
@@ -138,8 +136,9 @@ class ForeignSource(ClockedSource):
         self._count = len(self._rows[0])
         names, length = stream_names(self._streams), None if loop else self._count
         self._spec = SourceSpec(names, self._size, "uint8", (), self._fps, start_ns, length)
-        found = map(counts, self._times, self._rows, self._gaps)
-        self.alignment = dict(zip(names, found, strict=True))
+        self.alignment = dict(
+            zip(names, map(counts, self._times, self._rows, self._gaps), strict=True)
+        )
         self.pauses = dict(zip(names, self._gaps, strict=True))
         self.gaps = gaps == "skip" and any(self._gaps)
         self.shapes = {
@@ -188,10 +187,9 @@ class ForeignSource(ClockedSource):
         if not self.gaps:
             return super().take_all(n)
         check_request(self._spec, 0, n)
-        start, stop = self._t, self._t + n
+        start, stop, blocks = self._t, self._t + n, []
         if not self._loop and stop > self._count:
             raise self._exhausted(n)
-        blocks = []
         for stream in range(len(self._spec.streams)):
             for low, high in self.spans(stream, start, stop):
                 self._t = low
@@ -201,8 +199,7 @@ class ForeignSource(ClockedSource):
 
     def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
         """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
-        gaps = self._gaps[stream] if self.gaps else []
-        return between(gaps, self._count, start, stop)
+        return between(self._gaps[stream] if self.gaps else [], self._count, start, stop)
 
     def _unbroken(self, stream: int, n: int) -> int:
         """Where the next n frames of a stream begin that follow one another."""
@@ -349,8 +346,7 @@ class ForeignSource(ClockedSource):
     def _said_of_gaps(self, stream: int) -> str:
         """What the user should know of a stream's gaps."""
         held = "no block reaches across" if self.gaps else "the last image is shown"
-        images = self._streams[stream]
-        said = in_words(self._gaps[stream], self._fps)
+        images, said = self._streams[stream], in_words(self._gaps[stream], self._fps)
         return f"{images.path}: {images.topic} has {said}: {held}"
 
     def _refuse_unequal(self) -> None:
@@ -386,11 +382,6 @@ class ForeignSource(ClockedSource):
 
 def _size_of(image: Bytes) -> Size:
     return image.shape[0], image.shape[1]
-
-
-def _times(streams: Sequence[ImageStream], fps: float) -> list[Times]:
-    """When each stream's images were taken; where nobody knows, at an even rate."""
-    return [s.times if len(s.times) else even_times(s.count, fps) for s in streams]
 
 
 def _rate(streams: Sequence[ImageStream]) -> float:
