@@ -159,6 +159,9 @@ def test_sizes_without_values_allocate_nothing() -> None:
         decode_signals(encode_signals(hostile), version=1)
 
 
+VERDICT = "Verdict on each block: the last 50 blocks"
+
+
 def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Titles in the gate's tab of a run's layout."""
     tabs: list[Any] = []
@@ -169,9 +172,10 @@ def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_the_gate_of_1_0_shows_its_clusters_where_the_log_has_them(monkeypatch, tmp_path) -> None:
-    assert gate_of(OLD, monkeypatch)[1:] == ["Share of novel blocks"]
+    assert gate_of(OLD, monkeypatch)[1:] == [VERDICT, "Share of novel blocks"]
     write_run(tmp_path / "run.mcap", VECTOR, 3, learner={"algorithm": "1.0", "roc_error": 3.0})
     assert gate_of(tmp_path, monkeypatch)[1:] == [
+        VERDICT,
         "Clustering error by module 1: known below 3",
         "Clustering error by module 2: known below 3",
         "Clustering error of the block, and its mean: saved below 3",
