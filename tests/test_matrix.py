@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -190,3 +191,23 @@ def test_a_command_takes_a_log_or_says_why_not(
             assert done.json["iterations"] == 1
         case "convert":
             assert [view["frames"] for view in done.json["views"]] == [COUNT] * streams
+
+
+def test_the_commands_of_the_page_work(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_cameras(Path("robot.mcap"), dict.fromkeys(("/cam_left", "/cam_right"), (COUNT, STEP_MS)))
+    write_cameras(Path("part-1.mcap"), {"/left": (COUNT, STEP_MS)})
+    write_cameras(Path("part-2.mcap"), {"/right": (COUNT, STEP_MS)})
+    write_pictures(Path("pictures"), COUNT)
+    write_video(Path("film.mp4"))
+    page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text("utf-8")
+    lines = [
+        line for block in page.split("```sh")[1:] for line in block.split("```")[0].split("\n")
+    ]
+    commands = [shlex.split(line)[1:] for line in lines if line]
+    assert len(commands) == 6
+    for words in commands:
+        done = cdmisfa(*words)
+        assert done.code == 0, (words, done.err)
