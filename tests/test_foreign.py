@@ -101,6 +101,41 @@ def test_big_endian_pixels_are_read_as_such() -> None:
         np.testing.assert_array_equal(decoder(made), GRAY)
 
 
+@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("big", [False, True])
+def test_a_bayer_pattern_becomes_gray(order: str, bits: int, big: bool) -> None:
+    mosaic = np.zeros((7, 9), np.uint8)
+    for place, letter in enumerate(order):
+        cell = COLOUR[:3, :4, "rgb".index(letter)]
+        mosaic[place // 2 : 6 : 2, place % 2 : 8 : 2] = cell
+    data = mosaic.tobytes()
+    if bits == 16:
+        data = (mosaic.astype(np.uint16) << 8 | 55).astype(">u2" if big else "<u2").tobytes()
+    found = gray(data, 7, 9, f"bayer_{order}{bits}", big_endian=big)
+    np.testing.assert_array_equal(found, np.asarray(Image.fromarray(COLOUR).convert("L"))[:3, :4])
+
+
+@pytest.mark.parametrize("kind", RAW)
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_distances_are_shown_in_a_range(kind: tuple[str, str], encoding: str) -> None:
+    metres = np.array([[0.0, 0.5, 1.0, 1.5, 3.0], [np.nan, np.inf, 2.0, 0.9, 1.02]])
+    expected = np.array([[0, 0, 0, 128, 255], [0, 0, 255, 0, 5]], np.uint8)
+    values = metres.astype("<f4")
+    if encoding == "16UC1":
+        values = np.round(np.nan_to_num(metres, posinf=0) * 1000).astype("<u2")
+    step, data = 5 * values.itemsize, values.tobytes()
+    made = RAW[kind](height=2, width=5, encoding=encoding, big=0, step=step, data=data)
+    decoder = image_decoder(*kind, depth=(1.0, 2.0))
+    assert decoder is not None
+    np.testing.assert_array_equal(decoder(made), expected)
+    plain = image_decoder(*kind)
+    assert plain is not None
+    if encoding == "32FC1":
+        with pytest.raises(UsageError, match="--range"):
+            plain(made)
+
+
 def encoded(image: np.ndarray, kind: str) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(image).save(stream, kind, **({"quality": 95} if kind == "JPEG" else {}))
@@ -131,7 +166,7 @@ def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
         assert abs(decoder(message) - expected).max() <= (0 if kind == "PNG" else 6)
 
 
-@pytest.mark.parametrize("encoding", ["bayer_rggb8", "32FC1", "yuv422", ""])
+@pytest.mark.parametrize("encoding", ["bayer_rggb12", "64FC1", "yuv422", ""])
 def test_other_formats_are_refused_by_name(encoding: str) -> None:
     with pytest.raises(MalformedRecord, match=repr(encoding)):
         gray(bytes(48), 6, 8, encoding, 8)

@@ -45,6 +45,19 @@ def _seconds(ctx: click.Context, param: click.Parameter, value: str | None) -> f
     return hours * 3600 + minutes * 60 + seconds
 
 
+def _near_and_far(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[float, float] | None:
+    if value is None:
+        return None
+    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?):(\d{1,6}(?:\.\d{1,6})?)", value, re.ASCII)
+    if found is None or not float(found[1]) < float(found[2]):
+        raise click.BadParameter(
+            f"{value!r} is no range: write NEAR:FAR in metres, as 0.3:5", ctx, param
+        )
+    return float(found[1]), float(found[2])
+
+
 camera_options = options.together(
     click.option(
         "--topic",
@@ -94,6 +107,13 @@ camera_options = options.together(
     ),
     click.option(
         "--to", "stop", callback=_seconds, metavar="TIME", help="Leave out images from then on."
+    ),
+    click.option(
+        "--range",
+        "depth",
+        callback=_near_and_far,
+        metavar="NEAR:FAR",
+        help="Show distances of depth cameras, in metres, from black to white.",
     ),
     click.option(
         "--dry-run",

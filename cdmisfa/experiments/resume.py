@@ -50,6 +50,7 @@ OPTIONS = (
     "gaps",
     "start",
     "stop",
+    "depth",
     "max_iterations",
     "max_modules",
     "keyframes",

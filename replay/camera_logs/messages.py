@@ -7,27 +7,36 @@ import binascii
 import json
 import struct
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
-from replay.camera_logs.pixels import compressed_gray, gray
+from replay.camera_logs.pixels import Depth, compressed_gray, gray
 from replay.mcap.records import Bytes, MalformedRecord
 
 Decoder = Callable[[bytes], Bytes]
 """Turns a message into a gray image, (height, width) uint8; raises MalformedRecord."""
 
 
-def image_decoder(schema: str, encoding: str) -> Decoder | None:
-    """The decoder for messages of a schema in an encoding, or None."""
-    return _DECODERS.get((schema, encoding))
+def image_decoder(schema: str, encoding: str, depth: Depth | None = None) -> Decoder | None:
+    """The decoder for messages of a schema in an encoding, or None.
+
+    Args:
+        schema: type of the messages.
+        encoding: of the messages.
+        depth: how distances are shown; see `gray`.
+    """
+    decoder = _DECODERS.get((schema, encoding))
+    raw = _RAW.get((schema, encoding))
+    return decoder if raw is None or depth is None else partial(raw, depth=depth)
 
 
-def _foxglove_raw(data: bytes) -> Bytes:
-    message = _parse(RawImage, data)
-    return gray(message.data, message.height, message.width, message.encoding, message.step)
+def _foxglove_raw(data: bytes, depth: Depth | None = None) -> Bytes:
+    m = _parse(RawImage, data)
+    return gray(m.data, m.height, m.width, m.encoding, m.step, depth=depth)
 
 
 def _foxglove_compressed(data: bytes) -> Bytes:
@@ -41,13 +50,13 @@ def _parse(kind: Any, data: bytes) -> Any:
         raise MalformedRecord(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
 
 
-def _json_raw(data: bytes) -> Bytes:
+def _json_raw(data: bytes, depth: Depth | None = None) -> Bytes:
     fields = _json(data)
     numbers = [fields.get(k) for k in ("height", "width", "step")]
     if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
         raise MalformedRecord("a JSON image needs whole height, width and step")
     height, width, step = (int(n) for n in numbers if n is not None)
-    return gray(_base64(fields), height, width, str(fields.get("encoding")), step)
+    return gray(_base64(fields), height, width, str(fields.get("encoding")), step, depth=depth)
 
 
 def _json_compressed(data: bytes) -> Bytes:
@@ -107,11 +116,11 @@ class _RosFields:
         return str(raw if self._ros1 else raw.removesuffix(b"\0"), "utf-8", "replace")
 
 
-def _ros_raw(data: bytes, *, ros1: bool) -> Bytes:
+def _ros_raw(data: bytes, *, ros1: bool, depth: Depth | None = None) -> Bytes:
     fields = _RosFields(data, ros1=ros1)
     height, width, encoding = fields.u32(), fields.u32(), fields.text()
     big_endian, step = bool(fields.take(1)[0]), fields.u32()
-    return gray(fields.data(), height, width, encoding, step, big_endian=big_endian)
+    return gray(fields.data(), height, width, encoding, step, big_endian=big_endian, depth=depth)
 
 
 def _ros_compressed(data: bytes, *, ros1: bool) -> Bytes:
@@ -130,6 +139,14 @@ _DECODERS: Final[Mapping[tuple[str, str], Decoder]] = {
     ("sensor_msgs/Image", "ros1"): lambda data: _ros_raw(data, ros1=True),
     ("sensor_msgs/CompressedImage", "ros1"): lambda data: _ros_compressed(data, ros1=True),
 }
+
+_RAW: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
+    ("foxglove.RawImage", "protobuf"): _foxglove_raw,
+    ("foxglove.RawImage", "json"): _json_raw,
+    ("sensor_msgs/msg/Image", "cdr"): partial(_ros_raw, ros1=False),
+    ("sensor_msgs/Image", "ros1"): partial(_ros_raw, ros1=True),
+}
+"""Those of messages that hold pixels, which may be distances."""
 
 SCHEMAS: Final = tuple(sorted({schema for schema, _ in _DECODERS}))
 """Message types that are read."""

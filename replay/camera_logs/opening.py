@@ -14,6 +14,7 @@ from replay.camera_logs.formats.mcap_log import McapImages
 from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages
+from replay.camera_logs.pixels import Depth
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.identity import identity
 from replay.storage.checksum import sha256
@@ -21,13 +22,16 @@ from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
 
 
-def open_images(path: Location, topic: str | None, *, salvage: bool = False) -> ImageStream:
+def open_images(
+    path: Location, topic: str | None, *, salvage: bool = False, depth: Depth | None = None
+) -> ImageStream:
     """Open the images on a topic of a log, or in a folder.
 
     Args:
         path: an MCAP log or its URL, a ROS bag, a video or a folder of pictures.
         topic: may be left out where there is one topic of images.
         salvage: leave out what is damaged.
+        depth: how distances are shown; see `gray`.
 
     Raises:
         UsageError: no such topic, or no images on it.
@@ -37,14 +41,14 @@ def open_images(path: Location, topic: str | None, *, salvage: bool = False) -> 
         if is_dataset(path):
             return LeRobotImages(path, topic)
         if is_bag(path):
-            return BagImages(path, topic)
+            return BagImages(path, topic, depth=depth)
         if is_split(path):
-            return _open_parts(path, topic, salvage=salvage)
+            return _open_parts(path, topic, salvage=salvage, depth=depth)
         if path.is_dir():
             return FolderImages(path, topic)
         if is_video(path):
             return VideoImages(path, topic)
-    return McapImages(path, topic, salvage=salvage)
+    return McapImages(path, topic, salvage=salvage, depth=depth)
 
 
 def image_logs(paths: Sequence[str | Location]) -> list[Location]:
@@ -82,14 +86,16 @@ def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any
     return {"file": path.name, "sha256": whole.hexdigest()}
 
 
-def _open_parts(path: Path, topic: str | None, *, salvage: bool) -> ImageStream:
+def _open_parts(
+    path: Path, topic: str | None, *, salvage: bool, depth: Depth | None
+) -> ImageStream:
     """Open the images on a topic of a log in parts; a part may lack a topic that is named."""
     parts: list[ImageStream] = []
     refusal: UsageError | None = None
     try:
         for file in sorted(path.glob("*.mcap"), key=by_number):
             try:
-                parts.append(McapImages(file, topic, salvage=salvage))
+                parts.append(McapImages(file, topic, salvage=salvage, depth=depth))
             except UsageError as error:
                 refusal = refusal or error
         if refusal is not None and (topic is None or not parts):

@@ -25,6 +25,7 @@ class CameraOptions:
             reaches across, "hold" for the last image before.
         start: seconds after the first image of all, before which images are left out.
         stop: seconds after it from which on they are left out; None for never.
+        depth: distances in metres that are shown black and white; None for none.
     """
 
     topics: tuple[str, ...] = ()
@@ -35,3 +36,4 @@ class CameraOptions:
     gaps: Gaps = "skip"
     start: float = 0.0
     stop: float | None = None
+    depth: tuple[float, float] | None = None

@@ -38,8 +38,19 @@ _LAYOUTS: Final[Mapping[str, tuple[int, str]]] = {
     "bgra8": (4, "bgr"),
     "8UC4": (4, "bgr"),
 }
+_BAYER: Final[Mapping[str, str]] = {
+    f"bayer_{order}{bits}": order for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)
+}
+"""Formats of one colour a pixel, and the colours of two by two of them, row by row."""
+
+_DEPTHS: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
+"""Formats of distances: their numbers, and how many metres one is (REP 118)."""
+
 ENCODINGS: Final = tuple(_LAYOUTS)
-"""Pixel formats that are read."""
+"""Pixel formats that are read as they are."""
+
+Depth = tuple[float, float]
+"""Distances, in metres, that are shown black and white."""
 
 
 def gray(
@@ -50,8 +61,11 @@ def gray(
     step: int = 0,
     *,
     big_endian: bool = False,
+    depth: Depth | None = None,
 ) -> Bytes:
     """Turn pixels of any supported format into gray, (height, width) uint8.
+
+    Of a Bayer pattern each two by two pixels become one, (height // 2, width // 2).
 
     Args:
         data: rows of `step` bytes, 0 for no more than the pixels take.
@@ -59,17 +73,26 @@ def gray(
         width: pixels of a row.
         encoding: the pixel format, as ROS names it.
         step: bytes from one row to the next.
-        big_endian: the byte order of 16 bits.
+        big_endian: the byte order of 16 and 32 bits.
+        depth: show distances, 16UC1 in millimetres and 32FC1 in metres, from black to white;
+            black, too, where none was measured. None takes 16UC1 as gray.
 
     Raises:
+        UsageError: 32FC1, and no `depth`.
         MalformedRecord: an unsupported format, or sizes that contradict the data.
     """
-    layout = _LAYOUTS.get(encoding)
+    if encoding == "32FC1" and depth is None:
+        raise UsageError("its images are distances (32FC1): say which to show, as --range 0.3:5")
+    if encoding in _BAYER:
+        layout: tuple[int, str] | None = (1, "bayer") if encoding.endswith("8") else (2, "bayer")
+    elif encoding in _DEPTHS and depth is not None:
+        layout = (int(_DEPTHS[encoding][0][1]), "depth")
+    else:
+        layout = _LAYOUTS.get(encoding)
     if layout is None:
-        hint = " (undo the Bayer pattern first)" if "bayer" in encoding.lower() else ""
         raise MalformedRecord(
-            f"its pixel format {encoding[:40]!r} is not read{hint}: use one of "
-            f"{', '.join(ENCODINGS)}"
+            f"its pixel format {encoding[:40]!r} is not read: use one of "
+            f"{', '.join([*ENCODINGS, '32FC1', *_BAYER])}"
         )
     size, kind = layout
     step = step or width * size
@@ -82,6 +105,13 @@ def gray(
         )
     raw = np.frombuffer(data, np.uint8)
     rows = np.ndarray((height, width, size), np.uint8, raw, 0, (step, size, 1))
+    if kind == "depth" and depth is not None:
+        number, metres = _DEPTHS[encoding]
+        order = ">" if big_endian else "<"
+        values = np.ndarray((height, width), order + number, raw, 0, (step, size))
+        return _shown_depth(values, metres, depth)
+    if kind == "bayer":
+        return _bayer_gray(rows[:, :, 0 if big_endian else size - 1], _BAYER[encoding])
     if kind == "gray":
         return np.ascontiguousarray(rows[:, :, 0])
     if kind == "gray16":
@@ -90,6 +120,35 @@ def gray(
     for band in _bands(height, width):
         red, green, blue = (rows[band, :, kind.index(c)].astype(np.uint32) for c in "rgb")
         found[band] = (19595 * red + 38470 * green + 7471 * blue + 32768) >> 16
+    return found
+
+
+def _bayer_gray(pixels: Bytes, order: str) -> Bytes:
+    """The grey of each two by two pixels of a Bayer pattern, without interpolation."""
+    height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
+    if not height * width:
+        raise MalformedRecord("a Bayer pattern has two rows and columns at least")
+    weights = {"r": 19595, "g": 19235, "b": 7471}
+    found = np.empty((height, width), np.uint8)
+    for band in _bands(height, width):
+        rows = pixels[2 * band.start : 2 * min(band.stop, height)]
+        total = np.full((len(rows) // 2, width), 32768, np.uint32)
+        for place, colour in enumerate(order):
+            cell = rows[place // 2 :: 2, place % 2 : 2 * width : 2]
+            total += weights[colour] * cell.astype(np.uint32)
+        found[band] = total >> 16
+    return found
+
+
+def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> Bytes:
+    """Distances as gray; 0, infinity and NaN, which are none, as black."""
+    near, far = depth
+    found = np.empty(values.shape, np.uint8)
+    for band in _bands(*values.shape):
+        distance = values[band].astype(np.float64) * metres
+        distance[~np.isfinite(distance) | (distance <= 0)] = near
+        shown = (np.clip(distance, near, far) - near) * (255 / (far - near))
+        found[band] = np.floor(shown + 0.5)
     return found
 
 

@@ -34,6 +34,7 @@ from replay.camera_logs.joined import excerpts, join_parts, known_times
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
 from replay.camera_logs.options import Align, Fit, Gaps
+from replay.camera_logs.pixels import Depth
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
@@ -59,6 +60,7 @@ class ForeignSource(ClockedSource):
             show the last image; see `pauses`.
         start: seconds after the first image of all, before which images are left out.
         stop: seconds after it from which on they are left out.
+        depth: distances in metres that are shown black and white.
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged.
@@ -86,6 +88,7 @@ class ForeignSource(ClockedSource):
         gaps: Gaps = "skip",
         start: float = 0.0,
         stop: float | None = None,
+        depth: Depth | None = None,
         rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
@@ -107,7 +110,7 @@ class ForeignSource(ClockedSource):
         self._files = image_logs(named)
         self._loop = loop
         self._hashes: list[dict[str, Any]] | None = None
-        self._fit = fit
+        self._fit, self._depth = fit, depth
         self._asked_size = size
         self._goal = goal
         self._streams: list[ImageStream] = []
@@ -115,7 +118,7 @@ class ForeignSource(ClockedSource):
         self._shown: dict[int, tuple[int, Bytes]] = {}
         try:
             for path, topic in named_streams(self._files, topics):
-                self._streams.append(open_images(path, topic, salvage=salvage))
+                self._streams.append(open_images(path, topic, salvage=salvage, depth=depth))
             if align != "index":
                 self._streams = join_parts(self._streams)
             self._align_by = align
@@ -276,6 +279,8 @@ class ForeignSource(ClockedSource):
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if any(cut_or_added(size, self._size, self._fit) for size in self._sizes):
             chosen["fit"] = self._fit
+        if self._depth is not None:
+            chosen["range_metres"] = list(self._depth)
         return chosen
 
     def close(self) -> None:

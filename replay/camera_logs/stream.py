@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.messages import SCHEMAS, Decoder, image_decoder
-from replay.camera_logs.pixels import RECIPE
+from replay.camera_logs.pixels import RECIPE, Depth
 from replay.mcap.records import Bytes
 from replay.storage.location import Location
 
@@ -93,7 +93,10 @@ class ImageStream(ABC):
 
 
 def choose_images(
-    path: Location, topic: str | None, channels: Iterable[tuple[str, str, str, Found]]
+    path: Location,
+    topic: str | None,
+    channels: Iterable[tuple[str, str, str, Found]],
+    depth: Depth | None = None,
 ) -> tuple[Found, Decoder]:
     """Find the one channel of images that is meant, and the decoder of its messages.
 
@@ -101,6 +104,7 @@ def choose_images(
         path: the log, for the error.
         topic: as the user named it, or None.
         channels: topic, schema, encoding, and what stands for the channel.
+        depth: how distances are shown; see `gray`.
 
     Raises:
         UsageError: there is none, or not one.
@@ -108,7 +112,7 @@ def choose_images(
     readable: list[tuple[str, Found, Decoder]] = []
     others: dict[str, str] = {}
     for name, schema, encoding, channel in channels:
-        decoder = image_decoder(schema, encoding)
+        decoder = image_decoder(schema, encoding, depth)
         if decoder is None:
             others[name] = f"{schema} in {encoding or 'no encoding'}"
         else:

@@ -95,6 +95,7 @@ def open_cameras(
         gaps=cameras.gaps,
         start=cameras.start,
         stop=cameras.stop,
+        depth=cameras.depth,
         rate=cameras.rate,
         loop=loop,
         salvage=salvage,

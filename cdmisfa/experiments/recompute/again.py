@@ -20,7 +20,7 @@ from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_keyframe
 
-CAMERAS = ("topics", "size", "fit", "align", "rate", "gaps", "start", "stop")
+CAMERAS = ("topics", "size", "fit", "align", "rate", "gaps", "start", "stop", "depth")
 """Options of a command that say how images of others become frames."""
 
 

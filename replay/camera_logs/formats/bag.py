@@ -13,6 +13,7 @@ import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.camera_logs.messages import Decoder, image_decoder
+from replay.camera_logs.pixels import Depth
 from replay.camera_logs.stream import (
     ChannelFacts,
     ImageStream,
@@ -34,14 +35,14 @@ class BagImages(ImageStream):
         LogDamagedError: rosbags cannot read it.
     """
 
-    def __init__(self, path: Path, topic: str | None) -> None:
+    def __init__(self, path: Path, topic: str | None, *, depth: Depth | None = None) -> None:
         self.path = path
         self._messages: Iterator[tuple[int, bytes]] = iter(())
         self._next = -1
         ros1 = _is_ros1(path)
         self._reader = _opened(path, ros1=ros1)
         try:
-            self._connections, self._decode = self._find(topic, ros1=ros1)
+            self._connections, self._decode = self._find(topic, depth, ros1=ros1)
             self.topic = str(self._connections[0].topic)
             with explained(path, "rosbags"):
                 stamps = [stamp for stamp, _ in self._from(None)]
@@ -79,11 +80,13 @@ class BagImages(ImageStream):
             before = stamp
             yield stamp, data
 
-    def _find(self, topic: str | None, *, ros1: bool) -> tuple[list[Any], Decoder]:
+    def _find(
+        self, topic: str | None, depth: Depth | None, *, ros1: bool
+    ) -> tuple[list[Any], Decoder]:
         kinds = _kinds(self._reader, ros1=ros1)
         encoding = "ros1" if ros1 else "cdr"
         channels = [(name, kind, encoding, name) for name, kind in kinds.items()]
-        chosen, decode = choose_images(self.path, topic, channels)
+        chosen, decode = choose_images(self.path, topic, channels, depth)
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 

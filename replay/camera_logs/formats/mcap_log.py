@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.messages import image_decoder
+from replay.camera_logs.pixels import Depth
 from replay.camera_logs.stream import ImageStream, choose_images, sorted_times
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Bytes, MalformedRecord
@@ -28,7 +29,14 @@ class McapImages(ImageStream):
         LogDamagedError: the log is damaged.
     """
 
-    def __init__(self, path: Location, topic: str | None, *, salvage: bool = False) -> None:
+    def __init__(
+        self,
+        path: Location,
+        topic: str | None,
+        *,
+        salvage: bool = False,
+        depth: Depth | None = None,
+    ) -> None:
         self.path = path
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
         try:
@@ -37,7 +45,7 @@ class McapImages(ImageStream):
                 (c.topic, kinds.get(c.schema_id, "no schema"), c.encoding, c)
                 for c in self.reader.channels.values()
             ]
-            self._channel, self._decode = choose_images(path, topic, channels)
+            self._channel, self._decode = choose_images(path, topic, channels, depth)
             self.topic = self._channel.topic
             self._index()
         except BaseException:
