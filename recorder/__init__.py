@@ -1,11 +1,14 @@
-"""The world: simulated streams, and writing what any source shows."""
+"""The world: simulated and live streams, and writing what any source shows."""
 
 from cdmisfa.core.faces import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
+        "recorder.cameras.gym": "GymSource",
+        "recorder.cameras.stepped": "ArraySource",
         "recorder.config": "RecordConfig SceneConfig",
+        "recorder.live": "RecordedWhileWatched record_watched",
         "recorder.log.split": "Split",
         "recorder.recording": "RecordingStoppedError ViewRecording record record_scene",
         "recorder.world.scenes": "SCENES Scene open_scene",

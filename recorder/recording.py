@@ -147,7 +147,7 @@ def record(
         refuse_existing(folder, force=force)
     elif not holds_recording(folder):
         raise UsageError(f"{folder} holds no recording to go on with: choose another folder")
-    identity = _identity(source, names, settings, scene)
+    identity = identity_of(source, names, settings, scene)
     streams = identity.spec.streams
     for view in views or ():
         if view not in streams:
@@ -203,7 +203,7 @@ def record(
         )
         with contextlib.closing(blocks):
             for block in blocks:
-                _check(block, identity.spec)
+                check_block(block, identity.spec)
                 logs[block.stream].write(block)
                 if progress is not None:
                     progress(min(log.t for log in logs.values()))
@@ -214,7 +214,7 @@ def record(
         for log in logs.values():
             log.finish()
         keep_recording(folder, chosen)
-    return [_written(view, path, n) for view, done in parts.items() for path, n in done]
+    return [view_recording(view, path, n) for view, done in parts.items() for path, n in done]
 
 
 def record_scene(
@@ -246,16 +246,16 @@ def recorded(folder: Path) -> list[ViewRecording]:
     Raises:
         LogDamagedError: the disk does not give a file.
     """
-    return [_written(*log) for log in finished_logs(folder)]
+    return [view_recording(*log) for log in finished_logs(folder)]
 
 
-def _written(view: str, path: Path, frames: int) -> ViewRecording:
+def view_recording(view: str, path: Path, frames: int) -> ViewRecording:
     with path.open("rb") as file:
         checksum = hashlib.file_digest(file, "sha256").hexdigest()
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)
 
 
-def _check(block: Block, spec: SourceSpec) -> None:
+def check_block(block: Block, spec: SourceSpec) -> None:
     """Refuse a block that is not what its source says, before it spoils a file."""
     shape, dtype = block.frames.shape[1:], block.frames.dtype
     if shape != spec.frame_shape or dtype != spec.dtype:
@@ -265,13 +265,17 @@ def _check(block: Block, spec: SourceSpec) -> None:
         )
 
 
-def _identity(
+def identity_of(
     source: FrameSource,
     names: Sequence[str] | None,
     settings: RecordConfig,
     scene: OpenScene | None,
 ) -> Identity:
-    """What a recording of a source states; refused where no recording can hold it."""
+    """What a recording of a source states.
+
+    Raises:
+        UsageError: no recording can hold it.
+    """
     if names and len(names) != len(source.spec.streams):
         raise UsageError(
             f"{len(names)} names given for {len(source.spec.streams)} views: name each, or none"
@@ -295,7 +299,8 @@ def _identity(
         stated = description(source)
         seed = stated.get("seed")
         known = seed if isinstance(seed, int) else 0
-        return Identity(stated["kind"], known, spec, {"source": stated})
+        gaps = bool(getattr(source, "gaps", False))
+        return Identity(stated["kind"], known, spec, {"source": stated}, gaps=gaps)
     clock = replace(settings, fps=spec.fps, start_ns=spec.start_ns)
     return Identity(
         scene.name,

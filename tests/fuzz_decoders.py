@@ -36,9 +36,9 @@ from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.store import DONE, ROWS
+from recorder.images.messages import image_decoder
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
-from replay.camera_logs.messages import image_decoder
 from replay.camera_logs.opening import open_images
 from replay.export.lerobot import write_lerobot
 from replay.mcap.records import MalformedRecord

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -208,8 +209,8 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(environments.importlib, "import_module", missing)
-    with pytest.raises(UsageError, match=r"needs gymnasium.*cdmisfa\[arena\]"):
+    monkeypatch.setattr(importlib, "import_module", missing)
+    with pytest.raises(UsageError, match=r"needs gymnasium.*cdmisfa\[gym\]"):
         make("pong", 0)
 
 

@@ -21,10 +21,9 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.messages import image_decoder
-from replay.camera_logs.pixels import ENCODINGS, gray, shrink
+from recorder.images.messages import image_decoder
+from recorder.images.pixels import ENCODINGS, MalformedImage, gray, shrink
 from replay.camera_logs.source import ForeignSource
-from replay.mcap.records import MalformedRecord
 
 RANDOM = np.random.default_rng(5)
 GRAY = RANDOM.integers(0, 256, (6, 8), np.uint8)
@@ -168,7 +167,7 @@ def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb12", "64FC1", "yuv422", ""])
 def test_other_formats_are_refused_by_name(encoding: str) -> None:
-    with pytest.raises(MalformedRecord, match=repr(encoding)):
+    with pytest.raises(MalformedImage, match=repr(encoding)):
         gray(bytes(48), 6, 8, encoding, 8)
 
 
@@ -178,7 +177,7 @@ def test_bytes_that_are_no_image_are_refused(data: bytes, which: tuple[str, str]
     assert decoder is not None
     try:
         image = decoder(data)
-    except MalformedRecord:
+    except MalformedImage:
         return
     assert image.dtype == np.uint8
 

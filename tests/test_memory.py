@@ -15,16 +15,15 @@ import resource, sys
 import numpy as np
 from PIL import Image
 from cdmisfa.core.errors import CdmisfaError
-from replay.camera_logs.pixels import MAX_PIXELS, gray
+from recorder.images.pixels import MAX_PIXELS, MalformedImage, gray
 from replay.camera_logs.opening import open_images
-from replay.mcap.records import MalformedRecord
 from replay.runs.modules import load_modules
 from pathlib import Path
 folder, size = Path(sys.argv[1]), (9000, 4000)
 assert size[0] * size[1] == MAX_PIXELS
 try:
     {work}
-except (CdmisfaError, MalformedRecord) as error:
+except (CdmisfaError, MalformedImage) as error:
     assert len(str(error)) < 500
 line = next(x for x in open("/proc/self/status") if x.startswith("VmHWM"))
 print(int(line.split()[1]) // 1024)

@@ -49,6 +49,8 @@ FORBIDDEN = {
     "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "cdmisfa.presets": ("cdmisfa.core.config",),
     "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),
+    "recorder.cameras": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner", "rerun"),
+    "recorder.images": ("recorder.log.logfile", "recorder.cameras.live", "replay.palette"),
     "recorder.log": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner"),
     "recorder.world": ("recorder.log.logfile", "replay.palette", "cdmisfa.features.sfa", "mcap"),
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),

@@ -17,8 +17,8 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from recorder.images.pixels import shrink
 from replay.camera_logs.formats.video import VideoImages
-from replay.camera_logs.pixels import shrink
 from replay.camera_logs.source import ForeignSource
 
 av = pytest.importorskip("av")

@@ -8,19 +8,17 @@ the games' memory.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import importlib.util
-import os
 from collections.abc import Callable, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from cdmisfa.arena.pictures import HEIGHT, WIDTH, Rng, Shown, stateless
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.pixels import shrink
+from recorder.cameras.gym import make, picture, play
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "icub"
 """The recording that comes with the project."""
@@ -31,29 +29,22 @@ GAME_HOLD = 4
 GAME_SKIP = 2
 """Frames of the console for each of ours."""
 
-LARGEST_SEED = 2**31 - 1
-
 
 def classic(name: str, hold: int, state: tuple[str, ...]) -> Callable[[Rng, int], Shown]:
     """A classic control task, each random action held for some frames."""
 
-    def make(rng: Rng, n: int) -> Shown:
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
-        gymnasium = _package("gymnasium")
-        environment = gymnasium.make(name, render_mode="rgb_array")
+    def make_stream(rng: Rng, n: int) -> Shown:
+        environment = make(name)
         return _play(environment, rng, n, hold, state, lambda seen: (environment.render(), seen))
 
-    return make
+    return make_stream
 
 
 def atari(game: str, memory: Mapping[str, int]) -> Callable[[Rng, int], Shown]:
     """An Atari game and, of its memory, the bytes at some addresses."""
 
-    def make(rng: Rng, n: int) -> Shown:
-        gymnasium, ale = _package("gymnasium"), _package("ale_py")
-        ale.ALEInterface.setLoggerMode(ale.LoggerMode.Error)
-        gymnasium.register_envs(ale)
-        environment = gymnasium.make(f"ALE/{game}-v5", obs_type="rgb", frameskip=GAME_SKIP)
+    def make_stream(rng: Rng, n: int) -> Shown:
+        environment = make(f"ALE/{game}-v5", obs_type="rgb", frameskip=GAME_SKIP)
         console = environment.unwrapped.ale
         addresses = list(memory.values())
         return _play(
@@ -65,7 +56,7 @@ def atari(game: str, memory: Mapping[str, int]) -> Callable[[Rng, int], Shown]:
             lambda seen: (seen, console.getRAM()[addresses]),
         )
 
-    return make
+    return make_stream
 
 
 def _play(
@@ -80,16 +71,9 @@ def _play(
     frames = np.empty((n, HEIGHT, WIDTH), np.uint8)
     state = np.empty((n, len(names)))
     with contextlib.closing(environment):
-        environment.reset(seed=int(rng.integers(LARGEST_SEED)))
-        environment.action_space.seed(int(rng.integers(LARGEST_SEED)))
-        for t in range(n):
-            if t % hold == 0:
-                action = environment.action_space.sample()
-            seen, _, ended, cut, _ = environment.step(action)
-            if ended or cut:
-                seen, _ = environment.reset()
-            picture, state[t] = look(seen)
-            frames[t] = shrink(np.asarray(Image.fromarray(picture).convert("L")), HEIGHT, WIDTH)
+        for t, seen in enumerate(islice(play(environment, rng, hold), n)):
+            shown, state[t] = look(seen)
+            frames[t] = picture(shown, (HEIGHT, WIDTH))
     return Shown(frames, state, names)
 
 
@@ -126,13 +110,6 @@ def icub(view: str, thing: str) -> Callable[[Rng, int], Shown]:
             return Shown(block.frames, block.truth[:, columns], names)
 
     return make
-
-
-def _package(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise _missing(name) from error
 
 
 def _missing(name: str) -> UsageError:

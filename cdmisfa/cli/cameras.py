@@ -1,9 +1,12 @@
-"""Options for other people's camera logs, and what is said of a source that was opened."""
+"""Options for cameras and other people's logs of them, and what is said of an opened source."""
 
 from __future__ import annotations
 
+import contextlib
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,6 +15,9 @@ from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
+    from cdmisfa.experiments.sources import Configuration
+    from recorder.cameras.words import LiveOptions
+    from replay.camera_logs.options import CameraOptions
 
 
 def _height_and_width(
@@ -25,12 +31,22 @@ def _height_and_width(
     return int(found[2]), int(found[1])
 
 
+size_option = click.option(
+    "--size",
+    callback=_height_and_width,
+    metavar="WxH",
+    help="Shrink camera images to this size; by default to what has their ratio of the sides "
+    "and no more pixels than 128x48, of live ones 128x48.",
+)
+
 rate_option = click.option(
     "--rate",
     type=click.FloatRange(1e-3, 1e6),
     metavar="HZ",
-    help="Frames a second of camera logs; by default the first stream's.",
+    help="Frames a second of cameras and logs; by default the first stream's.",
 )
+
+size_and_rate = options.together(size_option, rate_option)
 
 
 def _seconds(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
@@ -67,13 +83,7 @@ camera_options = options.together(
         help="A topic of images in a log, one stream each, or a pattern of topics, such as "
         "'/cam*'; repeatable.",
     ),
-    click.option(
-        "--size",
-        callback=_height_and_width,
-        metavar="WxH",
-        help="Shrink camera images to this size; by default to what has their ratio of the sides "
-        "and no more pixels than 128x48.",
-    ),
+    size_option,
     click.option(
         "--fit",
         type=click.Choice(["crop", "pad", "stretch"]),
@@ -121,6 +131,57 @@ camera_options = options.together(
         help="Say what would be read from camera logs, and write nothing.",
     ),
 )
+
+live_options = options.together(
+    click.option(
+        "--hold",
+        type=click.FloatRange(0, 1e6),
+        default=0.25,
+        show_default=True,
+        metavar="SECONDS",
+        help="How long a camera's picture stands for those that are missing; then it has a gap.",
+    ),
+    click.option(
+        "--lost",
+        type=click.Choice(["reconnect", "wait", "end"]),
+        default="reconnect",
+        show_default=True,
+        help="What to do about a camera that stalls or goes away.",
+    ),
+    click.option(
+        "--stall",
+        type=click.FloatRange(0.1, 1e6),
+        default=5.0,
+        show_default=True,
+        metavar="SECONDS",
+        help="A camera without a picture for so long has stalled.",
+    ),
+)
+
+
+def live_streams(values: Mapping[str, Any]) -> LiveOptions:
+    """What `live_options` and a seed say."""
+    from recorder.cameras.words import LiveOptions
+
+    return LiveOptions(
+        hold=values["hold"], on_loss=values["lost"], stall=values["stall"], seed=values["seed"]
+    )
+
+
+def tell(line: str) -> None:
+    """Say on stderr what became of a camera."""
+    click.echo(line, err=True)
+
+
+def say_counts(source: FrameSource) -> None:
+    """Say on stderr what became of each live stream's pictures."""
+    for name, counts in getattr(source, "alignment", {}).items():
+        tell(
+            f"{name}: {counts['messages']} pictures; {counts['repeated']} frames repeated, "
+            f"{counts['missing']} missing; pictures: {counts['dropped']} between frames, "
+            f"{counts['late']} late, {counts['disordered']} out of order, {counts['lost']} thrown "
+            "away"
+        )
 
 
 def say_about(source: FrameSource) -> None:
@@ -171,3 +232,58 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     click.echo(f"{source.frames} frames at {source.spec.fps:g} a second, {seconds:.6g} s")
     for warning in source.warnings:
         click.echo(f"warning: {warning}", err=True)
+
+
+@contextlib.contextmanager
+def live_source(
+    words: Sequence[str],
+    live: Mapping[str, Any],
+    cameras: CameraOptions,
+    out: Path | None,
+    record_to: Path | None,
+    *,
+    preset: str | None,
+    settings: Sequence[str],
+    fsync_every: float | None,
+    force: bool,
+) -> Iterator[tuple[FrameSource, Configuration]]:
+    """Live streams to learn from, recorded meanwhile where that is asked for.
+
+    Args:
+        words: a stream each.
+        live: what `live_options` say, and a seed.
+        cameras: what `camera_options` say.
+        out: folder of the run; looked at before the cameras are opened.
+        record_to: folder of the recording.
+        preset: as the option.
+        settings: as the option --set.
+        fsync_every: as the option.
+        force: as the option.
+    """
+    from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.live import RecordedWhileWatched
+    from recorder.log.folder import refuse_existing
+
+    for folder in (out, record_to):
+        if folder is not None:
+            refuse_existing(folder, force=force)
+    source, configuration = open_cameras_now(
+        words, live_streams(live), cameras=cameras, preset=preset, settings=settings, say=tell
+    )
+    with contextlib.closing(source):
+        try:
+            if record_to is None:
+                yield source, configuration
+                return
+            recorded = RecordedWhileWatched(
+                source,
+                record_to,
+                settings=configuration.record,
+                fsync_every=fsync_every,
+                force=force,
+            )
+            with recorded:
+                yield recorded, configuration
+            tell(f"recording {record_to}")
+        finally:
+            say_counts(source)

@@ -106,6 +106,10 @@ class FrameSource(Protocol):
     Blocks do not depend on how they are cut: `take(s, 40)` gives the frames of
     `take(s, 15)` followed by `take(s, 25)`. Which stream is watched never changes
     what the streams show.
+
+    Streams of cameras have gaps: frames that a stream lacks. Then `take` gives the next n frames
+    that follow one another, wherever they begin, and moves t behind them; `take_all` gives a
+    block for each unbroken stretch, and none for a stream that shows nothing.
     """
 
     @property
@@ -168,8 +172,12 @@ class ClockedSource(SeekableSource):
     """A source that holds its spec and its clock, and so needs `take` and `describe` alone.
 
     A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.
+
+    Attributes:
+        gaps: whether streams may lack frames.
     """
 
+    gaps: bool = False
     _spec: SourceSpec
     _t: int = 0
 
@@ -187,6 +195,10 @@ class ClockedSource(SeekableSource):
         """Move the clock to frame t; see `SeekableSource.seek`."""
         check_frame(t)
         self._t = t
+
+    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        return [(start, stop)]
 
     def close(self) -> None:
         """Nothing to let go of."""
@@ -229,6 +241,36 @@ def check_request(spec: SourceSpec, stream: int, n: int) -> None:
         raise ValueError(f"stream {stream} does not exist: there are {len(spec.streams)}")
     if n < 1:
         raise ValueError(f"a block has at least one frame, not {n}")
+
+
+def take_unbroken(source: FrameSource, stream: int, n: int) -> Block:
+    """The next n frames of a stream that follow one another, from what all streams show.
+
+    Args:
+        source: its `take_all` is used; moves to behind the block.
+        stream: the index of the stream.
+        n: how many.
+
+    Raises:
+        LogExhaustedError: the source ends before.
+        ValueError: no such stream, or n < 1.
+    """
+    check_request(source.spec, stream, n)
+    run: list[Block] = []
+    held = 0
+    while held < n:
+        for block in source.take_all(n - held):
+            if block.stream != stream:
+                continue
+            if run and run[-1].t + len(run[-1]) != block.t:
+                run, held = [], 0
+            run.append(block)
+            held += len(block)
+    if len(run) == 1:
+        return run[0]
+    frames = freeze(np.concatenate([block.frames for block in run]))
+    truth = freeze(np.concatenate([block.truth for block in run]))
+    return Block(stream, run[0].t, frames, truth)
 
 
 def check_frame(t: int) -> None:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.arithmetic.choice import portable_bits
-from cdmisfa.core.blocks import SeekableSource, SourceSpec
+from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
+
+if TYPE_CHECKING:
+    from recorder.cameras.words import LiveOptions
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -208,6 +211,52 @@ def open_source(
         kind = scene_kind_for(source.spec, described, preset)
         learner = None if described.get("scene") in SCENES else OF_CAMERAS
         return source, configure(kind, preset, settings, seed, learner=learner)
+    except BaseException:
+        source.close()
+        raise
+
+
+def open_cameras_now(
+    words: Sequence[str | Path],
+    live: LiveOptions,
+    *,
+    cameras: CameraOptions | None = None,
+    preset: str | None = None,
+    settings: Sequence[str] = (),
+    say: Callable[[str], None] = lambda line: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[FrameSource, Configuration]:
+    """Open live streams, as `is_live` finds them, on one clock; see `open_live`.
+
+    Args:
+        words: a stream each.
+        live: how they become frames; its seed is also that of the configuration.
+        cameras: their size and rate; what is of logs alone is refused.
+        preset: instead of that of cameras.
+        settings: `section.key=value` words.
+        say: told in a line when a camera's state changes.
+        stop: asked while waiting for the first pictures.
+
+    Raises:
+        UsageError: a word names no live stream or one that cannot be opened, or a wrong
+            configuration.
+    """
+    from recorder.cameras.words import is_live, open_live
+
+    stored = [str(word) for word in words if not is_live(str(word))]
+    if stored:
+        raise UsageError(
+            f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
+            "and logs apart"
+        )
+    cameras = cameras or CameraOptions()
+    if cameras != CameraOptions(size=cameras.size, rate=cameras.rate):
+        raise UsageError("of live streams only --size and --rate are set: leave out the others")
+    live = replace(live, size=cameras.size or live.size, rate=cameras.rate or live.rate)
+    source = open_live([str(word) for word in words], live, say=say, stop=stop)
+    try:
+        kind = scene_kind_for(source.spec, source.describe(), preset)
+        return source, configure(kind, preset, settings, live.seed, learner=OF_CAMERAS)
     except BaseException:
         source.close()
         raise

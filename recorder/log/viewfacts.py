@@ -46,6 +46,8 @@ class ViewFacts:
         first_frame: number of the file's first frame.
         seed: of the scene's motions.
         config_sha256: checksum of the configuration that is attached.
+        gaps: whether frames may be missing, of live streams that had none to show; a key only
+            where they may.
         versions: of packages that the bytes may depend on, each a key, too.
         values: the record as it stands in the file, where it was read from one.
     """
@@ -62,6 +64,7 @@ class ViewFacts:
     first_frame: int
     seed: str
     config_sha256: str
+    gaps: bool = False
     versions: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict, compare=False)
 
@@ -82,7 +85,8 @@ class ViewFacts:
 
     def as_metadata(self) -> dict[str, str]:
         """The file's metadata record."""
-        names = [f.name for f in dataclasses.fields(self) if f.name not in ("versions", "values")]
+        others = ("versions", "values", *(() if self.gaps else ("gaps",)))
+        names = [f.name for f in dataclasses.fields(self) if f.name not in others]
         stated = {name: _text(getattr(self, name)) for name in names}
         return {"schema": str(SCHEMA_VERSION), **stated, **self.versions}
 
@@ -146,6 +150,7 @@ class ViewFacts:
             first_frame=number("first_frame", 0, MAX_FRAMES, "0"),
             seed=values.get("seed", ""),
             config_sha256=values.get("config_sha256", ""),
+            gaps=values.get("gaps") == str(True),
             versions={key: v for key, v in values.items() if key.startswith(_VERSION)},
             values=dict(values),
         )
@@ -161,6 +166,7 @@ class Identity:
         spec: what its source delivers, with the names of the views as its streams.
         config: what it was told, as JSON values.
         packages: whose versions the frames depend on, beside `PACKAGES`.
+        gaps: whether streams may lack frames.
     """
 
     kind: str
@@ -168,6 +174,7 @@ class Identity:
     spec: SourceSpec
     config: Mapping[str, Any]
     packages: tuple[str, ...] = ()
+    gaps: bool = False
 
     def config_json(self) -> bytes:
         """The configuration as the attachment holds it."""
@@ -189,6 +196,7 @@ class Identity:
             first_frame=first_frame,
             seed=str(self.seed),
             config_sha256=hashlib.sha256(self.config_json()).hexdigest(),
+            gaps=self.gaps,
             versions={_VERSION + name: version(name) for name in (*PACKAGES, *self.packages)},
         )
 

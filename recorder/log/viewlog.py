@@ -62,6 +62,7 @@ class ViewLog:
     Attributes:
         file: the log itself, to be flushed, finished or abandoned.
         t: the next frame to be written.
+        frames: how many are written.
     """
 
     def __init__(
@@ -77,6 +78,8 @@ class ViewLog:
         fsync_every: float | None = None,
     ) -> None:
         self.t = self._first = first_frame
+        self.frames = 0
+        self._gaps = identity.gaps
         self._spec = spec = identity.spec
         self._stream = spec.streams.index(view)
         self._topic = view_topic(view)
@@ -114,14 +117,16 @@ class ViewLog:
         }
 
     def write(self, block: Block) -> None:
-        """Write the frames of a block, which must start at `t`.
+        """Write the frames of a block, which must start at `t`, or later where there are gaps.
 
         Raises:
             ValueError: the block is of another stream or time.
             LogWriteError: the disk does not take it.
         """
-        if block.stream != self._stream or block.t != self.t:
+        follows = block.t >= self.t if self._gaps else block.t == self.t
+        if block.stream != self._stream or not follows:
             raise ValueError(f"{self.file.path}: frame {self.t} is next, not {block.t}")
+        self.t = block.t
         pose = self._pose
         for frame, values in zip(block.frames, block.truth, strict=True):
             if pose is not None and (self.t % self._pose_every == 0 or self.t == self._first):
@@ -134,6 +139,7 @@ class ViewLog:
                 self._write(TRUTH_TOPIC, values)
             self._write(self._topic, frame)
             self.t += 1
+        self.frames += len(block)
 
     def copy(self, path: Path, stop: int) -> None:
         """Take over the frames before `stop` of an earlier log of the same part.
@@ -151,7 +157,7 @@ class ViewLog:
                 held += channel.topic == self._topic
         if held != stop:
             raise LogDamagedError(f"{path} changed while it was read: resume it again")
-        self.t = stop
+        self.t, self.frames = stop, held - self._first
 
     def _write(self, topic: str, *values: Any) -> None:
         number, encode = self._channels[topic]
@@ -236,12 +242,16 @@ class ViewParts:
             )
             at += n
 
+    def state(self, name: str, values: Mapping[str, str]) -> None:
+        """Write what is known only now into the last part, as a metadata record."""
+        self._log.file.add_metadata(name, values)
+
     def finish(self) -> None:
         """Give the last part its index and its name, and forget what it was copied from."""
         file = self._log.file
         file.finish()
         aside_path(file.path).unlink(missing_ok=True)
-        self._parts.append((file.path, self.t - self._first))
+        self._parts.append((file.path, self._log.frames))
 
     def abandon(self) -> None:
         """Leave a readable partial."""
@@ -258,7 +268,7 @@ class ViewParts:
             return MAX_FRAMES
         written = self.t - self._first
         if self._length is not None:
-            return self._length - written
+            return max(self._length - written, 0)  # a gap may reach beyond
         return int(written == 0 or self._log.file.size < (self._split.size or 0))
 
     def _begin_next(self) -> None:
@@ -268,7 +278,7 @@ class ViewParts:
         """
         full = self._log.file
         full.flush()
-        self._parts.append((full.path, self.t - self._first))
+        self._parts.append((full.path, self._log.frames))
         self._first = self.t
         try:
             self._log = self._next()

@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
+from recorder.images.pixels import shrink
 from replay.camera_logs.options import Fit
-from replay.camera_logs.pixels import shrink
 from replay.mcap.records import Bytes
 
 FRAME_PIXELS: Final = 48 * 128

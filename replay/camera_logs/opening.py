@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import UsageError
+from recorder.images.pixels import Depth
 from replay.camera_logs.formats.bag import BAGS, BagImages
 from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
 from replay.camera_logs.formats.mcap_log import McapImages
 from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages
-from replay.camera_logs.pixels import Depth
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.identity import identity
 from replay.storage.checksum import sha256

@@ -12,6 +12,7 @@ import numpy as np
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from recorder.images.pixels import Depth, MalformedImage
 from replay.camera_logs.alignment import (
     Gap,
     Rows,
@@ -34,7 +35,6 @@ from replay.camera_logs.joined import excerpts, join_parts, known_times
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
 from replay.camera_logs.options import Align, Fit, Gaps
-from replay.camera_logs.pixels import Depth
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
@@ -314,7 +314,7 @@ class ForeignSource(ClockedSource):
         images = self._streams[stream]
         try:
             return images.image(row)
-        except MalformedRecord as error:
+        except (MalformedImage, MalformedRecord) as error:
             raise LogDamagedError(f"{images.where(row)}: {error}") from None
         except UsageError as error:
             raise UsageError(f"{images.path}: {error}") from None

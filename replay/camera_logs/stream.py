@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.messages import SCHEMAS, Decoder, image_decoder
-from replay.camera_logs.pixels import RECIPE, Depth
+from recorder.images.messages import SCHEMAS, Decoder, image_decoder
+from recorder.images.pixels import RECIPE, Depth
 from replay.mcap.records import Bytes
 from replay.storage.location import Location
 

@@ -30,9 +30,17 @@ def pieces(source: Logged, stream: int) -> Iterator[Block]:
     frame = math.prod(source.spec.frame_shape) * np.dtype(source.spec.dtype).itemsize
     size = max(1, min(PIECE, PIECE_BYTES // max(1, frame)))
     end = source.first_frame + source.frames
-    for t in range(source.first_frame, end, size):
-        source.seek(t)
-        yield source.take(stream, min(size, end - t))
+    for low, high in source.spans(stream, source.first_frame, end):
+        for t in range(low, high, size):
+            source.seek(t)
+            yield source.take(stream, min(size, high - t))
+
+
+def count(source: Logged) -> int:
+    """Frames of all views."""
+    first, streams = source.first_frame, range(len(source.spec.streams))
+    spans = [span for s in streams for span in source.spans(s, first, first + source.frames)]
+    return sum(high - low for low, high in spans)
 
 
 def file_names(spec: SourceSpec) -> tuple[str, ...]:
@@ -54,4 +62,4 @@ def write_images(source: Logged, folder: Path) -> int:
         for block in pieces(source, stream):
             for i, frame in enumerate(block.frames):
                 Image.fromarray(frame).save(folder / name / f"{block.t + i:08d}.png")
-    return source.frames * len(source.spec.streams)
+    return count(source)

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.export.images import file_names, pieces
+from replay.export.images import count, file_names, pieces
 from replay.export.videos import pixel_format, write_film
 from replay.inputs.opening import Logged
 
@@ -69,6 +69,11 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
             "change it with cdmisfa convert --rate"
         )
     columns, features = _columns(source, fps)
+    if count(source) < source.frames * len(source.spec.streams):
+        raise UsageError(
+            "the recording has gaps, and LeRobot's format none: export a recording without, or "
+            "to images or mp4"
+        )
     stats = {key: _number_stats(column) for key, column in columns.items()}
     videos = []
     if source.spec.images:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from replay.export.images import file_names, pieces
+from replay.export.images import count, file_names, pieces
 from replay.inputs.opening import Logged
 
 LOSSY = {"crf": "18", "preset": "medium"}
@@ -36,7 +36,7 @@ def write_films(source: Logged, folder: Path, *, lossless: bool) -> int:
     """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
     for stream, name in enumerate(file_names(source.spec)):
         write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
-    return source.frames * len(source.spec.streams)
+    return count(source)
 
 
 def write_film(

@@ -188,7 +188,7 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
             streams |= set(filter(None, facts.values.get("streams", "").split(",")))
             edges = [(0, facts.first_frame), *checked.view.ranges]
             for (_, end), (start, _) in itertools.pairwise(edges):
-                if start > end:
+                if start > end and not facts.gaps:
                     yield Problem(str(checked.path), f"frames {end} to {start - 1} are missing")
         if checked.error is not None:
             yield _said(checked.path, checked.error)
@@ -203,6 +203,8 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
         yield replace(_said(passes[0].path, error), where=folder)
         return
     with contextlib.closing(source):
+        if source.gaps:
+            return
         ends = {name: ranges[-1][1] for name, ranges in source.coverage().items()}
         shortest = min(ends.values())
         for name, end in ends.items():

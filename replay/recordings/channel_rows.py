@@ -64,7 +64,7 @@ class ChannelRows:
 
     Raises:
         LogDamagedError: a log time that is no frame's, a frame twice or out of order, and
-            without `salvage` a frame that is missing.
+            without `salvage` a frame that is missing, unless the file says that it has gaps.
     """
 
     def __init__(
@@ -73,6 +73,7 @@ class ChannelRows:
         self.channel = channel
         self._reader = reader
         self._facts = facts
+        self._may_lack = reader.salvage or facts.gaps
         self._segments: list[Segment] = []
         self._to_confirm: set[int] = set()
         self._starts = [0]
@@ -81,7 +82,7 @@ class ChannelRows:
         self._passed = 0
         if passing:
             self.spans = self._unbroken(0)
-        elif reader.by_index and not reader.salvage:
+        elif reader.by_index and not self._may_lack:
             # Each chunk's log times are compared with the summary when it is read.
             self._to_confirm = set(range(len(self._segments)))
             self.spans = self._unbroken(self._starts[-1])
@@ -90,7 +91,8 @@ class ChannelRows:
 
     def extend(self) -> None:
         """Take in what its recorder has added to the file."""
-        self.spans = self._spans_from(self._take_segments())
+        kept = self._take_segments()
+        self.spans = self._spans_from(0 if self._facts.gaps else kept)
 
     def pass_over(self, segment: Segment) -> MessageTable | None:
         """Number the messages of the next chunk; give them if it is whole and has some."""
@@ -159,7 +161,7 @@ class ChannelRows:
         exact = self._facts.times(frames) == times
         before = found[-1].stop if found else self._facts.first_frame
         steps = np.diff(frames, prepend=before - 1)
-        wrong = np.flatnonzero(~exact | (steps < 1 if self._reader.salvage else steps != 1))
+        wrong = np.flatnonzero(~exact | (steps < 1 if self._may_lack else steps != 1))
         if len(wrong):
             at = int(wrong[0])
             raise LogDamagedError(

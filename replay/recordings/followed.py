@@ -70,6 +70,11 @@ class FollowedSource(ClockedSource):
         self._source: RecordedSource | None = None
         self._identity: object = None
         self._wait(0, "frame 0")
+        if self._now.gaps:
+            raise UsageError(
+                f"{path}: a recording of cameras cannot be followed: learn from the cameras with "
+                "--record, or from the recording when it is finished"
+            )
         self._t = self._now.t
         self._spec = replace(self._now.spec, length=None)
 

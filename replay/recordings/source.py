@@ -31,7 +31,7 @@ _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)
 _SMALLEST: Final = 64
 """Bytes that no log of a recording has less of once its header is written."""
 _SCENE: Final = ("scene", "seed", "config_sha256")
-_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", *_SCENE)
+_SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *_SCENE)
 
 
 class RecordedSource(ClockedSource):
@@ -45,6 +45,7 @@ class RecordedSource(ClockedSource):
         opened: views that were opened already.
 
     Attributes:
+        gaps: whether the recording is of live streams, which may lack frames.
         warnings: what the user should know: files that were cut, frames left out.
     """
 
@@ -133,18 +134,16 @@ class RecordedSource(ClockedSource):
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a view shows at t .. t+n-1; moves t by n.
 
+        Of live streams, which have gaps, the next n that follow one another; moves t behind them.
+
         Raises:
             LogExhaustedError: fewer than n frames are left; t stays.
             LogDamagedError: a chunk is damaged; t stays.
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
-        played = self._t - self._first
-        if not self._loop and played + n > self._count:
-            raise LogExhaustedError(
-                f"{self._name()}: {self._count - played} frames are left at frame {self._t}, "
-                f"{n} are needed; record more frames, or begin again at its end with --loop"
-            )
+        start = self._unbroken(stream, n)
+        played = start - self._first
         frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
         truth = np.empty((n, len(self._spec.truth)))
         at = 0
@@ -152,9 +151,59 @@ class RecordedSource(ClockedSource):
             view, frame, count = self._place(stream, (played + at) % self._count, n - at)
             view.take(frame, frames[at : at + count], truth[at : at + count])
             at += count
-        block = Block(stream, self._t, freeze(frames), freeze(truth))
-        self._t += n
-        return block
+        self._t = start + n
+        return Block(stream, start, freeze(frames), freeze(truth))
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """What every view shows in the next n frames; of live streams each unbroken stretch."""
+        if not self.gaps:
+            return super().take_all(n)
+        check_request(self._spec, 0, n)
+        start, stop = self._t, self._t + n
+        if not self._loop and stop > self._first + self._count:
+            raise self._exhausted(n)
+        blocks = []
+        for stream in range(len(self._spec.streams)):
+            for low, high in self.spans(stream, start, stop):
+                self._t = low
+                blocks.append(self.take(stream, high - low))
+        self._t = stop
+        return tuple(blocks)
+
+    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """The unbroken stretches [low, high) that a view shows of the frames [start, stop)."""
+        if not self.gaps:
+            return [(start, stop)]
+        laps = range(
+            (start - self._first) // self._count, (stop - 1 - self._first) // self._count + 1
+        )
+        there = [
+            (low + lap * self._count, high + lap * self._count)
+            for lap in laps
+            for low, high in self._held[stream]
+        ]
+        return intersection(there, [(start, stop)])
+
+    def _unbroken(self, stream: int, n: int) -> int:
+        """Where the next n frames of a view begin that follow one another."""
+        end = self._first + self._count
+        if not self.gaps:
+            if self._loop or self._t + n <= end:
+                return self._t
+            raise self._exhausted(n)
+        # Looping, a stretch that holds them is in the rest of this lap or in the next one.
+        end = self._t + 2 * self._count if self._loop else end
+        for low, high in self.spans(stream, self._t, max(end, self._t + 1)):
+            if high - low >= n:
+                return low
+        raise self._exhausted(n)
+
+    def _exhausted(self, n: int) -> LogExhaustedError:
+        left = self._first + self._count - self._t
+        return LogExhaustedError(
+            f"{self._name()}: {left} frames are left at frame {self._t}, "
+            f"{n} are needed; record more frames, or begin again at its end with --loop"
+        )
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t.
@@ -224,7 +273,9 @@ class RecordedSource(ClockedSource):
         """Find the frames that every view has, whole."""
         coverage = self.coverage()
         covered = list(coverage.values())
-        common = functools.reduce(intersection, covered)
+        self._held = [_joined(ranges) for ranges in covered]
+        self.gaps = self._views[0][0].facts.gaps
+        common = self._whole() if self.gaps else functools.reduce(intersection, covered)
         if not common:
             raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
         self._ranges = _joined(common)
@@ -233,7 +284,7 @@ class RecordedSource(ClockedSource):
         self._first = self._ranges[0][0]
         self._count = self._range_starts[-1]
         warnings = [text for view in self._all() for text in view.reader.warnings]
-        if len({ranges[-1][1] for ranges in covered}) > 1:
+        if not self.gaps and len({ranges[-1][1] for ranges in covered}) > 1:
             warnings.append(
                 f"{self._name()}: its views end at different frames; it ends with the shortest, "
                 f"before frame {self._ranges[-1][1]}"
@@ -247,6 +298,12 @@ class RecordedSource(ClockedSource):
         length = None if self._loop else self._count
         one = self._views[0][0].facts.spec
         self._spec = replace(one, streams=tuple(coverage), length=length)
+
+    def _whole(self) -> list[tuple[int, int]]:
+        """All frames of the clock, from the first to the last that any view has."""
+        end = max((high for ranges in self._held for _, high in ranges), default=0)
+        first = self._views[0][0].facts.first_frame
+        return [(first, end)] if first < end else []
 
     def _place(self, stream: int, played: int, wanted: int) -> tuple[ViewFile, int, int]:
         """Find the frame that is `played` frames from the start: file, frame, how many follow."""

@@ -45,7 +45,7 @@ class ViewFile:
         path: the file.
         facts: what it states about itself.
         ranges: the frames that are there with their ground truth, each [start, stop); one range,
-            except with `salvage`.
+            except with `salvage`, and of live streams with gaps.
     """
 
     def __init__(

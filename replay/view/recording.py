@@ -86,13 +86,15 @@ def write_views(
     if spec.truth and tau is None:
         truth = line_column(recording, spec, "world/truth", spec.truth)
     for t in range(first, first + count, BLOCK):
-        frames = np.arange(t, min(t + BLOCK, first + count))
-        keep = frames % (every if spec.images else 1) == 0
-        iterations = None if tau is None else frames[keep] // tau
+        stop = min(t + BLOCK, first + count)
         for stream, column in enumerate(columns):
-            source.seek(t)
-            block = source.take(stream, len(frames))
-            column.add(frames[keep], iterations, block.frames[keep])
+            for low, high in source.spans(stream, t, stop):
+                source.seek(low)
+                block = source.take(stream, high - low)
+                frames = np.arange(low, high)
+                keep = frames % (every if spec.images else 1) == 0
+                iterations = None if tau is None else frames[keep] // tau
+                column.add(frames[keep], iterations, block.frames[keep])
         if truth is not None:
             truth.add(frames, None, block.truth)
     for column in [*columns, *([truth] if truth is not None else [])]:

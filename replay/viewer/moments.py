@@ -69,4 +69,4 @@ def _last_frame(path: Path) -> int:
     with contextlib.closing(open_to_look([path], salvage=True)) as source:
         if isinstance(source, ForeignSource):
             return source.frames - 1
-        return max(ranges[-1][1] for ranges in source.coverage().values()) - 1
+        return max(ranges[-1][1] for ranges in source.coverage().values() if ranges) - 1

@@ -9,15 +9,17 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import camera_options, print_plan, say_about, say_changes
-from cdmisfa.cli.commands.record import print_recording, recording_stoppable
+from cdmisfa.cli.cameras import camera_options, live_options, print_plan, say_about, say_changes
+from cdmisfa.cli.commands.record import print_recording, record_streams, recording_stoppable
 from cdmisfa.cli.progress import bar
+from cdmisfa.core.errors import UsageError
 
 
 @click.command("convert")
 @click.argument("source", nargs=-1, required=True)
 @options.out("Folder of the recording.", required=True)
 @camera_options
+@live_options
 @click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")
 @click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
 @options.server_limits
@@ -36,20 +38,42 @@ def convert_command(
     force: bool,
     as_json: bool,
     dry_run: bool,
+    hold: float,
+    lost: str,
+    stall: float,
     **cameras: Any,
 ) -> None:
     """Write camera logs of others as a recording.
 
     SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, or a video or a folder of
     pictures for each stream; several, or a pattern such as 'logs/*.mcap'. What was
-    interrupted is resumed with --resume.
+    interrupted is resumed with --resume. Live streams are recorded, as by cdmisfa record.
     """
     from cdmisfa.experiments.convert import convert
+    from recorder.cameras.words import is_live
     from recorder.log.folder import refuse_existing
     from replay.camera_logs.options import CameraOptions
     from replay.inputs.opening import open_cameras, refuse_what_is_no_log
     from replay.inputs.words import places
 
+    if any(map(is_live, source)):
+        if resume or salvage or dry_run:
+            raise UsageError(
+                "live streams cannot go back: leave out --resume, --salvage and --dry-run"
+            )
+        record_streams(
+            ctx,
+            source,
+            out,
+            frames=None,
+            split=None,
+            fsync_every=fsync_every,
+            force=force,
+            as_json=as_json,
+            live={"hold": hold, "lost": lost, "stall": stall, "seed": 0},
+            cameras=cameras,
+        )
+        return
     named = places(source)
     for place in named:
         refuse_what_is_no_log(place)

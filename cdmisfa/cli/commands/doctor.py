@@ -19,7 +19,9 @@ PACKAGES = ("numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matpl
 """Packages that no command can do without for long."""
 
 EXTRAS = {
-    "video": (("av",), "videos: learn, convert, export --to mp4"),
+    "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
+    "gym": (("gymnasium",), "gym: streams of simulated tasks"),
+    "foxglove": (("websockets",), "foxglove:// streams of running robots"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo"), "streams of the arena"),

@@ -12,13 +12,21 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import camera_options, print_plan, say_about, say_changes
+from cdmisfa.cli.cameras import (
+    camera_options,
+    live_options,
+    live_source,
+    print_plan,
+    say_about,
+    say_changes,
+)
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import Bar, bar
+from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 
 if TYPE_CHECKING:
-    from cdmisfa.core.blocks import Block
+    from cdmisfa.core.blocks import Block, FrameSource
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.runs import RunResult
@@ -64,9 +72,17 @@ TICK = 0.1
     metavar="SECONDS",
     help="With --follow, give up when no frame came for so long.",
 )
+@click.option(
+    "--record",
+    "record_to",
+    type=options.OUT,
+    metavar="DIR",
+    help="Record what every live stream shows while learning, to learn the same from it again.",
+)
 @options.keyframes
 @options.fsync_every
 @camera_options
+@live_options
 @options.server_limits
 @options.force
 @options.as_json
@@ -90,11 +106,15 @@ def learn_command(
     no_rerun: bool,
     follow: bool,
     follow_timeout: float,
+    record_to: Path | None,
     keyframes: int | None,
     fsync_every: float | None,
     force: bool,
     as_json: bool,
     dry_run: bool,
+    hold: float,
+    lost: str,
+    stall: float,
     **cameras: Any,
 ) -> None:
     """Learn slow feature modules from a scene or a recording.
@@ -104,6 +124,8 @@ def learn_command(
     It may also be other people's logs of cameras: MCAP files, ROS bags, or a video or a
     folder of pictures for each stream. Logs may be URLs: s3://, http:// and https://.
     With --resume it is that of the run, and need not be given.
+    Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
+    av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
     """
     if resume and out is None:
         raise click.UsageError("--resume needs -o RUN, the run to resume")
@@ -115,57 +137,81 @@ def learn_command(
     from cdmisfa.experiments.resume import command_of
     from cdmisfa.experiments.runs import RunExhaustedError, run
     from cdmisfa.experiments.sources import open_source
+    from recorder.cameras.words import is_live
     from replay.camera_logs.options import CameraOptions
 
+    frames: FrameSource
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
     if portable:
         settings = (*settings, "learner.portable=true")
-    frames, configuration = open_source(
-        source,
-        preset=preset,
-        settings=settings,
-        seed=seed,
-        loop=loop,
-        salvage=salvage,
-        cameras=CameraOptions(**cameras),
-        follow=follow_timeout if follow else None,
-    )
-    if dry_run:
-        with contextlib.closing(frames):
-            print_plan(frames, as_json=as_json)
-        return
-    say_about(frames)
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            if hasattr(frames, "stop"):
-                frames.stop = stop  # waiting for frames ends with a signal, too
-            reporter = Reporter(shown, max_iterations)
-            result = run(
-                frames,
-                configuration.learner,
+    with contextlib.ExitStack() as stack:
+        if any(map(is_live, source)):
+            if resume or loop or salvage or follow or dry_run:
+                raise UsageError(
+                    "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
+                    "and --dry-run, or learn from a recording of them"
+                )
+            opened = live_source(
+                source,
+                {"hold": hold, "lost": lost, "stall": stall, "seed": seed},
+                CameraOptions(**cameras),
                 out,
-                seed=seed,
-                max_iterations=max_iterations,
-                max_modules=max_modules,
-                sections=configuration.tables(),
-                force=force,
-                rerun=not no_rerun,
-                sinks=(reporter,),
-                stop=stop,
-                resume=resume,
-                keyframes=keyframes,
+                record_to,
+                preset=preset,
+                settings=settings,
                 fsync_every=fsync_every,
-                live=live_view,
-                announce=announce,
-                command=None if out is None else command_of(source, ctx.params, out),
+                force=force,
             )
-    except RunExhaustedError as error:
-        show(error.result, as_json=as_json)
-        raise
-    finally:
-        say_changes(frames)
-        frames.close()
+            frames, configuration = stack.enter_context(opened)
+        else:
+            if record_to is not None:
+                raise UsageError(
+                    "--record is for live streams: leave it out, or see cdmisfa record"
+                )
+            frames, configuration = open_source(
+                source,
+                preset=preset,
+                settings=settings,
+                seed=seed,
+                loop=loop,
+                salvage=salvage,
+                cameras=CameraOptions(**cameras),
+                follow=follow_timeout if follow else None,
+            )
+            stack.callback(frames.close)
+            if dry_run:
+                print_plan(frames, as_json=as_json)
+                return
+            say_about(frames)
+            stack.callback(say_changes, frames)
+        try:
+            with bar("learning", "blocks") as shown, stoppable() as stop:
+                if hasattr(frames, "stop"):
+                    frames.stop = stop  # waiting for frames ends with a signal, too
+                reporter = Reporter(shown, max_iterations)
+                result = run(
+                    frames,
+                    configuration.learner,
+                    out,
+                    seed=seed,
+                    max_iterations=max_iterations,
+                    max_modules=max_modules,
+                    sections=configuration.tables(),
+                    force=force,
+                    rerun=not no_rerun,
+                    sinks=(reporter,),
+                    stop=stop,
+                    resume=resume,
+                    keyframes=keyframes,
+                    fsync_every=fsync_every,
+                    live=live_view,
+                    announce=announce,
+                    command=None if out is None else command_of(source, ctx.params, out),
+                )
+        except RunExhaustedError as error:
+            show(error.result, as_json=as_json)
+            raise
     if resume and not reporter.told and not stop():
         click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)

@@ -1,17 +1,18 @@
-"""`cdmisfa record`: write what a scene shows."""
+"""`cdmisfa record`: write what a scene or cameras show."""
 
 from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
 from cdmisfa.cli import options
+from cdmisfa.cli.cameras import live_options, live_streams, say_counts, size_and_rate, tell
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
@@ -22,14 +23,18 @@ if TYPE_CHECKING:
 CONVERTED = ("foreign",)
 """What a recording names as its source where it was converted from camera logs."""
 
+LIVE = ("cameras", "gym")
+"""What it names where it is of live streams."""
+
 
 @click.command("record")
-@click.argument("scene", nargs=-1)
+@click.argument("source", nargs=-1)
 @options.out("Folder of the recording.")
 @click.option(
     "--frames",
     type=click.IntRange(1),
-    help="Frames of each view; by default 1000, with --resume as many as first asked for.",
+    help="Frames of each view; by default 1000, with --resume as many as first asked for, of "
+    "cameras until Ctrl-C.",
 )
 @options.seed
 @click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
@@ -50,12 +55,15 @@ CONVERTED = ("foreign",)
     "--resume as first asked for.",
 )
 @options.fsync_every
+@size_and_rate
+@live_options
 @options.force
 @options.as_json
 @click.pass_context
 def record_command(
     ctx: click.Context,
-    scene: tuple[str, ...],
+    /,
+    source: tuple[str, ...],
     out: Path | None,
     frames: int,
     seed: int,
@@ -69,23 +77,58 @@ def record_command(
     resume: bool,
     split: str | None,
     as_json: bool,
+    size: tuple[int, int] | None,
+    rate: float | None,
+    **live: Any,
 ) -> None:
-    """Record what a scene shows, one MCAP file per view.
+    """Record what a scene or cameras show, one MCAP file per view.
 
-    SCENE is icub or oscillatory; --resume knows it, the seed and the split of what was begun. The
-    same seed gives the same bytes.
+    SOURCE is icub or oscillatory; --resume knows it, the seed and the split of what was begun. The
+    same seed gives the same bytes. Or it is live streams, one or several: camera:/dev/video0,
+    rtsp://, http://.../x.mjpg, tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
     """
     from cdmisfa.experiments.sources import configure
+    from recorder.cameras.words import is_live
     from recorder.log.begun import Begun, read_recording
     from recorder.world.scenes import SCENES
 
-    _refuse_logs(scene)
+    if any(map(is_live, source)):
+        if resume or views or jobs > 1 or scene_picture is not None:
+            raise UsageError(
+                "live streams cannot go back, and are recorded all: leave out --resume, --view, "
+                "--jobs and --scene-picture"
+            )
+        if out is None:
+            raise click.UsageError("say -o FOLDER, where the recording goes")
+        record_streams(
+            ctx,
+            source,
+            out,
+            frames=frames,
+            split=split,
+            fsync_every=fsync_every,
+            force=force,
+            as_json=as_json,
+            live={**live, "seed": seed},
+            cameras={"size": size, "rate": rate},
+            preset=preset,
+            settings=settings,
+        )
+        return
+    if size or rate:
+        raise UsageError("--size and --rate are for cameras: a scene has record.fps, and its own")
+    _refuse_logs(source)
     begun = read_recording(out) if resume and out is not None else Begun()
+    if begun.source and begun.source[0] in LIVE:
+        raise UsageError(
+            f"{out} is of live streams, which cannot go back: what is recorded can be read, record "
+            "the rest into another folder"
+        )
     if begun.source == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
-    named = "".join(scene or begun.source)
+    named = "".join(source or begun.source)
     if resume and out is not None and not (named or frames or given_seed or split):
         from recorder.recording import recorded
 
@@ -156,6 +199,66 @@ def _refuse_logs(words: tuple[str, ...]) -> None:
         raise UsageError(f"{logs[0]} is a log, no scene: write it as a recording with {convert}")
     if len(words) > 1:
         raise UsageError(f"{' '.join(words)}: record one scene at a time")
+
+
+def record_streams(
+    ctx: click.Context,
+    words: Sequence[str],
+    out: Path,
+    *,
+    frames: int | None,
+    split: str | None,
+    fsync_every: float | None,
+    force: bool,
+    as_json: bool,
+    live: Mapping[str, Any],
+    cameras: Mapping[str, Any],
+    preset: str | None = None,
+    settings: Sequence[str] = (),
+) -> None:
+    """Record live streams until there are so many frames, they end, or Ctrl-C."""
+    from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.live import RecordedWhileWatched, record_watched
+    from recorder.log.folder import refuse_existing
+    from recorder.log.split import Split
+    from recorder.recording import DEFAULT_FRAMES
+    from replay.camera_logs.options import CameraOptions
+
+    refuse_existing(out, force=force)
+    with stoppable(notice="finishing the recording; again to stop at once\n") as stop:
+        source, configuration = open_cameras_now(
+            words,
+            live_streams(live),
+            cameras=CameraOptions(**cameras),
+            preset=preset,
+            settings=settings,
+            say=tell,
+            stop=stop,
+        )
+        with contextlib.closing(source):
+            endless = getattr(source, "gaps", False)
+            frames = frames or (None if endless else DEFAULT_FRAMES)
+            recorded = RecordedWhileWatched(
+                source,
+                out,
+                settings=configuration.record,
+                split=None if split is None else Split.parse(split),
+                fsync_every=fsync_every,
+                force=force,
+            )
+            with bar("recording", "frames") as shown:
+                record_watched(
+                    recorded,
+                    frames=frames,
+                    stop=stop,
+                    progress=lambda done: shown.update(done, frames),
+                )
+    if recorded.ended and not stop():
+        tell(f"ended at frame {recorded.t}: {recorded.ended}")
+    say_counts(recorded)
+    print_recording(out, recorded.files, as_json=as_json)
+    if stop() and frames is not None:
+        ctx.exit(stop.exit_code)
 
 
 @contextlib.contextmanager

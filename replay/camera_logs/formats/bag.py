@@ -12,8 +12,8 @@ import lz4.frame
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.messages import Decoder, image_decoder
-from replay.camera_logs.pixels import Depth
+from recorder.images.messages import Decoder, image_decoder
+from recorder.images.pixels import Depth
 from replay.camera_logs.stream import (
     ChannelFacts,
     ImageStream,

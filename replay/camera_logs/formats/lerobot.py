@@ -14,8 +14,8 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.pixels import compressed_gray
 from replay.camera_logs.formats.video import VideoImages
-from replay.camera_logs.pixels import compressed_gray
 from replay.camera_logs.stream import ChannelFacts, ImageStream, explained
 from replay.mcap.records import Bytes, MalformedRecord
 

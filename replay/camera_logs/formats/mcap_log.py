@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.messages import image_decoder
-from replay.camera_logs.pixels import Depth
+from recorder.images.messages import image_decoder
+from recorder.images.pixels import Depth
 from replay.camera_logs.stream import ImageStream, choose_images, sorted_times
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Bytes, MalformedRecord

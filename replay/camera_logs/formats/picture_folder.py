@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.pixels import compressed_gray
+from recorder.images.pixels import compressed_gray
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 from replay.storage.regular import check_regular, read_regular

@@ -15,7 +15,8 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.pixels import MAX_PIXELS, RECIPE, gray
+from recorder.images.frames import VIDEO_RECIPE, frame_gray
+from recorder.images.pixels import MAX_PIXELS
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 from replay.mcap.records import Bytes, MalformedRecord
 
@@ -23,10 +24,6 @@ VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm
 _NOWHERE: Final = 2**62
 _FORWARD: Final = 256
 """Frames that are decoded and passed over rather than sought."""
-_FULL_RANGE: Final = 2
-_LUMA: Final = ("yuv", "yuvj", "gray", "nv12", "nv21")
-_STRETCH: Final[Bytes] = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8)
-"""Luma of limited range as full range, a value for each byte, (256,)."""
 
 
 class VideoImages(ImageStream):
@@ -38,10 +35,7 @@ class VideoImages(ImageStream):
         LogDamagedError: it is no video, or a broken one.
     """
 
-    recipe = (
-        f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
-        "((Y - 16) * 510 + 219) // 438 where its range is limited"
-    )
+    recipe = VIDEO_RECIPE
 
     def __init__(self, path: Path, topic: str | None) -> None:
         self.path = path
@@ -75,7 +69,7 @@ class VideoImages(ImageStream):
             if found is None or found.pts != stamp or found.is_corrupt:
                 self._next = _NOWHERE
                 raise MalformedRecord("the video is broken, no frame can be decoded")
-            return _gray(found)
+            return frame_gray(found)
 
     def where(self, row: int) -> str:
         return f"{self.path}: at {float(int(self._stamps[row]) * self._tick):g} s"
@@ -125,19 +119,6 @@ class VideoImages(ImageStream):
         exact = [round((int(stamp) - first) * self._tick * NANOSECONDS) for stamp in self._stamps]
         self.times = sorted_times(f"{self.path}: it", exact)
         self._container.seek(0, stream=stream, backward=True)
-
-
-def _gray(frame: Any) -> Bytes:
-    """The luma of a frame, or the grey of its colours, (height, width) uint8."""
-    form = frame.format
-    if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
-        colours = frame.to_ndarray(format="rgb24")
-        height, width = colours.shape[:2]
-        return gray(colours.tobytes(), height, width, "rgb8")
-    plane = frame.planes[0]
-    luma = gray(memoryview(plane), frame.height, frame.width, "mono8", plane.line_size)
-    full = form.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
-    return luma if full else _STRETCH[luma]
 
 
 def _pyav(path: Path) -> Any:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa.core.errors import UsageError
-from replay.mcap.records import Bytes, MalformedRecord
+from cdmisfa.core.errors import LogDamagedError, UsageError
+
+Bytes = NDArray[np.uint8]
 
 MAX_PIXELS: Final = 36_000_000
 """Largest image that is decoded, more than one of 7680x4320."""
@@ -52,6 +53,13 @@ ENCODINGS: Final = tuple(_LAYOUTS)
 Depth = tuple[float, float]
 """Distances, in metres, that are shown black and white."""
 
+FRAME_SIZE: Final = (48, 128)
+"""Height and width of the paper's frames, which images are shrunk to where nothing is said."""
+
+
+class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
+    """What is no image that is read; who knows where it came from adds that."""
+
 
 def gray(
     data: bytes | memoryview,
@@ -79,7 +87,7 @@ def gray(
 
     Raises:
         UsageError: 32FC1, and no `depth`.
-        MalformedRecord: an unsupported format, or sizes that contradict the data.
+        MalformedImage: an unsupported format, or sizes that contradict the data.
     """
     if encoding == "32FC1" and depth is None:
         raise UsageError("its images are distances (32FC1): say which to show, as --range 0.3:5")
@@ -90,16 +98,16 @@ def gray(
     else:
         layout = _LAYOUTS.get(encoding)
     if layout is None:
-        raise MalformedRecord(
+        raise MalformedImage(
             f"its pixel format {encoding[:40]!r} is not read: use one of "
             f"{', '.join([*ENCODINGS, '32FC1', *_BAYER])}"
         )
     size, kind = layout
     step = step or width * size
     if not 0 < height * width <= MAX_PIXELS:
-        raise MalformedRecord(f"an image of {height}x{width} pixels is not read")
+        raise MalformedImage(f"an image of {height}x{width} pixels is not read")
     if step < width * size or step * (height - 1) + width * size > len(data):
-        raise MalformedRecord(
+        raise MalformedImage(
             f"an image of {height}x{width} {encoding} with a step of {step} bytes does not "
             f"fit its {len(data)} bytes"
         )
@@ -127,7 +135,7 @@ def _bayer_gray(pixels: Bytes, order: str) -> Bytes:
     """The grey of each two by two pixels of a Bayer pattern, without interpolation."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
-        raise MalformedRecord("a Bayer pattern has two rows and columns at least")
+        raise MalformedImage("a Bayer pattern has two rows and columns at least")
     weights = {"r": 19595, "g": 19235, "b": 7471}
     found = np.empty((height, width), np.uint8)
     for band in _bands(height, width):
@@ -191,21 +199,21 @@ def compressed_gray(data: bytes) -> Bytes:
     """Decode a JPEG or PNG into gray.
 
     Raises:
-        MalformedRecord: it is neither, broken, or too large.
+        MalformedImage: it is neither, broken, or too large.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             image: Image.Image = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
             if not 0 < image.width * image.height <= MAX_PIXELS:
-                raise MalformedRecord(f"an image of {image.width}x{image.height} is not read")
+                raise MalformedImage(f"an image of {image.width}x{image.height} is not read")
             if image.mode in ("I;16", "I;16B", "I"):
                 return _high_bytes(np.asarray(image))
             if image.mode not in ("L", "RGB"):
                 image = image.convert("RGB")
             image = image.convert("L")
             return np.array(image, np.uint8)
-    except MalformedRecord:
+    except MalformedImage:
         raise
     except Exception as error:  # Pillow raises whatever its codecs raise
-        raise MalformedRecord(f"its JPEG or PNG is broken ({type(error).__name__})") from None
+        raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None

@@ -14,11 +14,10 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
-from replay.camera_logs.pixels import Depth, compressed_gray, gray
-from replay.mcap.records import Bytes, MalformedRecord
+from recorder.images.pixels import Bytes, Depth, MalformedImage, compressed_gray, gray
 
 Decoder = Callable[[bytes], Bytes]
-"""Turns a message into a gray image, (height, width) uint8; raises MalformedRecord."""
+"""Turns a message into a gray image, (height, width) uint8; raises MalformedImage."""
 
 
 def image_decoder(schema: str, encoding: str, depth: Depth | None = None) -> Decoder | None:
@@ -47,14 +46,14 @@ def _parse(kind: Any, data: bytes) -> Any:
     try:
         return kind.FromString(data)
     except DecodeError:
-        raise MalformedRecord(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
+        raise MalformedImage(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
 
 
 def _json_raw(data: bytes, depth: Depth | None = None) -> Bytes:
     fields = _json(data)
     numbers = [fields.get(k) for k in ("height", "width", "step")]
     if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
-        raise MalformedRecord("a JSON image needs whole height, width and step")
+        raise MalformedImage("a JSON image needs whole height, width and step")
     height, width, step = (int(n) for n in numbers if n is not None)
     return gray(_base64(fields), height, width, str(fields.get("encoding")), step, depth=depth)
 
@@ -67,9 +66,9 @@ def _json(data: bytes) -> Mapping[str, Any]:
     try:
         fields = json.loads(data)
     except (ValueError, RecursionError):
-        raise MalformedRecord("a message is no JSON") from None
+        raise MalformedImage("a message is no JSON") from None
     if not isinstance(fields, dict):
-        raise MalformedRecord("a message is no JSON object")
+        raise MalformedImage("a message is no JSON object")
     return fields
 
 
@@ -77,7 +76,7 @@ def _base64(fields: Mapping[str, Any]) -> bytes:
     try:
         return base64.b64decode(fields.get("data", ""), validate=True)
     except (binascii.Error, ValueError, TypeError):
-        raise MalformedRecord("a JSON image's data is no base64") from None
+        raise MalformedImage("a JSON image's data is no base64") from None
 
 
 class _RosFields:
@@ -91,7 +90,7 @@ class _RosFields:
         if not ros1:
             head = bytes(self.take(4))
             if head[0] != 0 or head[1] not in (0, 1, 6, 7, 8, 9, 10, 11):
-                raise MalformedRecord("a message is no CDR")
+                raise MalformedImage("a message is no CDR")
             self._order = "<" if head[1] & 1 else ">"
         for _ in range(3 if ros1 else 2):  # sequence number of ROS 1, seconds, nanoseconds
             self.u32()
@@ -99,7 +98,7 @@ class _RosFields:
 
     def take(self, count: int) -> memoryview:
         if count > len(self._data) - self._at:
-            raise MalformedRecord("a ROS message is cut short or lies about a length")
+            raise MalformedImage("a ROS message is cut short or lies about a length")
         self._at += count
         return self._data[self._at - count : self._at]
 

@@ -1,0 +1,48 @@
+"""What a camera is to those who read it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from recorder.images.pixels import Bytes
+
+
+class Picture(NamedTuple):
+    """One image of a camera.
+
+    Attributes:
+        time_ns: when it was taken or came, by the clock that all cameras share.
+        image: gray, (height, width) uint8.
+    """
+
+    time_ns: int
+    image: Bytes
+
+
+class Camera(Protocol):
+    """A stream of images from outside, opened and read in a thread of its own.
+
+    Attributes:
+        name: of its stream.
+        finite: whether its end is an end, and not a loss to recover from.
+        rate: images a second that it states; None where it states none, or is not open yet.
+    """
+
+    name: str
+    finite: bool
+    rate: float | None
+
+    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+        """Open it and give its images as they come, until it ends.
+
+        Yields:
+            How many nanoseconds ago the image was taken, 0 where only its coming is known; and
+            the image, gray, (height, width) uint8, at its own size.
+
+        Raises:
+            Exception: it cannot be opened, or is gone.
+        """
+
+    def describe(self) -> Mapping[str, Any]:
+        """What identifies it, as JSON values, without secrets."""

@@ -1,0 +1,169 @@
+"""Whatever PyAV opens as a camera: devices, network streams, videos, FFmpeg's test pictures."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from recorder.images.frames import frame_gray
+from recorder.images.pixels import MAX_PIXELS, Bytes
+
+DRIFT: Final = 1e-3
+"""Seconds a second by which a camera's clock may be slow."""
+
+JUMP: Final = 1.0
+"""Seconds by which presentation times differ from what is due where they begin anew."""
+
+_NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
+_SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
+
+
+class VideoCamera:
+    """A device, a network stream or a file that PyAV opens.
+
+    Its pictures come no earlier than their presentation times say, so that a file plays at its
+    own pace.
+
+    Args:
+        word: as the user named it.
+        address: what FFmpeg opens.
+        form: the format FFmpeg takes it for; None to find out.
+        name: of the stream.
+        timeout: seconds that opening and reading may take of a network stream.
+
+    Raises:
+        UsageError: PyAV is missing.
+    """
+
+    def __init__(
+        self, word: str, address: str, form: str | None, name: str, *, timeout: float
+    ) -> None:
+        self.name = name
+        self.rate: float | None = None
+        self._word, self._address, self._form, self._timeout = word, address, form, timeout
+        self._remote = _NETWORK.match(address) is not None
+        self.finite = not self._remote and not address.startswith("/dev/")
+        self._av = pyav(word)
+
+    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+        """See `Camera`."""
+        options = {"rtsp_transport": "tcp"} if self._address.startswith("rtsp") else {}
+        if self._remote:
+            options["fflags"] = "nobuffer"
+        try:
+            container = self._av.open(
+                self._address,
+                format=self._form,
+                options=options,
+                timeout=self._timeout if self._remote else None,
+            )
+        except (OSError, ValueError) as error:
+            shown = _SECRET.sub("", self._word)
+            raise CdmisfaError(f"{shown} cannot be opened: {_reason(error)}") from None
+        with container:
+            if not container.streams.video:
+                raise CdmisfaError(f"{_SECRET.sub('', self._word)}: there is no video in it")
+            video = container.streams.video[0]
+            context = video.codec_context
+            if not 0 < context.width * context.height <= MAX_PIXELS:
+                raise CdmisfaError(f"{self.name}: images of {context.width}x{context.height}")
+            context.thread_count = 1  # of several cameras, each has a thread
+            stated = video.average_rate or video.guessed_rate
+            self.rate = float(stated) if stated else None
+            try:
+                yield from self._paced(container.decode(video))
+            except (OSError, ValueError) as error:
+                raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
+
+    def _paced(self, frames: Iterator[Any]) -> Iterator[tuple[int, Bytes]]:
+        steady = Steady()
+        for frame in frames:
+            now = time.monotonic()
+            early = steady.early(now, frame.time)
+            if early > 0 and not self._remote:
+                time.sleep(early)
+            yield steady.age(time.monotonic(), frame.time), frame_gray(frame)
+
+    def describe(self) -> Mapping[str, Any]:
+        """The word, without what may be a password."""
+        return {"camera": _SECRET.sub("", self._word)}
+
+
+class Steady:
+    """When frames were taken, by their presentation times: coming, they jitter, and these do not.
+
+    A frame that came with the least delay so far sets how the two clocks stand to one another;
+    that least delay is forgotten slowly, as clocks drift.
+    """
+
+    def __init__(self) -> None:
+        self._begun: float | None = None
+        self._offset = 0.0
+        self._last = 0.0
+
+    def early(self, now: float, presented: float | None) -> float:
+        """Seconds until a frame is due by the first one's coming; of a file, its own pace."""
+        if presented is None:
+            return 0.0
+        if self._begun is None:
+            self._begun = now - presented
+        return self._begun + presented - now
+
+    def age(self, now: float, presented: float | None) -> int:
+        """Nanoseconds ago at which a frame was taken that is there now; both in seconds."""
+        if presented is None:
+            return 0
+        delay = now - presented
+        drifted = self._offset + DRIFT * (now - self._last)
+        apart = self._last == 0.0 or abs(delay - self._offset) > JUMP
+        self._offset = delay if apart else min(delay, drifted)
+        self._last = now
+        return round((delay - self._offset) * NANOSECONDS)
+
+
+def video_camera(word: str, name: str, *, timeout: float) -> VideoCamera:
+    """The camera that a word names: `camera:DEVICE`, `av:FORMAT:ADDRESS`, `av:ADDRESS`, or a URL.
+
+    Raises:
+        UsageError: PyAV is missing, or the word names nothing.
+    """
+    head, _, rest = word.partition(":")
+    if head not in ("camera", "av"):
+        return VideoCamera(word, word, None, name, timeout=timeout)
+    if not rest:
+        raise UsageError(f"{word} names no device: write {head}:/dev/video0, as it is")
+    form = None
+    if head == "camera":
+        form = "v4l2" if rest.startswith("/dev/video") else None
+        if not os.path.exists(rest):
+            raise UsageError(f"{rest}: there is no such device")
+    else:
+        known, _, address = rest.partition(":")
+        formats = pyav(word).formats_available
+        if address and not address.startswith("//") and known in formats:
+            form, rest = known, address
+    return VideoCamera(word, rest, form, name, timeout=timeout)
+
+
+def _reason(error: Exception) -> str:
+    """What an error of FFmpeg says, without the address, in which a password may be."""
+    return str(getattr(error, "strerror", None) or _SECRET.sub("", one_line(error)))
+
+
+def pyav(word: str) -> Any:
+    """PyAV.
+
+    Raises:
+        UsageError: it is missing.
+    """
+    try:
+        import av
+    except ImportError:
+        raise UsageError(f"{word} needs PyAV: pip install 'cdmisfa[video]'") from None
+    av.logging.set_level(None)
+    return av

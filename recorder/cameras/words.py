@@ -1,0 +1,126 @@
+"""The words that name live streams: which they are, and what they open."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import urlsplit
+
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import UsageError
+from recorder.cameras.camera import Camera
+from recorder.cameras.live import HOLD, LiveSource
+from recorder.cameras.readers import STALL, OnLoss, Readers
+from recorder.images.pixels import FRAME_SIZE, RECIPE, shrink
+
+SCHEMES: Final = ("camera", "av", "gym", "foxglove", "rtsp", "rtsps", "rtmp", "tcp", "udp")
+"""What live streams begin with; http and https are such streams by the ending of their path."""
+
+_STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
+
+_TIMEOUT: Final = 10.0
+"""Seconds that opening a network stream may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """How live streams become streams of frames.
+
+    Attributes:
+        size: (height, width) of a frame.
+        rate: frames a second; None for the first stream's.
+        hold: seconds for which a picture stands for those that are missing.
+        on_loss: what is done about a camera that stalls or goes away.
+        stall: seconds without a picture after which a camera has stalled.
+        seed: of simulated tasks.
+    """
+
+    size: tuple[int, int] = FRAME_SIZE
+    rate: float | None = None
+    hold: float = HOLD
+    on_loss: OnLoss = "reconnect"
+    stall: float = STALL
+    seed: int = 0
+
+
+def is_live(word: str) -> bool:
+    """Whether a word on the command line names a live stream."""
+    scheme = word.partition(":")[0].lower()
+    if scheme in ("http", "https"):
+        return urlsplit(word).path.lower().endswith(_STREAMED)
+    return ":" in word and scheme in SCHEMES
+
+
+def open_live(
+    words: Sequence[str],
+    options: LiveOptions,
+    *,
+    say: Callable[[str], None] = lambda line: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> FrameSource:
+    """Open live streams on one clock.
+
+    Args:
+        words: a stream each.
+        options: see there.
+        say: told in a line when a camera's state changes.
+        stop: asked while waiting for the first pictures.
+
+    Raises:
+        UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
+    """
+    names = stream_names(words)
+    simulated = [word.startswith("gym:") for word in words]
+    if any(simulated):
+        from recorder.cameras.gym import GymSource
+
+        if not all(simulated):
+            raise UsageError(
+                "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
+            )
+        tasks = [word.removeprefix("gym:") for word in words]
+        return GymSource(tasks, names=names, size=options.size, fps=options.rate, seed=options.seed)
+    cameras = [_camera(word, name) for word, name in zip(words, names, strict=True)]
+    height, width = options.size
+    inbox = Readers(
+        cameras,
+        lambda image: shrink(image, height, width),
+        on_loss=options.on_loss,
+        stall=options.stall,
+        say=say,
+    )
+    about = {"cameras": [dict(camera.describe()) for camera in cameras], "recipe": RECIPE}
+    return LiveSource(
+        inbox, names, about, size=options.size, rate=options.rate, hold=options.hold, stop=stop
+    )
+
+
+def stream_names(words: Sequence[str]) -> tuple[str, ...]:
+    """A name for each stream, that can be one of a file: rtsp://host/left is left."""
+    names: list[str] = []
+    for word in words:
+        scheme, _, rest = word.partition(":")
+        place = urlsplit(word)
+        if scheme == "foxglove":
+            last = place.path.strip("/")
+        elif place.netloc:
+            last = place.path.rstrip("/").rpartition("/")[2].rpartition(".")[0] or place.path
+            last = last.strip("/") or place.netloc.rpartition("@")[2]
+        else:
+            last = re.sub(r"\.\w{2,4}$", "", re.split(r"[=,]", rest)[0].rpartition("/")[2])
+        plain = re.sub(r"[^A-Za-z0-9_-]+", "_", last).strip("_-") or "stream"
+        taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
+        names.append(f"{plain}-{taken + 1}" if taken else plain)
+    return tuple(names)
+
+
+def _camera(word: str, name: str) -> Camera:
+    if word.startswith("foxglove:"):
+        from recorder.cameras.foxglove import FoxgloveCamera
+
+        return FoxgloveCamera(word, name, timeout=_TIMEOUT)
+    from recorder.cameras.video import video_camera
+
+    return video_camera(word, name, timeout=_TIMEOUT)

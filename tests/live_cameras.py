@@ -1,0 +1,111 @@
+"""Cameras for tests: scripted ones on a clock of their own, and real threads."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cdmisfa.core.clock import NANOSECONDS
+from recorder.cameras.camera import Picture
+
+SHAPE = (12, 16)
+BEGIN = 10**18
+"""When the scripted cameras begin."""
+
+
+class Arrival(NamedTuple):
+    """A picture that comes at a time, taken at another, both in seconds from `BEGIN`."""
+
+    comes: float
+    stream: int
+    image: np.ndarray[Any, Any]
+    taken: float | None = None
+
+
+class ScriptedInbox:
+    """Pictures that come by a script; time passes only while they are waited for.
+
+    A camera whose script is over has ended.
+    """
+
+    def __init__(self, script: Sequence[Arrival], streams: int, rate: float | None = 30.0) -> None:
+        self._script = deque(sorted(script, key=lambda arrival: arrival.comes))
+        self._waiting: list[deque[Picture]] = [deque() for _ in range(streams)]
+        self._now, self._rate = BEGIN, rate
+        self.closed = 0
+
+    def now(self) -> int:
+        return self._now
+
+    def take(self, stream: int) -> Picture | None:
+        return self._waiting[stream].popleft() if self._waiting[stream] else None
+
+    def wait(self, until: int) -> None:
+        comes = self._script[0].comes if self._script else np.inf
+        if BEGIN + comes * NANOSECONDS > until:
+            self._now = max(self._now, until)
+            return
+        arrival = self._script.popleft()
+        self._now = BEGIN + round(arrival.comes * NANOSECONDS)
+        taken = arrival.comes if arrival.taken is None else arrival.taken
+        picture = Picture(BEGIN + round(taken * NANOSECONDS), arrival.image)
+        self._waiting[arrival.stream].append(picture)
+
+    def over(self, stream: int) -> str:
+        left = any(arrival.stream == stream for arrival in self._script)
+        return "" if left else f"camera {stream} ended"
+
+    def lost(self, stream: int) -> int:
+        return 0
+
+    def rate(self, stream: int) -> float | None:
+        return self._rate
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def bar(seed: int, k: int) -> np.ndarray[Any, Any]:
+    """What a camera sees at its k-th picture: a bar that moves, and noise."""
+    picture = np.random.default_rng([seed, k]).integers(0, 40, SHAPE, np.uint8)
+    picture[:, int(7.5 + 7 * np.sin((seed + 1) * k / 40))] += 200
+    return picture
+
+
+class Hand:
+    """A camera that shows what it is handed: images, an error to raise, or None to end."""
+
+    finite = False
+    rate: float | None = 50.0
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.opened = 0
+        self._given: deque[Any] = deque()
+        self._there = threading.Condition()
+
+    def give(self, *things: Any) -> None:
+        with self._there:
+            self._given.extend(things)
+            self._there.notify_all()
+
+    def pictures(self) -> Iterator[tuple[int, Any]]:
+        self.opened += 1
+        number = self.opened
+        while True:
+            with self._there:
+                while not self._given or number != self.opened:  # an older connection hangs
+                    self._there.wait()
+                thing = self._given.popleft()
+            if thing is None:
+                return
+            if isinstance(thing, Exception):
+                raise thing
+            yield 0, thing
+
+    def describe(self) -> Mapping[str, Any]:
+        return {"camera": self.name}

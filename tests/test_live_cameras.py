@@ -1,0 +1,394 @@
+"""Cameras on one clock: what is shown, what is missing, and that a recording gives the same."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedInbox, bar
+from source_contract import same
+
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.core.blocks import FrameSource, SeekableSource
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
+from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
+from recorder.cameras.live import LiveSource
+from recorder.cameras.readers import Readers
+from recorder.cameras.video import Steady
+from recorder.live import COUNTS, RecordedWhileWatched, record_watched
+from recorder.log.split import Split
+from replay.export.forms import export
+from replay.integrity.info import describe
+from replay.integrity.verify import check_log
+from replay.recordings.followed import FollowedSource
+from replay.recordings.source import RecordedSource
+
+FPS = 30.0
+
+
+def flat(value: int) -> Any:
+    return np.full(SHAPE, value, np.uint8)
+
+
+def steady(stream: int, start: float, count: int, fps: float = FPS) -> list[Arrival]:
+    return [Arrival(start + k / fps, stream, flat(k % 256)) for k in range(count)]
+
+
+def opened(script: Sequence[Arrival], streams: int = 1, **options: Any) -> LiveSource:
+    names = ("left", "right", "third")[:streams]
+    rate = options.pop("states", FPS)
+    return LiveSource(ScriptedInbox(script, streams, rate), names, {}, size=SHAPE, **options)
+
+
+def values(source: FrameSource, n: int) -> list[tuple[int, int, list[int]]]:
+    blocks = source.take_all(n)
+    return [(b.stream, b.t, b.frames[:, 0, 0].tolist()) for b in blocks]
+
+
+def test_steady_cameras_show_each_picture_once() -> None:
+    source = opened([*steady(0, 0, 40), *steady(1, 0.01, 40)], 2)
+    assert isinstance(source, FrameSource)
+    assert not isinstance(source, SeekableSource)
+    # the clock begins half a tick after the first picture of the last camera
+    assert source.spec.start_ns == BEGIN + 10**7 + round(1e9 / 60)
+    assert values(source, 3) == [(0, 0, [0, 1, 2]), (1, 0, [0, 1, 2])]
+    block = source.take(1, 10)
+    assert (block.t, block.frames[:, 0, 0].tolist()) == (3, list(range(3, 13)))
+    assert source.t == 13
+    assert {c["repeated"] + c["dropped"] + c["missing"] for c in source.alignment.values()} == {0}
+
+
+def test_a_slower_camera_repeats_and_a_faster_one_drops() -> None:
+    source = opened([*steady(0, 0, 60), *steady(1, 0, 20, 10), *steady(2, 0, 120, 60)], 3)
+    shown = values(source, 6)
+    assert shown[0] == (0, 0, [0, 1, 2, 3, 4, 5])
+    assert shown[1] == (1, 0, [0, 0, 0, 1, 1, 1])
+    assert shown[2] == (2, 0, [1, 3, 5, 7, 9, 11])
+    counts = source.alignment
+    assert (counts["right"]["repeated"], counts["third"]["dropped"]) == (4, 6)
+
+
+def test_a_stall_is_a_gap_and_not_a_picture_that_stands_still() -> None:
+    script = [*steady(0, 0, 90)]
+    script = [arrival for arrival in script if not 1 < arrival.comes < 2]
+    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.1)
+    shown = values(source, 70)
+    held = [30, 30]
+    assert shown[0] == (0, 0, [*range(31), *held])
+    assert shown[1] == (0, 60, list(range(60, 70)))
+    assert shown[2] == (1, 0, list(range(70)))
+    assert source.alignment["left"]["missing"] == 27
+    assert source.alignment["left"]["repeated"] == 2
+
+
+def test_a_block_is_unbroken_and_the_clock_goes_on_behind_it() -> None:
+    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
+    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+    assert source.take(0, 20).t == 0
+    block = source.take(0, 20)
+    assert (block.t, source.t) == (60, 80)
+    assert block.frames[:, 0, 0].tolist() == list(range(60, 80))
+
+
+def test_a_picture_that_comes_too_late_changes_no_tick_and_keeps_its_time() -> None:
+    script = steady(0, 0, 60)
+    # taken in time, but half a second on its way
+    script[10] = script[10]._replace(comes=10 / FPS + 0.5, taken=10 / FPS)
+    for k in range(11, 26):
+        script[k] = script[k]._replace(comes=10 / FPS + 0.5 + k * 1e-6, taken=k / FPS)
+    source = opened([*script, *steady(1, 0, 60)], 2, hold=0.02, patience=0.21)
+    shown = values(source, 40)
+    # it waits 0.21 s for picture 10, 11 ... of which those are late whose ticks had to be decided
+    assert shown[0] == (0, 0, list(range(10)))
+    assert shown[1] == (0, 19, list(range(19, 40)))
+    counts = source.alignment["left"]
+    assert (counts["late"], counts["missing"]) == (9, 9)
+
+
+def test_pictures_in_the_wrong_order_are_counted_and_not_shown() -> None:
+    script = steady(0, 0, 30)
+    script[8] = script[8]._replace(comes=9.5 / FPS, taken=8 / FPS)
+    source = opened(script, hold=1.0)
+    assert values(source, 12)[0][2] == [0, 1, 2, 3, 4, 5, 6, 7, 7, 9, 10, 11]
+    assert source.alignment["left"]["disordered"] == 1
+
+
+def test_the_rate_is_stated_or_measured_or_asked_for() -> None:
+    assert opened(steady(0, 0, 30)).spec.fps == FPS
+    assert opened(steady(0, 0, 30, 12.5), states=None).spec.fps == 12.5
+    assert opened(steady(0, 0, 30), rate=7.5).spec.fps == 7.5
+    with pytest.raises(UsageError, match="tells no rate: set one with --rate"):
+        opened(steady(0, 0, 1), states=None)
+    with pytest.raises(UsageError, match="--rate is 1e-05"):
+        opened(steady(0, 0, 30), rate=1e-5)
+
+
+def test_a_camera_that_shows_nothing_is_named() -> None:
+    inbox = ScriptedInbox([*steady(0, 0, 3000), Arrival(99, 1, flat(0))], 2)
+    with pytest.raises(UsageError, match="right shows no picture"):
+        LiveSource(inbox, ("left", "right"), {}, size=SHAPE)
+    assert inbox.closed
+
+
+def test_it_ends_with_the_first_camera_that_ends() -> None:
+    source = opened([*steady(0, 0, 30), *steady(1, 0, 60)], 2)
+    source.take_all(28)
+    with pytest.raises(LogExhaustedError, match="camera 0 ended"):
+        source.take_all(3)
+    assert source.t == 28
+    assert values(source, 2) == [(0, 28, [28, 29]), (1, 28, [28, 29])]
+
+
+def rough(seconds: float = 40.0) -> list[Arrival]:
+    """Three cameras with jitter, lost pictures, stalls, late and disordered ones."""
+    rng = np.random.default_rng(5)
+    script = []
+    for stream, fps in enumerate((30.0, 30.0, 25.0)):
+        for k in range(int(seconds * fps)):
+            taken = k / fps + 0.004 * rng.random()
+            delay = 0.01 + (0.4 if rng.random() < 0.02 else 0.01) * rng.random()
+            stalled = stream == k // 200 % 4 and k % 200 < 40
+            held_up = stream == 1 and taken % 10 < 0.5  # all of half a second comes at once
+            comes = taken - taken % 10 + 0.5 + k * 1e-6 if held_up else taken + delay
+            if not stalled and rng.random() > 0.01:
+                script.append(Arrival(comes, stream, bar(stream, k), taken))
+    return script
+
+
+CONFIGS = [
+    LearnerConfig(tau=20, components=3, expansion="none", warm_up=3),
+    ProgressConfig(tau=20, components=3),
+]
+
+
+def learned(source: FrameSource, config: Any) -> RunResult:
+    with pytest.raises(RunExhaustedError) as ended:
+        run(source, config, max_modules=99)
+    return ended.value.result
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=["curious", "progress"])
+@pytest.mark.parametrize("split", [None, Split.parse("9s")], ids=["one", "parts"])
+def test_what_is_learned_live_is_learned_again_from_the_recording(
+    tmp_path: Path, config: Any, split: Split | None
+) -> None:
+    with RecordedWhileWatched(opened(rough(), 3), tmp_path / "rec", split=split) as live:
+        first = learned(live, config)
+    counts = live.alignment
+    for name in ("repeated", "dropped", "missing", "late", "disordered"):
+        assert sum(count[name] for count in counts.values()) > 0, name
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+        again = learned(source, config)
+    assert again.signals_sha256 == first.signals_sha256
+    assert again.iterations == first.iterations > 20
+    assert check_log(tmp_path / "rec").ok
+    held = {file.name: 0 for file in live.files}
+    for file in live.files:
+        held[file.name] += file.frames
+    for name, count in counts.items():
+        assert held[name] + count["missing"] == pytest.approx(live.t, abs=20)
+    stated = describe(tmp_path / "rec").metadata
+    last = {name: records[COUNTS] for name, records in stated.items() if COUNTS in records}
+    assert [int(last[name]["missing"]) for name in sorted(last)] == [
+        counts[name]["missing"] for name in sorted(counts)
+    ]
+
+
+def shown(path: Path) -> dict[str, list[tuple[int, int]]]:
+    with contextlib.closing(RecordedSource(path)) as source:
+        return source.coverage()
+
+
+class Cameras:
+    """Real threads that read cameras handed pictures by the test."""
+
+    def __init__(self, count: int = 2, **options: Any) -> None:
+        self.said: list[str] = []
+        self.hands = [Hand(name) for name in ("left", "right")[:count]]
+        self.inbox = Readers(self.hands, lambda image: image, say=self.said.append, **options)
+
+    def source(self) -> LiveSource:
+        for hand in self.hands:
+            hand.give(flat(0))
+        names = [hand.name for hand in self.hands]
+        return LiveSource(self.inbox, names, {}, size=SHAPE)
+
+    def close(self, source: LiveSource) -> None:
+        for hand in self.hands:
+            hand.give(*[None] * 4)
+        source.close()
+
+    def show(self, n: int, *which: int) -> Callable[[], None]:
+        """Let cameras show n pictures at their rate, in the background."""
+
+        def shows() -> None:
+            for k in range(n):
+                time.sleep(0.02)
+                for number in which:
+                    self.hands[number].give(flat(k))
+
+        thread = threading.Thread(target=shows)
+        thread.start()
+        return thread.join
+
+
+def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def test_real_cameras_are_recorded_and_learned_from(tmp_path: Path) -> None:
+    cameras = Cameras()
+    source = cameras.source()
+    join = cameras.show(100, 0, 1)
+    with RecordedWhileWatched(source, tmp_path / "rec") as live:
+        result = run(live, CONFIGS[1], max_iterations=4)
+    join()
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as again:
+        learned_again = run(again, CONFIGS[1], max_iterations=4)
+    assert learned_again.signals_sha256 == result.signals_sha256
+    assert {count["lost"] for count in live.alignment.values()} == {0}
+
+
+def test_a_camera_that_goes_away_is_connected_to_anew(tmp_path: Path) -> None:
+    cameras = Cameras()
+    source = cameras.source()
+    join = cameras.show(100, 0)
+    cameras.hands[1].give(OSError("unplugged"))
+    until(lambda: cameras.hands[1].opened == 2)
+    cameras.hands[1].give(*[flat(7)] * 3)
+    source.take_all(40)
+    join()
+    cameras.close(source)
+    assert cameras.said == ["right is gone: unplugged: connecting to it anew"]
+    assert source.alignment["right"]["missing"] > 0
+
+
+def test_a_camera_that_hangs_is_connected_to_anew() -> None:
+    cameras = Cameras(stall=0.3)
+    source = cameras.source()
+    join = cameras.show(60, 0)
+    source.take_all(30)
+    assert cameras.hands[1].opened >= 2
+    cameras.hands[1].give(flat(1), flat(2))
+    join()
+    assert cameras.said[0] == "right: no picture for 0.3 s: connecting to it anew"
+    until(lambda: "right shows pictures again" in cameras.said)
+    cameras.close(source)
+
+
+def test_a_camera_that_stalls_is_waited_for() -> None:
+    cameras = Cameras(stall=0.3, on_loss="wait")
+    source = cameras.source()
+    join = cameras.show(60, 0)
+    source.take_all(40)
+    join()
+    assert cameras.hands[1].opened == 1
+    assert cameras.said == ["right: no picture for 0.3 s: waiting"]
+    cameras.close(source)
+
+
+@pytest.mark.parametrize("lost", ["stalls", "goes"])
+def test_a_camera_that_is_lost_ends_the_source_where_that_is_asked_for(lost: str) -> None:
+    cameras = Cameras(stall=0.3, on_loss="end")
+    source = cameras.source()
+    join = cameras.show(40, 0)
+    if lost == "goes":
+        cameras.hands[1].give(OSError("unplugged"))
+    why = {"stalls": "right: no picture for 0.3 s", "goes": "right is gone: unplugged"}[lost]
+    with pytest.raises(LogExhaustedError, match=why):
+        source.take_all(200)
+    join()
+    cameras.close(source)
+
+
+def test_a_camera_that_cannot_be_opened_is_no_loss_but_an_error() -> None:
+    cameras = Cameras(1)
+    cameras.hands[0].give(CdmisfaError("rtsp://nowhere cannot be opened"))
+    with pytest.raises(UsageError, match="rtsp://nowhere cannot be opened"):
+        LiveSource(cameras.inbox, ["left"], {}, size=SHAPE)
+
+
+def test_a_full_queue_is_emptied_and_says_so() -> None:
+    cameras = Cameras(1, queue_bytes=10 * flat(0).nbytes)
+    source = cameras.source()
+    cameras.hands[0].give(*[flat(k) for k in range(25)])
+    until(lambda: source.alignment["left"]["lost"] == 20)
+    assert cameras.said == 2 * [
+        "left: 10 pictures thrown away: they came faster than they were taken"
+    ]
+    cameras.close(source)
+
+
+def test_waiting_for_a_camera_can_be_stopped() -> None:
+    cameras = Cameras(1)
+    source = cameras.source()
+    source.stop = lambda: True
+    with pytest.raises(LogExhaustedError, match="stopped while waiting for frame"):
+        source.take_all(50)
+    cameras.close(source)
+
+
+def test_recording_goes_on_until_it_is_stopped(tmp_path: Path) -> None:
+    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
+    source = opened([*script, *steady(1, 0, 300)], 2)
+    recorded = RecordedWhileWatched(source, tmp_path / "rec")
+    seen: list[float] = []
+    record_watched(recorded, stop=lambda: len(seen) == 80, progress=seen.append)
+    assert seen == list(range(1, 81))
+    assert shown(tmp_path / "rec") == {"left": [(0, 38), (60, 80)], "right": [(0, 80)]}
+    assert [file.frames for file in recorded.files] == [58, 80]
+    assert not list((tmp_path / "rec").glob("*.partial"))
+
+
+def test_recording_ends_with_the_cameras_and_says_why(tmp_path: Path) -> None:
+    recorded = RecordedWhileWatched(opened(steady(0, 0, 20)), tmp_path / "rec")
+    record_watched(recorded)
+    assert recorded.ended == "camera 0 ended"
+    assert shown(tmp_path / "rec") == {"left": [(0, 20)]}
+
+
+def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Path) -> None:
+    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
+    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+    record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
+    assert check_log(tmp_path / "rec").ok
+    assert export(tmp_path / "rec", tmp_path / "png", "images") == 90 - 29 + 90
+    names = sorted(path.name for path in (tmp_path / "png" / "left").iterdir())
+    assert (names[30], names[31]) == ("00000030.png", "00000060.png")
+    with pytest.raises(UsageError, match="has gaps, and LeRobot's format none"):
+        export(tmp_path / "rec", tmp_path / "robot", "lerobot")
+    with pytest.raises(UsageError, match="a recording of cameras cannot be followed"):
+        FollowedSource(tmp_path / "rec")
+    with contextlib.closing(RecordedSource(tmp_path / "rec", loop=True)) as looped:
+        looped.seek(85)
+        block = looped.take(0, 10)
+        assert (block.t, block.frames[:, 0, 0].tolist()) == (90, list(range(10)))
+        live = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+        looped.seek(0)
+        for n in (1, 40, 30):
+            for one, two in zip(live.take_all(n), looped.take_all(n), strict=True):
+                same(one, two)
+
+
+def test_frames_are_stamped_by_their_presentation_times_and_not_by_their_coming() -> None:
+    steady = Steady()
+    rng = np.random.default_rng(1)
+    presented = np.arange(3000) / 30
+    comes = (
+        presented * (1 + 1e-4) + 100 + 0.005 + 0.04 * rng.random(3000) * (rng.random(3000) < 0.5)
+    )
+    taken = [now - steady.age(now, at) / 1e9 for now, at in zip(comes, presented, strict=True)]
+    error = (np.array(taken) - (presented * (1 + 1e-4) + 100.005))[10:]
+    assert -1e-9 <= error.min() <= error.max() < 2e-3
+    assert steady.age(comes[-1] + 7, presented[-1] + 1) == 0  # the times begin anew
+    assert steady.age(0.0, None) == 0

@@ -1,0 +1,378 @@
+"""Live streams by their words: what PyAV opens, simulated tasks, robots, arrays; on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import io
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import foxglove
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from foxglove.channels import CompressedImageChannel, RawImageChannel
+from foxglove.messages import CompressedImage, RawImage
+from PIL import Image
+from source_contract import ForwardContract
+
+from cdmisfa import ArraySource, GymSource
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import LogExhaustedError, UsageError
+from recorder.cameras.words import LiveOptions, is_live, open_live, stream_names
+from replay.recordings.source import RecordedSource
+
+TEST = "av:lavfi:testsrc=size=160x120:rate=30"
+
+
+@pytest.mark.parametrize(
+    ("word", "live"),
+    [
+        ("camera:/dev/video0", True),
+        ("rtsp://robot/left", True),
+        ("http://robot:8080/stream.mjpg", True),
+        ("https://robot/a.mjpeg?x=1", True),
+        ("tcp://robot:9000", True),
+        ("av:clip.mkv", True),
+        ("gym:Pendulum-v1", True),
+        ("foxglove://robot:8765/cam", True),
+        ("http://robot/log.mcap", False),
+        ("s3://bucket/log.mcap", False),
+        ("icub", False),
+        ("av", False),
+        ("folder/log.mcap", False),
+    ],
+)
+def test_which_words_name_live_streams(word: str, live: bool) -> None:
+    assert is_live(word) is live
+
+
+def test_streams_are_named_after_what_they_are() -> None:
+    words = {
+        "camera:/dev/video0": "video0",
+        "rtsp://user:secret@robot:554/left": "left",
+        "rtsp://user:secret@robot": "robot",
+        "http://robot/cam/front.mjpg": "front",
+        "tcp://robot:9000": "robot_9000",
+        "av:lavfi:testsrc=size=160x120:rate=30": "lavfi_testsrc",
+        "gym:Pendulum-v1": "Pendulum-v1",
+        "foxglove://robot:8765/cam/left": "cam_left",
+        "camera:/dev/video1": "video1",
+        "av:/data/video0": "video0-2",
+    }
+    assert stream_names(list(words)) == tuple(words.values())
+
+
+class TestGym(ForwardContract):
+    def open(self) -> FrameSource:
+        return GymSource(["CartPole-v1", "Pendulum-v1"], seed=3, size=(24, 32))
+
+
+class TestArrays(ForwardContract):
+    def open(self) -> FrameSource:
+        frames = np.random.default_rng(0).integers(0, 255, (100, 6, 8), np.uint8)
+        return ArraySource({"array": frames, "iterator": (255 - frame for frame in frames)})
+
+
+class TestValues(ForwardContract):
+    ends = True
+
+    def open(self) -> FrameSource:
+        return ArraySource({"values": np.random.default_rng(0).random((60, 3))}, fps=20)
+
+
+def test_a_task_shows_its_observations_as_truth() -> None:
+    with contextlib.closing(GymSource(["CartPole-v1"], size=(24, 32))) as source:
+        assert source.spec.truth == tuple(f"CartPole_v1_{i}" for i in range(4))
+        assert source.spec.fps == 50
+        block = source.take(0, 200)
+    # the cart moves by its velocity times 0.02 s, within an episode
+    position, velocity = block.truth[:-1, 0], block.truth[:-1, 1]
+    moved = block.truth[1:, 0] - position
+    assert np.median(np.abs(moved - 0.02 * velocity)) < 1e-6
+
+
+def test_a_policy_is_given_the_observation() -> None:
+    seen: list[Any] = []
+
+    def policy(observation: Any) -> Any:
+        seen.append(observation)
+        return 0
+
+    with contextlib.closing(GymSource(["CartPole-v1"], policy=policy, hold=4)) as source:
+        source.take(0, 8)
+    assert len(seen) == 2
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(UsageError, match="a shows uint8 of shape"):
+        ArraySource({"a": np.zeros((5, 2, 2, 3), np.uint8)})
+    with pytest.raises(UsageError, match="no stream given"):
+        ArraySource({})
+    source = ArraySource({"a": np.zeros((5, 4), float), "b": np.zeros((5, 3), float)})
+    with pytest.raises(UsageError, match="b shows float64"):
+        source.take(0, 2)
+
+
+def test_a_task_is_recorded_and_learned_from_alike(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = ["gym:CartPole-v1", "gym:Pendulum-v1"]
+    options = ["--size", "32x24", "--max-iterations", "4", "--json"]
+    run = cdmisfa("learn", *words, "--record", str(tmp_path / "rec"), *options).json
+    again = cdmisfa("learn", str(tmp_path / "rec"), *options).json
+    assert again["signals_sha256"] == run["signals_sha256"]
+    cdmisfa("record", *words, "-o", str(tmp_path / "two"), "--size", "32x24", "--frames", "160")
+    for name in ("CartPole-v1.mcap", "Pendulum-v1.mcap"):
+        one, two = (tmp_path / folder / name for folder in ("rec", "two"))
+        assert one.stat().st_size == two.stat().st_size
+    refused = cdmisfa("record", "gym:Nothing-v0", "-o", str(tmp_path / "x"))
+    assert refused.code == 2
+    assert "gym:Nothing-v0 cannot be made" in refused.err
+
+
+def test_pictures_of_ffmpeg_are_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    words = [TEST, TEST.replace("testsrc", "testsrc2")]
+    rec = str(tmp_path / "rec")
+    options = ["--size", "32x24", "--set", "learner.tau=15", "--max-iterations", "3", "--json"]
+    run = cdmisfa("learn", *words, "--record", rec, *options)
+    assert "lavfi_testsrc: " in run.err
+    again = cdmisfa("learn", rec, *options).json
+    assert again["signals_sha256"] == run.json["signals_sha256"]
+
+
+def test_a_video_plays_at_its_own_pace_and_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    clip = tmp_path / "clip.mkv"
+    with av.open(str(clip), "w") as container:
+        video = container.add_stream("ffv1", rate=25)
+        video.width, video.height, video.pix_fmt = 64, 48, "gray"
+        for k in range(20):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64), k, np.uint8), format="gray")
+            container.mux(video.encode(frame))
+        container.mux(video.encode(None))
+    begun = time.monotonic()
+    done = cdmisfa("record", f"av:{clip}", "-o", str(tmp_path / "rec"), "--size", "64x48")
+    assert time.monotonic() - begun > 19 / 25
+    assert "ended at frame 20: clip ended" in done.err
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+        assert source.spec.fps == 25
+        assert source.take(0, 20).frames[:, 0, 0].tolist() == list(range(20))
+
+
+class Motion(http.server.BaseHTTPRequestHandler):
+    """A web camera: MJPEG without end, but each connection breaks after 20 pictures."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.end_headers()
+        with contextlib.suppress(OSError):
+            for k in range(20):
+                data = io.BytesIO()
+                Image.fromarray(np.full((48, 64), 5 * k, np.uint8)).save(data, "JPEG")
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {data.tell()}\r\n"
+                self.wfile.write(head.encode() + b"\r\n" + data.getvalue() + b"\r\n")
+                time.sleep(0.04)
+
+    def log_message(self, *args: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def web_camera() -> Iterator[str]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Motion) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/stream.mjpg"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
+    said: list[str] = []
+    options = LiveOptions(size=(48, 64), rate=25)
+    with contextlib.closing(open_live([web_camera], options, say=said.append)) as source:
+        blocks = [block for _ in range(3) for block in source.take_all(25)]
+    assert said[0] == "stream is gone: Input/output error: connecting to it anew"
+    assert len(blocks) >= 2
+    assert source.alignment["stream"]["missing"] > 0  # type: ignore[attr-defined]
+
+
+def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+
+        def send() -> None:
+            connection, _ = server.accept()
+            buffer = connection.makefile("wb")
+            with av.open(buffer, "w", format="matroska") as container:
+                video = container.add_stream("mjpeg", rate=25)
+                video.width, video.height, video.pix_fmt = 64, 48, "yuvj420p"
+                for k in range(40):
+                    gray = np.full((72, 64), 128, np.uint8)
+                    gray[:48] = 5 * k
+                    frame = av.VideoFrame.from_ndarray(gray, format="yuvj420p")
+                    container.mux(video.encode(frame))
+                    time.sleep(0.02)
+                container.mux(video.encode(None))
+            buffer.close()
+            connection.close()
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        options = LiveOptions(size=(48, 64), on_loss="end")
+        with contextlib.closing(open_live([f"tcp://127.0.0.1:{port}"], options)) as source:
+            assert source.take(0, 10).frames.shape == (10, 48, 64)
+            with pytest.raises(LogExhaustedError, match=f"127_0_0_1_{port}"):
+                source.take(0, 10**4)
+        thread.join()
+
+
+class Robot:
+    """foxglove-sdk's server on loopback, with two topics of images and one of something else."""
+
+    def __init__(self) -> None:
+        self.context = foxglove.Context()
+        self.server = foxglove.start_server(
+            name="robot", host="127.0.0.1", port=0, context=self.context
+        )
+        self.raw = RawImageChannel("/cam/left", context=self.context)
+        self.jpeg = CompressedImageChannel("/cam/right", context=self.context)
+        self.other = foxglove.Channel("/words", message_encoding="json", context=self.context)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._show)
+        self._thread.start()
+
+    @property
+    def address(self) -> str:
+        return f"foxglove://127.0.0.1:{self.server.port}"
+
+    def _show(self) -> None:
+        k = 0
+        while not self._over.wait(0.02):
+            image = np.full((48, 64), k % 256, np.uint8)
+            data = io.BytesIO()
+            Image.fromarray(image).save(data, "PNG")
+            self.raw.log(
+                RawImage(width=64, height=48, encoding="mono8", step=64, data=image.tobytes())
+            )
+            self.jpeg.log(CompressedImage(format="png", data=data.getvalue()))
+            self.other.log({"k": k})
+            k += 1
+
+    def close(self) -> None:
+        self._over.set()
+        self._thread.join()
+        self.server.stop()
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    robot = Robot()
+    yield robot
+    robot.close()
+
+
+def test_images_of_a_running_robot_are_recorded_and_learned_from(
+    cdmisfa: Cdmisfa, tmp_path: Path, robot: Robot
+) -> None:
+    words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right"]
+    rec = str(tmp_path / "rec")
+    options = ["--size", "64x48", "--set", "learner.tau=20", "--max-iterations", "2", "--json"]
+    run = cdmisfa("learn", *words, "--record", rec, *options).json
+    assert run["source"]["rate"] == pytest.approx(50, rel=0.3)
+    assert cdmisfa("learn", rec, *options).json["signals_sha256"] == run["signals_sha256"]
+    with contextlib.closing(RecordedSource(rec)) as source:
+        assert source.spec.streams == ("cam_left", "cam_right")
+        shown = source.take(0, 20).frames
+        assert (shown == shown[:, :1, :1]).all()
+        assert (np.diff(shown[:, 0, 0].astype(int)) % 256 <= 3).all()
+
+
+@pytest.mark.parametrize(
+    ("topic", "why"),
+    [
+        ("/cam/front", "has no topic /cam/front: it has images on /cam/left, /cam/right"),
+        ("", "has not one topic of images: it has images on /cam/left, /cam/right"),
+        ("/words", "/words holds .*, which is no image"),
+    ],
+)
+def test_a_topic_that_is_no_image_is_refused(
+    robot: Robot, topic: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("recorder.cameras.words._TIMEOUT", 0.5)
+    with pytest.raises(UsageError, match=why):
+        open_live([robot.address + topic], LiveOptions())
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["learn", "av:nothing.mkv"], "av:nothing.mkv cannot be opened"),
+        (["record", "rtsp://me:secret@127.0.0.1:9/x", "-o", "x"], "rtsp://127.0.0.1:9/x cannot"),
+        (["record", "foxglove://127.0.0.1:9/x", "-o", "x"], "does not answer"),
+        (["record", "camera:/dev/video99", "-o", "x"], "/dev/video99: there is no such device"),
+        (["learn", TEST, "icub"], "icub is no live stream, as the others are"),
+        (["learn", TEST, "gym:CartPole-v1"], "record each apart"),
+        (["learn", TEST, "--loop"], "live streams cannot go back"),
+        (["learn", TEST, "--resume", "-o", "run"], "learn from a recording of them"),
+        (["learn", TEST, "--topic", "/x"], "of live streams only --size and --rate"),
+        (["learn", "oscillatory", "--record", "x"], "--record is for live streams"),
+        (["record", TEST, "-o", "x", "--resume"], "leave out --resume"),
+        (["convert", TEST, "-o", "x", "--resume"], "live streams cannot go back"),
+        (["record", "icub", "oscillatory", "-o", "x"], "name one scene, or live streams"),
+        (["record", "icub", "--size", "32x24", "-o", "x"], "--size and --rate are for cameras"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    cdmisfa: Cdmisfa, tmp_path: Path, words: list[str], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused = cdmisfa(*words)
+    assert refused.code == 2
+    assert why in refused.err
+    assert refused.err.count("\n") == 1
+    assert "secret" not in refused.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(tmp_path / "rec")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 60
+    while not list(tmp_path.glob("rec/*.partial")):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(2)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+        assert source.frames > 3
+    assert (tmp_path / "rec" / "lavfi_testsrc.mcap").exists()
+
+
+def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(tmp_path / "rec")]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 60
+    while not any(path.stat().st_size > 8000 for path in tmp_path.glob("rec/*.partial")):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    assert cdmisfa("info", str(tmp_path / "rec"), "--json").json["complete"] is False
+    refused = cdmisfa("record", "-o", str(tmp_path / "rec"), "--resume")
+    assert refused.code == 2
+    assert "is of live streams, which cannot go back" in refused.err
+    cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
+    with contextlib.closing(RecordedSource(tmp_path / "saved")) as source:
+        assert source.frames > 0
