@@ -326,7 +326,7 @@ def test_a_topic_that_is_no_image_is_refused(
         (["learn", "oscillatory", "--record", "x"], "--record is for live streams"),
         (["record", TEST, "-o", "x", "--resume"], "leave out --resume"),
         (["convert", TEST, "-o", "x", "--resume"], "live streams cannot go back"),
-        (["record", "icub", "oscillatory", "-o", "x"], "name one scene, or live streams"),
+        (["record", "icub", "oscillatory", "-o", "x"], "record one scene at a time"),
         (["record", "icub", "--size", "32x24", "-o", "x"], "--size and --rate are for cameras"),
     ],
 )
