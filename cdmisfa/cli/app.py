@@ -23,7 +23,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
-    "record": ("record", "Record what a scene shows, one MCAP file per view."),
+    "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
     "learn": ("learn", "Learn slow feature modules from a scene or a recording."),
     "view": ("view", "Open a run in the Rerun viewer, or save, serve or picture it."),
     "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),
