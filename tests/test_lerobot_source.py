@@ -1,0 +1,84 @@
+"""LeRobot datasets of many episodes are streams of all their images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from camera_files import pictures, write_cameras
+from conftest import Cdmisfa
+from test_matrix import png
+
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from replay.camera_logs.formats.lerobot import PAUSE
+from replay.camera_logs.source import ForeignSource
+
+pytest.importorskip("av")
+
+COUNT, FIRST = 60, 25
+KEY = "observation.images.cam"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+@pytest.fixture
+def dataset(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
+    """An export without loss, its one episode told as two."""
+    write_cameras(tmp_path / "log.mcap", {"/cam": (COUNT, 20)})
+    words = ["--to", "lerobot", "--lossless", "-o", tmp_path / "data"]
+    assert cdmisfa("convert", tmp_path / "log.mcap", "-o", tmp_path / "rec").code == 0
+    assert cdmisfa("export", tmp_path / "rec", *words).code == 0
+    row = pq.read_table(tmp_path / "data" / EPISODES).to_pylist()[0]
+    rows = [
+        {**row, "episode_index": i, "length": stop - start, "dataset_from_index": start,
+         f"videos/{KEY}/from_timestamp": start / 50, f"videos/{KEY}/to_timestamp": stop / 50}
+        for i, (start, stop) in enumerate([(0, FIRST), (FIRST, COUNT)])
+    ]  # fmt: skip
+    pq.write_table(pa.Table.from_pylist(rows[::-1]), tmp_path / "data" / EPISODES)
+    return tmp_path / "data"
+
+
+def as_pictures(dataset: Path) -> None:
+    """Keep the images in the table instead of a video."""
+    table = dataset / "data/chunk-000/file-000.parquet"
+    images = [{"bytes": png(image), "path": f"{i}.png"} for i, image in enumerate(pictures(COUNT))]
+    pq.write_table(pq.read_table(table).append_column(KEY, pa.array(images)), table)
+    info = json.loads((dataset / "meta/info.json").read_text())
+    info["features"][KEY]["dtype"] = "image"
+    (dataset / "meta/info.json").write_text(json.dumps(info))
+
+
+@pytest.mark.parametrize("kept", ["video", "pictures"])
+def test_episodes_follow_one_another_after_a_pause(dataset: Path, kept: str) -> None:
+    if kept == "pictures":
+        as_pictures(dataset)
+    source = ForeignSource(dataset)
+    assert source.pauses[KEY] == [(FIRST, FIRST + PAUSE)]
+    expected = np.stack(list(pictures(COUNT)))
+    blocks = source.take_all(COUNT + PAUSE)
+    assert [(block.t, len(block)) for block in blocks] == [
+        (0, FIRST),
+        (FIRST + PAUSE, COUNT - FIRST),
+    ]
+    np.testing.assert_array_equal(np.concatenate([b.frames for b in blocks]), expected)
+    source.close()
+
+
+def test_what_is_no_such_dataset_is_one_line(dataset: Path) -> None:
+    with pytest.raises(UsageError, match=f"no topic cam; it has images on: {KEY}"):
+        ForeignSource(dataset, ["cam"])
+    info = dataset / "meta/info.json"
+    text = info.read_text()
+    info.write_text(text.replace("v3.0", "v2.1"))
+    with pytest.raises(UsageError, match=r"LeRobot dataset v2\.1"):
+        ForeignSource(dataset)
+    info.write_text(text[:50])
+    with pytest.raises(LogDamagedError, match="describes no LeRobot dataset"):
+        ForeignSource(dataset)
+    info.write_text(text)
+    next(dataset.glob("videos/*/*/*.mp4")).unlink()
+    with pytest.raises(LogDamagedError, match="no such file"):
+        ForeignSource(dataset)
