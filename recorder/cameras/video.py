@@ -19,6 +19,9 @@ DRIFT: Final = 1e-3
 JUMP: Final = 1.0
 """Seconds by which presentation times differ from what is due where they begin anew."""
 
+LATE: Final = 60
+"""Frames in a row that come later than that before they are taken to begin anew."""
+
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
 
@@ -105,6 +108,7 @@ class Steady:
         self._begun: float | None = None
         self._offset = 0.0
         self._last = 0.0
+        self._late = 0
 
     def early(self, now: float, presented: float | None) -> float:
         """Seconds until a frame is due by the first one's coming; of a file, its own pace."""
@@ -120,8 +124,9 @@ class Steady:
             return 0
         delay = now - presented
         drifted = self._offset + DRIFT * (now - self._last)
-        apart = self._last == 0.0 or abs(delay - self._offset) > JUMP
-        self._offset = delay if apart else min(delay, drifted)
+        self._late = self._late + 1 if delay > self._offset + JUMP else 0
+        anew = self._last == 0.0 or delay < self._offset - JUMP or self._late > LATE
+        self._offset = delay if anew else min(delay, drifted)
         self._last = now
         return round((delay - self._offset) * NANOSECONDS)
 
