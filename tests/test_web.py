@@ -32,7 +32,7 @@ SECONDS = 240
 """Longest wait for a page that is drawn without a graphics card on a busy machine."""
 
 LANES = {"stream watched": (124, 195, 238), "novel": (193, 181, 216)}
-"""Colours of lanes that are on the first page, as the browser shows them."""
+"""Colours of lanes of the overview, as the browser shows them."""
 
 FLAGS = (
     "--headless=new",
@@ -75,6 +75,7 @@ def command(tmp_path):
     (tmp_path / "run").mkdir()
     write_run(tmp_path / "run" / "run.mcap", VECTOR, 24)
     words = [sys.executable, "-m", "cdmisfa", "view", str(tmp_path / "run"), "--web"]
+    words += ["--tab", "Overview"]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     try:
         yield process
