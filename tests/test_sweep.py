@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -87,6 +88,20 @@ def test_the_world_has_the_seed_of_the_trial_unless_it_was_given_one() -> None:
     assert [trial.configuration.scene.seed for trial in fixed] == [0, 0]
     assert free[0].id == fixed[0].id
     assert free[1].id != fixed[1].id
+
+
+def test_a_preset_is_parsed_once_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[str] = []
+    parse = tomllib.loads
+    monkeypatch.setattr(tomllib, "loads", lambda text: parsed.append(text) or parse(text))
+    preset = tmp_path / "mine.toml"
+    preset.write_text("[learner]\nnu = 0.03\n")
+    grid = {"learner.sigma": [0, 0.0009]}
+    trials = plan("oscillatory", grid=grid, seeds=range(4), preset=str(preset))
+    assert (len(trials), len(parsed)) == (8, 1)
+    preset.write_text("[learner]\nnu = 0.04\n")
+    (changed,) = plan("oscillatory", grid={}, seeds=[0], preset=str(preset))
+    assert [t.configuration.learner.nu for t in (trials[0], changed)] == [0.03, 0.04]
 
 
 def test_a_worker_with_other_code_refuses() -> None:

@@ -7,6 +7,7 @@ in `recorder`); this module fills any of them.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import os
@@ -16,7 +17,7 @@ import types
 import typing
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from operator import index
 from typing import Any, Literal, TypeVar
@@ -195,12 +196,12 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
     """
     try:
         if name.endswith(".toml"):
-            document = tomllib.loads(_preset_text(name))
+            text = _preset_text(name)
         else:
             if name not in presets():
                 raise UsageError(f"no preset {name!r}: {did_you_mean(name, presets())}")
             text = resources.files("cdmisfa.presets").joinpath(f"{name}.toml").read_text("utf-8")
-            document = tomllib.loads(text)
+        document = copy.deepcopy(_parsed(text))
     except OSError as error:
         raise UsageError(f"{name}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -211,6 +212,12 @@ def load_preset(name: str) -> dict[str, dict[str, Any]]:
         if not isinstance(value, dict):
             raise UsageError(f"{name}: {shown(key)} stands outside a [section]")
     return document
+
+
+@lru_cache
+def _parsed(text: str) -> dict[str, Any]:
+    """A TOML document; once parsed it is known to every trial of a sweep."""
+    return tomllib.loads(text)
 
 
 def _preset_text(name: str) -> str:
