@@ -96,37 +96,35 @@ def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command
     return lambda command: functools.reduce(lambda c, option: option(c), reversed(each), command)
 
 
-def _limit(name: str) -> Callable[[click.Context, click.Parameter, float], None]:
+def _limit(option: str, name: str, default: float, meaning: str) -> Callable[[Command], Command]:
+    """An option for one of the `Limits`, which hold while the command runs."""
+
     def hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
         from replay.storage.limits import limited, limits
 
         ctx.with_resource(limited(dataclasses.replace(limits(), **{name: value})))
 
-    return hold
+    return click.option(
+        option,
+        type=click.FloatRange(0.1, 1e6),
+        default=default,
+        show_default=True,
+        metavar="SECONDS",
+        callback=hold,
+        is_eager=True,
+        expose_value=False,
+        help=meaning,
+    )
 
 
 server_limits = together(
-    click.option(
-        "--timeout",
-        type=click.FloatRange(0.1, 1e6),
-        default=60.0,
-        show_default=True,
-        metavar="SECONDS",
-        callback=_limit("total"),
-        is_eager=True,
-        expose_value=False,
-        help="Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
+    _limit(
+        *("--timeout", "total", 60.0),
+        "Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
     ),
-    click.option(
-        "--read-timeout",
-        type=click.FloatRange(0.1, 1e6),
-        default=20.0,
-        show_default=True,
-        metavar="SECONDS",
-        callback=_limit("read"),
-        is_eager=True,
-        expose_value=False,
-        help="Ask a server again that sends nothing for so long.",
+    _limit(
+        *("--read-timeout", "read", 20.0),
+        "Ask a server again that sends nothing for so long.",
     ),
 )
 """How long the servers of URLs are waited for; a command with a URL among its arguments has it."""

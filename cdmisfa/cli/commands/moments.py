@@ -89,13 +89,13 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
     """Write what a learner is learning as a file of one module."""
     import dataclasses
 
+    from recorder.log.whole import refuse_taken
     from replay.runs.modules import save_modules
 
     module = getattr(learner, "unfinished", None)
     if module is None:
         raise UsageError("nothing is being learned then: choose another iteration")
-    if path.exists() and not force:
-        raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+    refuse_taken(path, force=force)
     save_modules(path, [dataclasses.replace(module, index=1)])
 
 
