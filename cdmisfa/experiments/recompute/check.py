@@ -56,13 +56,10 @@ def check_run(
         LogDamagedError: the log cannot be read.
     """
     with Again(Path(run), start, source) as again:
-        first = at = again.learner.iteration
-        for logged in _logged(again, stop):
-            again_learned = iter(_columns(again, len(logged)))
-            found = first_of(iter([logged]), again_learned, again.header.schema, at)
-            at += len(logged)
-            if found is not None:
-                return Checked(first, at, found)
+        first = again.learner.iteration
+        at, found = _learned_again(again, stop)
+    if found is not None:
+        return Checked(first, at, found)
     if at <= start and (at or stop):
         raise UsageError(f"{again.log} holds {at} iterations: choose a part of these")
     if stop is not None and at < stop:
@@ -83,24 +80,33 @@ def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tup
     if iterations < 0:
         raise UsageError(f"{iterations} iterations: a run begins after 0")
     with Again(Path(run), iterations, source) as again:
-        at = again.learner.iteration
-        if at < iterations:
-            for logged in _logged(again, iterations):
-                learned = iter(_columns(again, len(logged)))
-                found = first_of(iter([logged]), learned, again.header.schema, at)
-                if found is not None:
-                    raise NotReproducedError(
-                        f"{again.log}: learned again, {found}: name its own source with --source"
-                    )
-                at += len(logged)
+        at, found = _learned_again(again, iterations)
+        if found is not None:
+            raise NotReproducedError(
+                f"{again.log}: learned again, {found}: name its own source with --source"
+            )
         if at < iterations:
             raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
         return again.learner, again.t
 
 
+def _learned_again(again: Again, stop: int | None) -> tuple[int, Difference | None]:
+    """Learn up to an iteration, or to the log's end: how far, and the log's first difference."""
+    at = again.learner.iteration
+    for logged in _logged(again, stop):
+        learned = iter(_columns(again, len(logged)))
+        found = first_of(iter([logged]), learned, again.header.schema, at)
+        at += len(logged)
+        if found is not None:
+            return at, found
+    return at, None
+
+
 def _logged(again: Again, stop: int | None) -> Iterator[SignalColumns]:
     """The records of a run from where its learner stands, up to an iteration."""
     at = again.learner.iteration
+    if at == stop:
+        return
     for columns in read_columns(again.log, again.header, start=again.t):
         kept = len(columns) if stop is None else min(len(columns), stop - at)
         if kept <= 0:
