@@ -338,7 +338,12 @@ def _as_begun(
             )
     if split is None and limit is not None:
         split = Split.parse(limit)
-    earlier = {n: {p: frames_held(p, n) for p in view_logs(folder, n)} for n in views}
+    earlier = {
+        view: {
+            path: frames_held(path, view, gaps=identity.gaps) for path in view_logs(folder, view)
+        }
+        for view in views
+    }
     unfinished = not all(
         files and all(p.suffix == ".mcap" for p in files) for files in earlier.values()
     )

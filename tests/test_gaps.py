@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,10 +18,14 @@ from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.experiments.convert import convert
+from recorder.log.split import Split
+from recorder.recording import RecordingStoppedError
 from replay.camera_logs.alignment import between
 from replay.camera_logs.framing import FRAME_PIXELS, default_size, fitted
 from replay.camera_logs.options import Align, Fit
 from replay.camera_logs.source import ForeignSource
+from replay.recordings.source import RecordedSource
 
 STEP_MS = 20
 PAUSED = (*range(0, 2000, STEP_MS), *range(5000, 9000, STEP_MS))
@@ -153,14 +158,68 @@ def test_a_run_across_a_gap_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: P
     assert other != whole
 
 
-def test_a_conversion_keeps_its_clock_and_says_where_gaps_are(
+def coverage(folder: Path) -> dict[str, list[tuple[int, int]]]:
+    with contextlib.closing(RecordedSource(folder)) as source:
+        return source.coverage()
+
+
+def test_a_conversion_keeps_its_clock_and_has_the_gaps_of_its_logs(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    log = write_log(tmp_path / "log.mcap", PAUSED)
-    done = cdmisfa("convert", log, "-o", tmp_path / "rec", "--json")
+    log, rec = write_log(tmp_path / "log.mcap", PAUSED), tmp_path / "rec"
+    done = cdmisfa("convert", log, "-o", rec, "--json")
+    assert "no block reaches across" in done.err
+    assert done.json["frames"] == 300
+    assert coverage(rec) == {"cam": [(0, 100), (250, 450)]}
+    assert cdmisfa("verify", rec).code == 0
+    options = ["--set", "learner.tau=30", "--json", "--max-iterations", "8"]
+    runs = [cdmisfa("learn", path, *options) for path in (log, rec)]
+    assert [run.code for run in runs] == [0, 0]
+    assert runs[0].json["signals_sha256"] == runs[1].json["signals_sha256"]
+
+
+def test_a_conversion_can_show_the_last_image_in_a_gap(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log, rec = write_log(tmp_path / "log.mcap", PAUSED), tmp_path / "rec"
+    done = cdmisfa("convert", log, "-o", rec, "--gaps", "hold", "--json")
     assert "the last image is shown" in done.err
     assert done.json["frames"] == 450
-    assert cdmisfa("verify", tmp_path / "rec").code == 0
+    assert coverage(rec) == {"cam": [(0, 450)]}
+    assert cdmisfa("verify", rec).code == 0
+
+
+@pytest.mark.parametrize("split", [None, Split.parse("2s")], ids=["one", "parts"])
+def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: Split | None) -> None:
+    left = write_log(tmp_path / "left.mcap", PAUSED)
+    # its first image comes before the other's, and its next long after
+    right = write_log(tmp_path / "right.mcap", [-100 + 500, *range(3000, 9000, STEP_MS)])
+    logs = [left, right]
+
+    def converted(name: str, after: int, *, resume: bool = False) -> Path:
+        told: list[float] = []
+        source = ForeignSource(logs, align="time", rate=50, start=0.4)
+        with contextlib.closing(source), contextlib.suppress(RecordingStoppedError):
+            convert(
+                source,
+                tmp_path / name,
+                split=split,
+                resume=resume,
+                stop=lambda: len(told) > after,
+                progress=told.append,
+            )
+        return tmp_path / name
+
+    whole = converted("whole", 999)
+    gap = [stretch for stretches in coverage(whole).values() for stretch in stretches]
+    assert len(gap) > 2
+    for after in (0, 2, 5):
+        part = converted(f"part{after}", after)
+        assert list(part.glob("*.partial"))
+        converted(part.name, 999, resume=True)
+        for _ in range(2):
+            names = sorted(path.name for path in whole.iterdir())
+            assert sorted(path.name for path in part.iterdir()) == names
+            assert all((part / n).read_bytes() == (whole / n).read_bytes() for n in names)
+            converted(part.name, 999, resume=True)
 
 
 def test_images_that_change_their_size_are_said_and_shown(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

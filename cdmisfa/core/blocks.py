@@ -149,7 +149,7 @@ class FrameSource(Protocol):
 
 @runtime_checkable
 class SeekableSource(FrameSource, Protocol):
-    """A source that can show any frame again. A class that derives from it has `take_all`."""
+    """A source that can show any frame again; deriving from it gives `spans` and `take_all`."""
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t, so that the next block starts there.
@@ -157,6 +157,10 @@ class SeekableSource(FrameSource, Protocol):
         Raises:
             ValueError: there is no frame before 0.
         """
+
+    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        return [(start, stop)]
 
     def take_all(self, n: int) -> tuple[Block, ...]:
         """What every stream shows in the next n frames; see `FrameSource`."""
@@ -195,10 +199,6 @@ class ClockedSource(SeekableSource):
         """Move the clock to frame t; see `SeekableSource.seek`."""
         check_frame(t)
         self._t = t
-
-    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
-        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
-        return [(start, stop)]
 
     def close(self) -> None:
         """Nothing to let go of."""

@@ -43,30 +43,39 @@ class FramesHeld(NamedTuple):
 
     Attributes:
         first: its first frame.
-        stop: its frames [first, stop) are all there.
+        stop: its frames [first, stop) are all there, except those of gaps.
         end: one more than its last frame; 0 without any.
+        gaps: whether the source may lack frames, the first of a log, too.
     """
 
     first: int
     stop: int
     end: int
+    gaps: bool = False
 
     def whole(self, first: int) -> int:
         """Up to before which frame all from a given one on are there."""
-        return self.stop if self.end and self.first == first else first
+        follows = self.first == first or (self.gaps and self.first > first)
+        return self.stop if self.end and follows else first
 
 
-def frames_held(path: Path, view: str) -> FramesHeld:
-    """Read once through a log, damaged or not, for the frames of a view that it holds."""
+def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
+    """Read once through a log, damaged or not, for the frames of a view that it holds.
+
+    Args:
+        path: the log.
+        view: name of the view.
+        gaps: whether the source may lack frames.
+    """
     first = stop = end = 0
     for channel, message in messages(path):
         if channel.topic == view_topic(view):
             if not end:
                 first = stop = message.sequence
-            if message.sequence == stop:
-                stop += 1
+            if message.sequence == stop or (gaps and message.sequence > stop):
+                stop = message.sequence + 1
             end = max(end, message.sequence + 1)
-    return FramesHeld(first, stop, end)
+    return FramesHeld(first, stop, end, gaps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +149,10 @@ def resume_view(
             break
         _refuse_other(best, identity.facts(view, first))
         follows = best == path and bool(later)
-        if length is not None and (stop - first > length or (follows and stop - first != length)):
+        wrong = length is not None and (
+            stop - first > length or (follows and stop - first != length)
+        )
+        if wrong and not identity.gaps:
             raise UsageError(
                 f"{best} has {stop - first} frames, with this --split it would have {length}: "
                 "use the same, or overwrite with --force"

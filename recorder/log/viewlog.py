@@ -148,16 +148,18 @@ class ViewLog:
             LogDamagedError: they are not there any more.
         """
         held = self._first
+        frames = 0
         for channel, message in messages(path):
             if message.sequence >= stop:
                 break
             if channel.topic in self._channels:
                 number, _ = self._channels[channel.topic]
                 self.file.write(number, message.log_time, message.data, message.sequence)
-                held += channel.topic == self._topic
-        if held != stop:
+                if channel.topic == self._topic:
+                    held, frames = message.sequence + 1, frames + 1
+        if held != stop or (not self._gaps and frames != stop - self._first):
             raise LogDamagedError(f"{path} changed while it was read: resume it again")
-        self.t, self.frames = stop, held - self._first
+        self.t, self.frames = stop, frames
 
     def _write(self, topic: str, *values: Any) -> None:
         number, encode = self._channels[topic]

@@ -56,7 +56,7 @@ def take_here(
     """
     if isinstance(source, SeekableSource):
         for request in requests(starts, frames):
-            yield _take(source, request)
+            yield from _take(source, request)
         return
     first = min(starts.values(), default=frames)
     if first >= frames:
@@ -86,15 +86,15 @@ def render_in_processes(
     Raises:
         CdmisfaError: a process died, or could not open the scene.
     """
-    pending: deque[Future[Block]] = deque()
+    pending: deque[Future[list[Block]]] = deque()
     workers = Workers(jobs, _start, (SCENES[scene.name].open, scene.config, scene.record))
     try:
         for request in requests(starts, frames):
             pending.append(workers.submit(_render, request))
             if len(pending) > _AHEAD * jobs:
-                yield pending.popleft().result()
+                yield from pending.popleft().result()
         while pending:
-            yield pending.popleft().result()
+            yield from pending.popleft().result()
     except BrokenProcessPool as error:
         raise CdmisfaError(
             "a rendering process ended: go on with --resume; if it ends again, with --jobs 1 to "
@@ -110,13 +110,15 @@ def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
     _source = opener(config, record)
 
 
-def _render(request: Request) -> Block:
+def _render(request: Request) -> list[Block]:
     if _source is None:
         raise RuntimeError("the rendering process was not started")
-    return _take(_source, request)
+    return list(_take(_source, request))
 
 
-def _take(source: SeekableSource, request: Request) -> Block:
+def _take(source: SeekableSource, request: Request) -> Iterator[Block]:
+    """What a stream shows of a block's frames: all, or each stretch between its gaps."""
     stream, first, n = request
-    source.seek(first)
-    return source.take(stream, n)
+    for low, high in source.spans(stream, first, first + n):
+        source.seek(low)
+        yield source.take(stream, high - low)

@@ -79,11 +79,8 @@ def convert_command(
         refuse_what_is_no_log(place)
     if not resume and not dry_run:
         refuse_existing(out, force=force)
-    if not dry_run:
-        cameras["gaps"] = "hold"  # a recording has every frame, and says which are of a gap
-    options_given = CameraOptions(**cameras)
     goal = ("convert", str(out))
-    opened = open_cameras(named, options_given, salvage=salvage, goal=goal)
+    opened = open_cameras(named, CameraOptions(**cameras), salvage=salvage, goal=goal)
     with contextlib.closing(opened) as frames:
         if dry_run:
             print_plan(frames, as_json=as_json)
