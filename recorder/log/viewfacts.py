@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import metadata
 from typing import Any, Final
 
@@ -201,6 +202,7 @@ class Identity:
         )
 
 
+@cache
 def version(package: str) -> str:
     """Version of an installed package."""
     try:
