@@ -27,7 +27,7 @@ fuzz: $(INSTALLED)
 torture: $(INSTALLED)
 	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
 	    --seeds 0:2 --frames 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
-	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),30) --seed $(or $(SEED),0)
+	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),60) --seed $(or $(SEED),0)
 
 install: $(INSTALLED)
 

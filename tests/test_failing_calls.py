@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 from pathlib import Path
@@ -9,15 +10,22 @@ from pathlib import Path
 import pytest
 from torture.calls import Call, Refusal, watched
 from torture.failing import WAYS, begin, fail
-from torture.stories import STORIES
+from torture.stories import STORIES, WITH_WORKERS
 
-SAMPLED = {"record --resume": 4, "learn --resume": 3, "convert": 4, "sweep": 4, "recover": 4}
+SAMPLED = {
+    "record --resume": 4,
+    "learn --resume": 3,
+    "convert": 4,
+    "sweep": 4,
+    "recover": 4,
+    "sweep --keep-logs --jobs 2": 2,
+}
 """Cases of some stories; `make torture` takes all cases of all."""
 
 
 @pytest.mark.parametrize("name", SAMPLED)
 def test_a_command_goes_on_after_a_call_that_failed(tmp_path: Path, name: str) -> None:
-    begun = begin(STORIES[name], tmp_path / "begun")
+    begun = begin((STORIES | WITH_WORKERS)[name], tmp_path / "begun")
     cases = random.Random(name).sample(list(begun.cases()), SAMPLED[name])
     for number, (way, call) in enumerate(cases):
         fail(begun, way, call, tmp_path / str(number))
@@ -62,3 +70,29 @@ def test_every_call_is_seen_and_can_be_refused(tmp_path: Path) -> None:
     for number in range(2):
         with watched(tmp_path, Refusal(number)), pytest.raises(OSError, match="folder"):
             (tmp_path / "folder" / str(number)).mkdir(parents=True)
+
+
+def test_calls_of_forked_processes_count_with_those_of_their_parent(tmp_path: Path) -> None:
+    refusal = Refusal(3, lasting=True)
+    with watched(tmp_path, refusal):
+        (tmp_path / "a").mkdir()
+        if (child := os.fork()) == 0:
+            made = []
+            for name in ("b", "c", "refused", "refused"):
+                try:
+                    (tmp_path / name).mkdir()
+                    made.append(name)
+                except OSError:
+                    pass
+            os._exit(len(made))
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 2
+        with pytest.raises(OSError, match="refused"):
+            (tmp_path / "refused").mkdir()
+    assert [call.path.name for call in refusal.seen] == ["a", "b", "c", *["refused"] * 3]
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b", "c"}
+
+
+def test_what_workers_write_can_be_refused(tmp_path: Path) -> None:
+    """The log of a trial is written by the process that computes it."""
+    begun = begin(WITH_WORKERS["sweep --keep-logs --jobs 2"], tmp_path / "begun")
+    assert {"run.mcap.partial", "rows.jsonl"} <= {call.path.name for call in begun.calls}

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -121,6 +122,17 @@ def test_what_prepares_for_long_has_its_fewest_cases(tmp_path: Path) -> None:
     good = made(lambda job: Outcome(RIGHT, "group"), results)
     harness.run(good, results, time.monotonic() - 60, 2, io.StringIO(), fewest=3)
     assert sorted(line["seed"] for line in results.lines) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("given", "enough"), [(None, 5), (["of", "all", "five", "done", 1], None)])
+def test_a_campaign_ends_when_there_are_enough(tmp_path: Path, given: Any, enough: Any) -> None:
+    """Also when it is gone on with."""
+    results = harness.Results(tmp_path / "cases.jsonl")
+    for deadline in (-60.0, 60.0):  # the first time the fewest alone
+        good = made(lambda job: Outcome(RIGHT, "group"), results, enough=enough)
+        good = replace(good, given=given)
+        harness.run(good, results, time.monotonic() + deadline, 2, io.StringIO(), fewest=3)
+    assert sorted(line["seed"] for line in results.lines) == [0, 1, 2, 3, 4]
 
 
 def test_results_are_of_one_commit(tmp_path: Path) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
+import math
 import os
 import platform
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,15 +28,20 @@ ROOT = Path(__file__).resolve().parents[2]
 FEWEST = 4
 """Cases of each campaign, however long preparing takes."""
 
+MEMORY = Path("/dev/shm")
+"""Where cases write, if there is room: what a killed process wrote is kept here as on a disk."""
+
+ROOM = 2 << 30
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run campaigns; 1 when anything was found."""
     parser = argparse.ArgumentParser(prog="python -m tests.torture", description=about)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=", ".join(CAMPAIGNS))
-    parser.add_argument("--minutes", type=float, default=30, help="with preparing; 0: page only")
+    parser.add_argument("--minutes", type=float, default=60, help="with preparing; 0: page only")
     parser.add_argument("--seed", type=int, default=0, help="of each campaign's first case")
-    parser.add_argument("--jobs", type=int, default=2, help="cases at a time")
+    parser.add_argument("--jobs", type=int, default=2, help="cases that compute at a time")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "build" / "torture")
     parser.add_argument("--case", type=int, help="run this case alone, and keep its folder")
     parser.add_argument("--page", type=Path, help="write the results as a page, too")
@@ -41,6 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in chosen.campaigns if name not in CAMPAIGNS]
     if unknown:
         parser.error(f"no campaign {unknown[0]}: there are {', '.join(CAMPAIGNS)}")
+    if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
+        tempfile.tempdir = str(MEMORY)
     names = chosen.campaigns or CAMPAIGNS
     results = chosen.out / harness.CASES
     if chosen.case is not None:
@@ -48,8 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.minutes > 0:
         print(f"seed {chosen.seed}: {', '.join(names)} for {chosen.minutes:g} min", flush=True)
         told = {**_about(), "seed": chosen.seed, "minutes": chosen.minutes}
-        harness.Results(results).begin(told)
+        kept = harness.Results(results)
+        kept.begin(told)
         deadline = time.monotonic() + 60 * chosen.minutes
+        names = [n for n in names if kept.cases(n) < (_limits(n).enough or math.inf)]
         for number, name in enumerate(names):
             # Each in a process of its own, so that what one imports is none of another's memory.
             shares = [_limits(other).share for other in names[number:]]
@@ -76,6 +88,7 @@ def _in_child(name: str, path: Path, first_seed: int, deadline: float, jobs: int
     try:
         with tempfile.TemporaryDirectory(prefix="torture-shared-") as shared:
             opened = _opened(name, Path(shared), results.seeds(name, first_seed))
+            gc.freeze()  # so that cases need not copy what they share
             harness.run(opened, results, deadline, jobs, sys.stderr, fewest=FEWEST)
         code = 0
     except BaseException as error:  # other campaigns go on

@@ -24,6 +24,9 @@ KINDS = ("open", "write", "fsync", "rename", "unlink", "mkdir")
 
 DELETED = " (deleted)"
 
+_RECORD = 512
+"""Bytes for a call that counted."""
+
 
 @dataclass(frozen=True, slots=True)
 class Call:
@@ -83,28 +86,50 @@ def watched(
 class Refusal:
     """Refuses the N-th call of some kinds, and where it lasts all later ones too.
 
+    Those of processes that are forked meanwhile count with those of this one.
+
     Attributes:
         number: counted from 0; -1 refuses none.
         kinds: those that count.
         code: what is wrong, as `errno` has it.
         lasting: the disk stays so.
-        seen: the calls that counted.
     """
 
     number: int
     kinds: tuple[str, ...] = KINDS
     code: int = errno.ENOSPC
     lasting: bool = False
-    seen: list[Call] = field(default_factory=list)
+    _seen: int = field(default_factory=lambda: os.memfd_create("seen"))
+
+    def __del__(self) -> None:
+        os.close(self._seen)
+
+    @property
+    def seen(self) -> list[Call]:
+        """The calls that counted, but for their data."""
+        raw = os.pread(self._seen, os.fstat(self._seen).st_size, 0)
+        records = (raw[at : at + _RECORD] for at in range(0, len(raw), _RECORD))
+        told = [os.fsdecode(record.rstrip(b"\0")).partition(" ") for record in records]
+        return [Call(kind, Path(path)) for kind, _, path in told]
 
     def __call__(self, call: Call) -> None:
         """See `watched`."""
         if call.kind not in self.kinds:
             return
-        self.seen.append(call)
-        at = len(self.seen) - 1
+        at = self._count(call)
         if at == self.number or (self.lasting and 0 <= self.number <= at):
             raise OSError(self.code, os.strerror(self.code), str(call.path))
+
+    def _count(self, call: Call) -> int:
+        """Which call it is, of those of all processes; nothing is locked that one might die in."""
+        record = os.fsencode(f"{call.kind} {call.path}").ljust(_RECORD, b"\0")
+        assert len(record) == _RECORD, call.path
+        file = os.open(f"/proc/self/fd/{self._seen}", os.O_WRONLY | os.O_APPEND)
+        try:
+            os.write(file, record)
+            return os.lseek(file, 0, os.SEEK_CUR) // _RECORD - 1
+        finally:
+            os.close(file)
 
 
 class _Watch:

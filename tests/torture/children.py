@@ -24,7 +24,7 @@ from .outcomes import HANG, MIXED, RIGHT, SKIPPED, WRONG, Defect, Job, Limits, O
 from .processes import descendants, wait_gone
 from .works import WORKS, Work, files
 
-LIMITS = Limits(seconds=200, share=3)
+LIMITS = Limits(seconds=200, share=5, enough=200, beside=2)
 
 REAL = 0.2
 """Share of commands that are begun as a user would; workers import everything anyway."""

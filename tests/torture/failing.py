@@ -15,8 +15,19 @@ from random import Random
 from typing import Any
 
 from .calls import KINDS, Call, Refusal, watched
-from .outcomes import CLEAR_ERROR, LOST, RIGHT, SKIPPED, Defect, Job, Outcome
-from .stories import OUT, STORIES, Story, check, command, compare, refuse_unclear
+from .outcomes import CLEAR_ERROR, LOST, RIGHT, SKIPPED, Defect, Job, Limits, Outcome
+from .stories import (
+    OUT,
+    STORIES,
+    WITH_WORKERS,
+    Story,
+    check,
+    command,
+    compare,
+    refuse_unclear,
+)
+
+LIMITS = Limits(share=6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +111,8 @@ def fail(begun: Begun, way: Way, number: int, folder: Path) -> Outcome:
 
 def prepare(folder: Path) -> list[tuple[Begun, Way, int]]:
     """Every case there is, those of all stories among each other."""
-    begun = [begin(story, folder / str(i)) for i, story in enumerate(STORIES.values())]
+    stories = (*STORIES.values(), *WITH_WORKERS.values())
+    begun = [begin(story, folder / str(i)) for i, story in enumerate(stories)]
     found = [(one, way, number) for one in begun for way, number in one.cases()]
     Random(0).shuffle(found)
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import random
 import select
@@ -33,6 +34,12 @@ class Campaign:
     seeds: Iterator[int]
     given: Any
     limits: Limits
+
+    @property
+    def enough(self) -> float:
+        """Cases after which it ends."""
+        most = len(self.given) if isinstance(self.given, list) else math.inf
+        return most if self.limits.enough is None else self.limits.enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +85,10 @@ class Results:
             self.lines = []
         self.add({"run": told})
 
+    def cases(self, campaign: str) -> int:
+        """How many there are of a campaign."""
+        return sum(line["count"] for line in self.lines if line.get("campaign") == campaign)
+
     def seeds(self, campaign: str, first: int) -> Iterator[int]:
         """Those from `first` on of which there is no line yet."""
         done = {line["seed"] for line in self.lines if line.get("campaign") == campaign}
@@ -97,26 +108,32 @@ def run(
     *,
     fewest: int = 0,
 ) -> None:
-    """Run cases until the time is over; those that run then are ended in peace.
+    """Run cases until there are enough, or the time is over; those that run are ended in peace.
 
     Args:
         campaign: with what `prepare` gave.
         results: each case is written there as it ends.
         deadline: until when, by the monotonic clock.
-        jobs: cases at a time.
+        jobs: cases that compute at a time; see `Limits`.
         say: where found defects are told.
         fewest: cases that are run even when the time is over.
     """
     running: dict[int, Running] = {}
-    begun = 0
-    while running or begun < fewest or time.monotonic() < deadline:
-        while len(running) < jobs and (begun < fewest or time.monotonic() < deadline):
+    begun, done = 0, results.cases(campaign.name)
+
+    def more() -> bool:
+        in_time = begun < fewest or time.monotonic() < deadline
+        return in_time and done + len(running) < campaign.enough
+
+    while running or more():
+        while len(running) < jobs * campaign.limits.beside and more():
             case = begin(campaign, next(campaign.seeds))
             running[case.pidfd] = case
             begun += 1
         for pidfd in select.select(list(running), [], [], 0.5)[0]:
             line = end(case := running.pop(pidfd))
             results.add(line)
+            done += line["count"]
             if "defect" in line:
                 print(f"{campaign.name} {case.seed}: {line['defect']}", file=say, flush=True)
         for case in running.values():

@@ -41,7 +41,7 @@ from replay.runs.stretches import read_columns
 from .calls import Call, watched
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
 
-LIMITS = Limits(seconds=120, share=1)
+LIMITS = Limits(seconds=120, share=17, enough=10_000)
 TAU = 20
 MOST = 400
 """Frames of the longest recording."""
@@ -247,7 +247,8 @@ class History:
         if result.source.get("first_frame", 0):
             return
         worlds = self._check_signals(result.streams, result.signals_sha256, result.iterations)
-        check(WRONG, check_log(self.run).ok, f"{check_log(self.run).problems}")
+        log = check_log(self.run)
+        check(WRONG, log.ok, f"{log.problems}")
         named: Any = result.source.get("views", ())
         if result.iterations and named and all(map(self._is_there, named)):
             with contextlib.closing(RecordedSource(self.recording)) as source:

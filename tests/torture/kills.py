@@ -22,7 +22,7 @@ from .processes import descendants, wait_gone
 from .witness import due, witnessing
 from .works import WORKS, Work, prepared
 
-LIMITS = Limits(seconds=150, share=3)
+LIMITS = Limits(seconds=150, share=9, enough=1_000, beside=2)
 
 SIGNALS = {
     "kill -9": (signal.SIGKILL,),

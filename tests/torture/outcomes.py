@@ -93,9 +93,14 @@ class Limits:
     Attributes:
         seconds: a case that takes longer hangs, whatever it is doing.
         megabytes: most memory of one process of a case; None where inputs are not hostile.
-        share: of the time of all campaigns.
+        share: of the time of all campaigns; minutes of the hour in which each has enough.
+        enough: cases after which the campaign ends; None ends with its time, but what goes through
+            a list ends with that.
+        beside: cases at a time for each job; more than one where most of a case is waiting.
     """
 
     seconds: float = 120.0
     megabytes: float | None = None
-    share: float = 1.0
+    share: float = 2.0
+    enough: int | None = None
+    beside: int = 1

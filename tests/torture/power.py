@@ -18,13 +18,15 @@ from random import Random
 from typing import Any
 
 from .calls import Call, watched
-from .outcomes import LOST, RIGHT, Defect, Job, Outcome
+from .outcomes import LOST, RIGHT, Defect, Job, Limits, Outcome
 from .stories import OUT, STORIES, Story, check, command, compare, refuse_unreadable
 
 WRITTEN, ZEROS, SYNCED = "all that was written", "lengths with zeros", "what was synced"
 NAMES, OLD_NAMES = "all names", "synced names"
 LEFT = tuple(itertools.product((WRITTEN, ZEROS, SYNCED), (NAMES, OLD_NAMES)))
 """What is left of the data, and of the names."""
+
+LIMITS = Limits(share=4)
 
 GONE = 1 << 22
 """The number of no process, as all processes of before are gone when the power is back."""
@@ -250,9 +252,9 @@ def go_on(cut: Cut, folder: Path) -> Outcome:
     return Outcome(RIGHT, story.name, f"{cut}; gone on with by {on}")
 
 
-def prepare(folder: Path) -> Sequence[Cut]:
+def prepare(folder: Path) -> list[Cut]:
     """Every case there is, those of all stories among each other."""
-    found = []
+    found = list[Cut]()
     for number, story in enumerate(STORIES.values()):
         place = folder / str(number)
         place.mkdir()

@@ -10,11 +10,13 @@ import contextlib
 import hashlib
 import io
 import json
+import multiprocessing
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from camera_files import write_cameras
 
@@ -79,9 +81,17 @@ def command(folder: Path, words: str) -> Ended:
     """Run a command line in this process, its paths being in a folder."""
     args = [re.sub(rf"^({OUT}|{GIVEN})\b", lambda m: str(folder / m[0]), w) for w in words.split()]
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), forked_workers():
         code = run(args)
     return Ended(words, code, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def forked_workers() -> Iterator[None]:
+    """Have worker processes forked off this one: with what is watched here, and all imported."""
+    fork = multiprocessing.get_context("fork")
+    with mock.patch.object(multiprocessing, "get_context", return_value=fork):
+        yield
 
 
 def refuse_unclear(story: Story, ended: Ended) -> None:
@@ -365,3 +375,18 @@ STORIES = {
     )
 }
 """By name."""
+
+WITH_WORKERS = {
+    story.name: story
+    for story in (
+        Story("record --jobs 2", f"{RECORD} --jobs 2", STORIES["record"].on, files),
+        Story(
+            "sweep --keep-logs --jobs 2",
+            f"{SWEEP} --keep-logs --jobs 2",
+            STORIES["sweep --keep-logs"].on,
+            rows,
+            progress=done,
+        ),
+    )
+}
+"""Those in which several processes work at the same time."""
