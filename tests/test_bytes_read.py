@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.experiments.runs import run
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
+from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import check_log
 from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
@@ -77,6 +80,14 @@ def share_read(path: Path, work: str) -> float:
 )
 def test_no_byte_is_read_without_need(noise: Path, work: str, most: float) -> None:
     assert share_read(noise, work) <= most
+
+
+@pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="counts what Linux counts")
+def test_a_run_is_verified_in_one_pass(tmp_path: Path) -> None:
+    never = LearnerConfig(delta=1e-9, tau=100)
+    run(OscillatorySource(), never, tmp_path / "run", max_iterations=600, rerun=False)
+    log = tmp_path / "run" / "run.mcap"
+    assert share_read(log, "check_log(path)") <= 1.1 + 25_000 / log.stat().st_size  # its header
 
 
 def test_a_damaged_chunk_is_told_when_it_is_reached(noise: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 from collections.abc import Iterator, Mapping
@@ -10,73 +11,108 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from replay.integrity.survey import said
 from replay.mcap.reader import LogReader
-from replay.mcap.segments import Problem
+from replay.mcap.segments import Problem, Segment
 from replay.runs.final import facts_sha256
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
-from replay.runs.log import read_header
+from replay.runs.log import SIGNALS_TOPIC, read_header
 from replay.runs.modules import load_modules
-from replay.runs.stretches import read_columns
+from replay.runs.stretches import Stretch, Stretches
 from replay.storage.checksum import sha256
 
 
-def view_again(run: Path) -> str:
+class RunPass:
+    """Looks at what a run states of itself while the chunks of its log are decoded.
+
+    Args:
+        log: of the run, whole.
+        reader: of the log.
+        beside: also look at the files beside it.
+    """
+
+    def __init__(self, log: Path, reader: LogReader, *, beside: bool) -> None:
+        self._log, self._reader, self._beside = log, reader, beside
+        self._final = next((r.values for r in reader.metadata if r.name == FINAL_METADATA), None)
+        self._document = read_run_json(log.parent) if beside else {}
+        self._stated = self._stated_signals()
+        self._hash, self._expected = SignalsHash(), 0
+        self._stretches: Stretches | None = None
+        self._found: list[Problem] = []
+        with self._telling():
+            header = read_header(log)
+            if self._stated is not None and header.schema == SCHEMA_VERSION:
+                self._stretches = Stretches(log, header, reader.channels, topics=(SIGNALS_TOPIC,))
+
+    def add(self, segment: Segment) -> None:
+        """Take in the next chunk of the log."""
+        table = self._reader.table(segment)
+        with self._telling():
+            if self._stretches is not None and table is not None:
+                for stretch in self._stretches.take(table):
+                    self._add(stretch)
+
+    def finish(self) -> None:
+        """Hear that there is no further chunk."""
+        with self._telling():
+            if self._stretches is not None:
+                self._add(self._stretches.rest())
+                if self._hash.hexdigest() != self._stated:
+                    what = f"its {self._hash.count} iterations are not those that the run had"
+                    self._found.append(Problem(str(self._log), what))
+
+    def problems(self) -> Iterator[Problem]:
+        """Where the run is not what it states, of a log that is whole."""
+        yield from self._found
+        final, folder = self._final, self._log.parent
+        if final is None or not self._beside:
+            return
+        if not self._document:
+            yield Problem(str(folder / RUN_JSON), "is missing or no JSON")
+        elif facts_sha256(self._document) != final.get("facts_sha256"):
+            what = "states something else than the run's final record"
+            yield Problem(str(folder / RUN_JSON), what)
+        yield from _check_modules(folder / MODULES_FILE, final.get("modules_sha256"))
+        view = folder / VIEW_FILE
+        if final.get("view") == json.dumps(True) and not view.is_file():
+            yield Problem(str(view), f"is missing; {_view_again(folder)}")
+
+    def notes(self) -> Iterator[str]:
+        """What nothing proves."""
+        folder = self._log.parent
+        if self._beside and (view := folder / VIEW_FILE).is_file():
+            yield f"{view} is not checked: {_view_again(folder)}"
+        if self._final is None:
+            yield f"{self._log} holds no final record: nothing proves what is beside it"
+
+    def _stated_signals(self) -> Any:
+        """SHA-256 of its signals as it states it, None where it does not."""
+        if self._final is not None:
+            return self._final.get("signals_sha256")
+        result = self._document.get("result")
+        return result.get("signals_sha256") if isinstance(result, Mapping) else None
+
+    def _add(self, stretch: Stretch) -> None:
+        for signals in (record for columns in stretch.signals for record in columns.records()):
+            if signals.iteration != self._expected:
+                what = f"iterations {self._expected} to {signals.iteration - 1} are missing"
+                self._found.append(Problem(str(self._log), what))
+            self._expected = signals.iteration + 1
+            self._hash.add(signals)
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        try:
+            yield
+        except CdmisfaError as error:
+            self._found.append(said(self._log, error))
+            self._stretches = None
+
+
+def _view_again(run: Path) -> str:
     """How the view of a run comes back; it holds nothing that the log does not."""
     command = ("cdmisfa", "view", str(run), "--save", str(run / VIEW_FILE), "--force")
     return f"make it again with {shlex.join(command)}"
-
-
-def read_final(log: Path) -> Mapping[str, str] | None:
-    """The final record of a run's log, None where it holds none."""
-    with LogReader(log, salvage=True) as reader:
-        return next((r.values for r in reader.metadata if r.name == FINAL_METADATA), None)
-
-
-def check_run(log: Path, *, beside: bool) -> Iterator[Problem]:
-    """Compare what a run states of itself with what is there.
-
-    Args:
-        log: of a run, whole.
-        beside: also look at the files beside it.
-    """
-    final = read_final(log)
-    folder = log.parent
-    document = read_run_json(folder) if beside else {}
-    try:
-        yield from _check_signals(log, final, document)
-    except CdmisfaError as error:
-        yield Problem(str(log), str(error).removeprefix(f"{log}: "))
-    if final is None or not beside:
-        return
-    if not document:
-        yield Problem(str(folder / RUN_JSON), "is missing or no JSON")
-    elif facts_sha256(document) != final.get("facts_sha256"):
-        yield Problem(str(folder / RUN_JSON), "states something else than the run's final record")
-    yield from _check_modules(folder / MODULES_FILE, final.get("modules_sha256"))
-    view = folder / VIEW_FILE
-    if final.get("view") == json.dumps(True) and not view.is_file():
-        yield Problem(str(view), f"is missing; {view_again(folder)}")
-
-
-def _check_signals(
-    log: Path, final: Mapping[str, str] | None, document: Mapping[str, Any]
-) -> Iterator[Problem]:
-    result = document.get("result")
-    of_result = result.get("signals_sha256") if isinstance(result, Mapping) else None
-    stated = of_result if final is None else final.get("signals_sha256")
-    header = read_header(log)
-    if stated is None or header.schema != SCHEMA_VERSION:
-        return
-    found, expected = SignalsHash(), 0
-    for columns in read_columns(log, header):
-        for signals in columns.records():
-            if signals.iteration != expected:
-                what = f"iterations {expected} to {signals.iteration - 1} are missing"
-                yield Problem(str(log), what)
-            expected = signals.iteration + 1
-            found.add(signals)
-    if found.hexdigest() != stated:
-        yield Problem(str(log), f"its {found.count} iterations are not those that the run had")
 
 
 def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
@@ -88,4 +124,4 @@ def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
         else:
             load_modules(path)
     except CdmisfaError as error:
-        yield Problem(str(path), str(error).removeprefix(f"{path}: "))
+        yield said(path, error)

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from recorder.log.messages import RECORDING_METADATA
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
@@ -73,6 +73,11 @@ def _crc(reader: LogReader, decoded: bool) -> Crc:
 def moved(problem: Problem, copy: Path, place: Location) -> Problem:
     """A problem with what was copied called by its own name."""
     return Problem(problem.where.replace(str(copy), str(place)), problem.what)
+
+
+def said(path: Location, error: CdmisfaError) -> Problem:
+    """An error as a problem of the file that it names."""
+    return Problem(str(path), str(error).removeprefix(f"{path}: "))
 
 
 def problems_of(reader: LogReader) -> tuple[Problem, ...]:

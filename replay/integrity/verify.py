@@ -14,14 +14,13 @@ from replay.camera_logs.catalogue import channels_of
 from replay.camera_logs.opening import only_foreign, open_images
 from replay.camera_logs.stream import ImageStream
 from replay.inputs.words import places
-from replay.integrity.run_files import check_run, read_final, view_again
-from replay.integrity.survey import SCHEMA, Crc, Kind, kind_of, moved, survey
+from replay.integrity.run_files import RunPass
+from replay.integrity.survey import SCHEMA, Crc, kind_of, moved, said, survey
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MalformedRecord
 from replay.mcap.segments import Problem, Segment
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
-from replay.runs.folders import VIEW_FILE
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched
@@ -85,20 +84,17 @@ def check_log(path: str | Location) -> LogCheck:
     files: list[FileCheck] = []
     views: list[_ViewPass] = []
     notes: list[str] = []
+    beside = isinstance(place, Path) and place.is_dir()
     with fetched(place) as copy:
         for file in log_files(copy):
-            crc, kind, found, view = _check_file(file)
+            crc, found, passed = _check_file(file, beside=beside)
             problems += found
             files.append(FileCheck(str(file).replace(str(copy), str(place)), crc))
-            if view is not None:
-                views.append(view)
-            if kind == "run" and not found and isinstance(file, Path):
-                beside = isinstance(place, Path) and place.is_dir()
-                problems += check_run(file, beside=beside)
-                if beside and (shown := file.parent / VIEW_FILE).is_file():
-                    notes.append(f"{shown} is not checked: {view_again(file.parent)}")
-                if read_final(file) is None:
-                    notes.append(f"{file} holds no final record: nothing proves what is beside it")
+            if isinstance(passed, _ViewPass):
+                views.append(passed)
+            elif passed is not None and not found:
+                problems += passed.problems()
+                notes += passed.notes()
         if views:
             problems += _check_views(views, alone=copy.is_file())
     unique = dict.fromkeys(moved(problem, copy, place) for problem in problems)
@@ -116,7 +112,7 @@ def _check_images(path: Path) -> LogCheck:
                     problems += _broken(images)
                     notes |= dict.fromkeys(images.warnings)
     except LogDamagedError as error:
-        problems.append(_said(path, error))
+        problems.append(said(path, error))
     return LogCheck(tuple(problems), (FileCheck(str(path), "absent"),), tuple(notes))
 
 
@@ -156,13 +152,15 @@ class _ViewPass:
             self.error = error
 
 
-def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem], _ViewPass | None]:
+def _check_file(
+    path: Location, *, beside: bool
+) -> tuple[Crc, list[Problem], _ViewPass | RunPass | None]:
     try:
         with LogReader(path, salvage=True, check="pass") as reader:
-            view = _ViewPass(path, reader) if kind_of(reader) == "recording" else None
-            found = survey(reader, decode=True, told=view.add if view else lambda _: None)
-            if view:
-                view.finish()
+            passed = _pass_of(path, reader, beside)
+            found = survey(reader, decode=True, told=passed.add if passed else lambda _: None)
+            if passed:
+                passed.finish()
             wrong = [
                 f"holds messages of channel {number}, never defined"
                 for number in found.channels.keys() - reader.channels.keys()
@@ -172,9 +170,17 @@ def _check_file(path: Location) -> tuple[Crc, Kind, list[Problem], _ViewPass | N
             if stated != there and not reader.problems:
                 wrong.append(f"its summary states {stated} messages, there are {there}")
             problems = [Problem(str(path), what) for what in wrong]
-            return found.crc, found.kind, [*problems, *found.problems], view
+            return found.crc, [*problems, *found.problems], passed
     except LogDamagedError as error:
-        return "bad", "foreign", [_said(path, error)], None
+        return "bad", [said(path, error)], None
+
+
+def _pass_of(path: Location, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:
+    """What looks at a log's content while it is decoded, where it is one of ours."""
+    kind = kind_of(reader)
+    if kind == "run" and isinstance(path, Path) and reader.complete:
+        return RunPass(path, reader, beside=beside)
+    return _ViewPass(path, reader) if kind == "recording" else None
 
 
 def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
@@ -191,7 +197,7 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
                 if start > end and not facts.gaps:
                     yield Problem(str(checked.path), f"frames {end} to {start - 1} are missing")
         if checked.error is not None:
-            yield _said(checked.path, checked.error)
+            yield said(checked.path, checked.error)
     for name in () if alone else sorted(streams - names):
         yield Problem(folder, f"the view {name!r} of the recording has no file")
     if any(checked.error is not None for checked in passes):
@@ -200,7 +206,7 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
     try:
         source = RecordedSource([v.path for v in views], salvage=True, opened=views)
     except LogDamagedError as error:
-        yield replace(_said(passes[0].path, error), where=folder)
+        yield replace(said(passes[0].path, error), where=folder)
         return
     with contextlib.closing(source):
         if source.gaps:
@@ -211,8 +217,3 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
             if end > shortest:
                 what = f"the view {name!r} ends before frame {end}, another before {shortest}"
                 yield Problem(folder, what)
-
-
-def _said(path: Location, error: LogDamagedError) -> Problem:
-    """An error as a problem of the log that it names."""
-    return Problem(str(path), str(error).removeprefix(f"{path}: "))

@@ -223,8 +223,8 @@ class LogReader:
     ) -> Iterator[tuple[Segment, MessageTable]]:
         """Give the messages chunk by chunk as columns, in the order of `messages`.
 
-        Chunks whose times overlap come in pieces. Of a URL, chunks without any of `topics`
-        are left out.
+        Chunks whose times overlap come in pieces. Of a log that was opened by its index, chunks
+        without any of `topics` are left out.
 
         Raises:
             LogDamagedError: at the first damage, without `salvage`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
+from replay.mcap.records import Channel
+from replay.mcap.tables import MessageTable
 from replay.runs.columns import SignalColumns, columns_of_messages
 from replay.runs.folders import run_log
 from replay.runs.log import (
@@ -83,27 +85,12 @@ def read_stretches(
     """
     log = run_log(path)
     header = header or read_header(log)
-    waiting, spec = _Waiting(log, header), header.spec
     with LogReader(log) as reader:
-        wanted = {number: c.topic for number, c in reader.channels.items() if c.topic in topics}
-        since = spec.time_ns(start) if start else None
+        stretches = Stretches(log, header, reader.channels, every=every, topics=topics)
+        since = header.spec.time_ns(start) if start else None
         for _, table in reader.tables(ordered=False, start=since):
-            data = memoryview(table.data.data)
-            for number, t, at, size in zip(
-                table.channel.tolist(),
-                spec.frames_at(table.log_time).tolist(),
-                table.at.tolist(),
-                table.size.tolist(),
-                strict=True,
-            ):
-                topic = wanted.get(number)
-                if topic is None or (topic == WATCHED_TOPIC and spec.images and t % every):
-                    continue
-                if waiting.full(topic):
-                    stretch, waiting = waiting.stretch(), _Waiting(log, header)
-                    yield stretch
-                waiting.add(topic, t, bytes(data[at : at + size]))
-        yield waiting.stretch()
+            yield from stretches.take(table)
+        yield stretches.rest()
         if not reader.complete and not log.name.endswith(PARTIAL):
             raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")
 
@@ -114,6 +101,52 @@ def read_columns(
     """The records of a run from a frame on, in order, as arrays; see `read_stretches`."""
     for stretch in read_stretches(path, header, topics=(SIGNALS_TOPIC,), start=start):
         yield from stretch.signals
+
+
+class Stretches:
+    """Makes stretches of a run's log from its chunks, which are given in file order.
+
+    Args:
+        log: of the run.
+        header: what stands at its beginning.
+        channels: of the log.
+        every: see `read_stretches`, as `topics`.
+    """
+
+    def __init__(
+        self,
+        log: Path,
+        header: RunHeader,
+        channels: Mapping[int, Channel],
+        *,
+        every: int = 1,
+        topics: Sequence[str] = TOPICS,
+    ) -> None:
+        self._log, self._header, self._every = log, header, every
+        self._wanted = {n: c.topic for n, c in channels.items() if c.topic in topics}
+        self._waiting = _Waiting(log, header)
+
+    def take(self, table: MessageTable) -> Iterator[Stretch]:
+        """Take the messages of the next chunk, and give the stretches that end with them."""
+        spec, data = self._header.spec, memoryview(table.data.data)
+        for number, t, at, size in zip(
+            table.channel.tolist(),
+            spec.frames_at(table.log_time).tolist(),
+            table.at.tolist(),
+            table.size.tolist(),
+            strict=True,
+        ):
+            topic = self._wanted.get(number)
+            if topic is None or (topic == WATCHED_TOPIC and spec.images and t % self._every):
+                continue
+            if self._waiting.full(topic):
+                yield self.rest()
+            self._waiting.add(topic, t, bytes(data[at : at + size]))
+
+    def rest(self) -> Stretch:
+        """What was taken since the last stretch ended, as one."""
+        waiting, self._waiting = self._waiting, _Waiting(self._log, self._header)
+        return waiting.stretch()
 
 
 class _Waiting:
