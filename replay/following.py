@@ -144,7 +144,12 @@ def _that_go_round(truth: Float) -> tuple[int, ...]:
 
 
 def read_outputs(
-    path: Path, outline: Outline, modules: int, most: int = KEPT
+    path: Path,
+    outline: Outline,
+    modules: int,
+    most: int = KEPT,
+    *,
+    truth: Frames | None = None,
 ) -> tuple[Output, ...]:
     """What the first modules of a run say about their own streams; see `read_stretches`.
 
@@ -157,6 +162,7 @@ def read_outputs(
         outline: the run in short.
         modules: how many, at most.
         most: last frames of each.
+        truth: what the world knew at each frame, where that was read already.
     """
     header = outline.header
     heard = [
@@ -166,7 +172,8 @@ def read_outputs(
     for columns in read_columns(path, header) if heard else ():
         for module in heard:
             module.add(columns)
-    truth = read_truth(path, header) if heard else None
+    if heard and truth is None:
+        truth = _read_truth(path, header)
     spoken = {module.number: module.said(most) for module in heard if module.blocks}
     silent = {m.number: spoken[m.number][0] for m in heard if m.blocks and m.is_silent}
     spoken |= _of_kept_modules(path, header, silent)
@@ -211,7 +218,7 @@ def _known_at(t: NDArray[np.int64], truth: Frames | None) -> Float:
     return np.empty((len(t), 0))
 
 
-def read_truth(path: Path, header: RunHeader) -> Frames | None:
+def _read_truth(path: Path, header: RunHeader) -> Frames | None:
     """What the world knew at each frame that was watched; None where it knows nothing."""
     if not header.spec.truth:
         return None

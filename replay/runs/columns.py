@@ -61,6 +61,50 @@ class SignalColumns:
         return every, np.repeat(self.iterations, self.tau)
 
 
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """Where the blocks of consecutive iterations began.
+
+    Which iteration a frame is of cannot be computed from its number: between blocks may be gaps.
+
+    Attributes:
+        starts: (n,) first frame of each block.
+        iterations: (n,) its iteration.
+        streams: (n,) what was watched.
+    """
+
+    starts: NDArray[np.int64]
+    iterations: NDArray[np.int64]
+    streams: NDArray[np.int64]
+
+    def places(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Number, from 0, of the last block here that had begun at each frame."""
+        return np.maximum(np.searchsorted(self.starts, frames, side="right") - 1, 0)
+
+    def iteration(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The last iteration that had begun at each frame; 0 before the first."""
+        if not len(self.starts):
+            return np.zeros(len(frames), dtype=np.int64)
+        return self.iterations[self.places(frames)]
+
+    def last(self) -> Blocks:
+        """The last one of these."""
+        return Blocks(self.starts[-1:], self.iterations[-1:], self.streams[-1:])
+
+    @classmethod
+    def of(cls, columns: SignalColumns) -> Blocks:
+        """Those of records, as copies: the records need not be kept for them."""
+        kept = (columns.frames, columns.iterations, columns["stream"])
+        return cls(*(np.array(part, dtype=np.int64) for part in kept))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Blocks]) -> Blocks:
+        """Several, one after the other."""
+        none = np.empty(0, dtype=np.int64)
+        every = ((p.starts, p.iterations, p.streams) for p in parts)
+        return cls(*(np.concatenate(part) for part in zip((none,) * 3, *every, strict=True)))
+
+
 def told(name: str, values: NDArray[Any]) -> bool:
     """Whether a signal's values are not all missing."""
     if values.dtype.kind == "f":

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import NO_STATE, SIGNALS
-from replay.runs.columns import SignalColumns, told
+from replay.runs.columns import Blocks, SignalColumns, told
 from replay.runs.log import RunHeader, read_header
 from replay.runs.stretches import read_columns
 
@@ -57,6 +57,8 @@ class Outline:
 
     Attributes:
         iterations: number of records; `frames` those watched.
+        blocks: of all records.
+        end: the frame after the last one; there may be more before it than were watched.
         tau: frames of a block.
         outputs: of an abstraction.
         modules: most frozen modules in any iteration.
@@ -71,6 +73,8 @@ class Outline:
     header: RunHeader
     iterations: int
     frames: int
+    blocks: Blocks
+    end: int
     tau: int
     outputs: int
     modules: int
@@ -97,6 +101,7 @@ class Tally:
     def __init__(self, header: RunHeader) -> None:
         self.header = header
         self._visits = np.zeros(len(header.spec.streams), dtype=np.int64)
+        self._blocks: list[Blocks] = []
         self._lines: dict[str, list[Float]] = {name: [] for name in LINES}
         self._saved: list[Saved] = []
         self._iterations = self._modules = self._tau = self._outputs = 0
@@ -107,6 +112,7 @@ class Tally:
     def add(self, columns: SignalColumns) -> None:
         """Take the next records in."""
         _, self._tau, self._outputs = columns["y"].shape
+        self._blocks.append(Blocks.of(columns))
         self._visits += self._tau * np.bincount(columns["stream"], minlength=len(self._visits))
         for name, parts in self._lines.items():
             parts.append(columns[name].reshape(-1))
@@ -132,10 +138,13 @@ class Tally:
 
     def outline(self) -> Outline:
         """What was taken in, in short."""
+        blocks = Blocks.joined(self._blocks)
         return Outline(
             header=self.header,
             iterations=self._iterations,
             frames=int(self._visits.sum()),
+            blocks=blocks,
+            end=int(blocks.starts[-1]) + self._tau if self._iterations else 0,
             tau=self._tau,
             outputs=self._outputs,
             modules=self._modules,

@@ -18,7 +18,7 @@ from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel
 from replay.mcap.tables import MessageTable
-from replay.runs.columns import SignalColumns, columns_of_messages
+from replay.runs.columns import Blocks, SignalColumns, columns_of_messages
 from replay.runs.folders import run_log
 from replay.runs.log import (
     EVENT_TOPIC,
@@ -51,11 +51,14 @@ class Stretch:
     """What a log holds of some consecutive iterations.
 
     Attributes:
+        blocks: of the records, after the last one before them, which the first of the other
+            messages may belong to; none where no records were wanted.
         truth: what the world knew, (n, D).
         phi: (t, (J, I)) weights of the abstraction.
     """
 
     signals: tuple[SignalColumns, ...]
+    blocks: Blocks
     watched: tuple[Frames, ...]
     truth: tuple[Frames, ...]
     phi: tuple[tuple[int, NDArray[np.float64]], ...]
@@ -145,16 +148,17 @@ class Stretches:
 
     def rest(self) -> Stretch:
         """What was taken since the last stretch ended, as one."""
-        waiting, self._waiting = self._waiting, _Waiting(self._log, self._header)
-        return waiting.stretch()
+        stretch = self._waiting.stretch()
+        self._waiting = _Waiting(self._log, self._header, (stretch.blocks.last(),))
+        return stretch
 
 
 class _Waiting:
     """Messages that wait to be decoded together."""
 
-    def __init__(self, log: Path, header: RunHeader) -> None:
+    def __init__(self, log: Path, header: RunHeader, before: tuple[Blocks, ...] = ()) -> None:
         self.header = header
-        self._log = log
+        self._log, self._before = log, before
         self._data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self._frames: dict[str, list[int]] = {topic: [] for topic in TOPICS}
         self._bytes = 0
@@ -174,9 +178,11 @@ class _Waiting:
         """What waits, decoded."""
         log, spec, data = self._log, self.header.spec, self._data
         watched = self._pictures() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
+        signals = self._records()
         events = zip(data[EVENT_TOPIC], self._frames[EVENT_TOPIC], strict=True)
         return Stretch(
-            signals=self._records(),
+            signals=signals,
+            blocks=Blocks.joined([*self._before, *map(Blocks.of, signals)]),
             watched=watched,
             truth=self._rows(TRUTH_TOPIC, (len(spec.truth),)),
             phi=tuple(decode_matrix(d, f"{log} {PHI_TOPIC}") for d in data[PHI_TOPIC]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -13,7 +12,6 @@ from cdmisfa.core.blocks import HeadPose
 from replay.palette import colour, packed_all, pale
 from replay.recordings.poses import yaw_of
 from replay.runs.outline import Outline
-from replay.runs.stretches import read_columns
 from replay.view.columns import line_column, time_columns
 from replay.view.labels import label, part
 
@@ -55,26 +53,23 @@ def write_heads(
 
 
 def write_gaze(
-    recording: rr.RecordingStream, log: Path, outline: Outline, poses: Mapping[str, HeadPose]
+    recording: rr.RecordingStream, outline: Outline, poses: Mapping[str, HeadPose]
 ) -> None:
     """Show where a run turned the head: `/head/yaw` in degrees, and an arrow in 3D."""
-    spec, watching = outline.header.spec, -1
+    spec, blocks = outline.header.spec, outline.blocks
     watched = [poses[name] for name in spec.streams]
     yaws = np.array([yaw_of(pose) for pose in watched])
     names = ["head turned to the left [degrees]"]
     column = line_column(recording, spec, YAW, names, [pale(0)], steps=True)
-    for columns in read_columns(log, outline.header):
-        streams = columns["stream"].astype(np.int64)
-        column.add(*columns.times(), yaws[streams][:, None])
-        turns = np.flatnonzero(np.diff(streams, prepend=watching))
-        watching = int(streams[-1])
-        if len(turns):
-            turned = rr.Transform3D.columns(
-                translation=[watched[s].position for s in streams[turns]],
-                quaternion=[watched[s].quaternion for s in streams[turns]],
-            )
-            times = time_columns(spec, columns.frames[turns], columns.iterations[turns])
-            recording.send_columns(WATCHING, times, turned)
+    column.add(blocks.starts, blocks.iterations, yaws[blocks.streams][:, None])
+    turns = np.flatnonzero(np.diff(blocks.streams, prepend=-1))
+    if len(turns):
+        turned = rr.Transform3D.columns(
+            translation=[watched[s].position for s in blocks.streams[turns]],
+            quaternion=[watched[s].quaternion for s in blocks.streams[turns]],
+        )
+        times = time_columns(spec, blocks.starts[turns], blocks.iterations[turns])
+        recording.send_columns(WATCHING, times, turned)
     column.flush()
     white = packed_all([(255, 255, 255)])
     arrow = rr.Arrows3D(vectors=[[-1.4 * REACH, 0, 0]], radii=[0.003], colors=white)

@@ -16,6 +16,7 @@ from cdmisfa.core.errors import UsageError
 from replay.inputs.opening import Logged, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
+from replay.runs.columns import Blocks
 from replay.runs.outline import Outline
 from replay.view.columns import FRAME, frames_column, line_column
 from replay.view.heads import gaze, write_gaze, write_heads
@@ -69,7 +70,7 @@ def write_views(
     source: Logged,
     count: int,
     every: int,
-    tau: int | None = None,
+    blocks: Blocks | None = None,
 ) -> None:
     """Write every view of a recording, and what the world knows, from the source's t on.
 
@@ -78,12 +79,12 @@ def write_views(
         source: the recording.
         count: how many frames.
         every: show images of every this many frames.
-        tau: frames of an iteration, for the views of a run, whose truth is there already.
+        blocks: of a run, for its views; its truth is there already.
     """
     first, spec = source.t, source.spec
     columns = [frames_column(recording, spec, view) for view in _views(spec)]
     truth = None
-    if spec.truth and tau is None:
+    if spec.truth and blocks is None:
         truth = line_column(recording, spec, "world/truth", spec.truth)
     for t in range(first, first + count, BLOCK):
         stop = min(t + BLOCK, first + count)
@@ -93,7 +94,7 @@ def write_views(
                 block = source.take(stream, high - low)
                 frames = np.arange(low, high)
                 keep = frames % (every if spec.images else 1) == 0
-                iterations = None if tau is None else frames[keep] // tau
+                iterations = None if blocks is None else blocks.iteration(frames[keep])
                 column.add(frames[keep], iterations, block.frames[keep])
         if truth is not None:
             truth.add(frames, None, block.truth)
@@ -102,7 +103,7 @@ def write_views(
 
 
 def write_unwatched(
-    recording: rr.RecordingStream, log: Path, path: Path, outline: Outline, every: int
+    recording: rr.RecordingStream, path: Path, outline: Outline, every: int
 ) -> bool:
     """Write all views of the recording that a run learned from, also while not watched.
 
@@ -122,11 +123,11 @@ def write_unwatched(
                 f"{path} is not the recording that this run learned from: the SHA-256 of its "
                 "files are others"
             )
-        write_views(recording, source, outline.frames, every, max(outline.tau, 1))
+        write_views(recording, source, outline.end - source.t, every, outline.blocks)
     poses = head_poses(path)
     if not write_heads(recording, outline.names(), poses):
         return False
-    write_gaze(recording, log, outline, poses)
+    write_gaze(recording, outline, poses)
     return True
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -19,7 +19,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, Signal
 from replay.palette import BRICK, GREY, MIST, Rgb, colour, dim, packed, packed_all, pale, shade
-from replay.runs.columns import SignalColumns, told
+from replay.runs.columns import Blocks, SignalColumns, told
 from replay.runs.log import RunHeader
 from replay.runs.outline import Outline
 from replay.runs.stretches import Stretch
@@ -70,8 +70,6 @@ DECISION_TABLE = "decision/table"
 WIDTH = 1.5
 """Of lines."""
 
-Frames = TypeVar("Frames", int, NDArray[np.int64])
-
 
 class RunView:
     """Writes a run into a recording.
@@ -102,7 +100,7 @@ class RunView:
         self._spec = header.spec
         self._columns: dict[str, Column] = {}
         self._streams = streams
-        self._tau = 1
+        self._blocks = Blocks.joined(())
         self._recent = np.zeros((0, len(streams)), dtype=bool)
         self._stream_of: dict[int, int] = {}
         self._named = -1
@@ -112,6 +110,7 @@ class RunView:
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
+        self._blocks = stretch.blocks
         for columns in stretch.signals:
             self._add(columns)
         for frames, watched in stretch.watched:
@@ -119,7 +118,8 @@ class RunView:
         for frames, truth in stretch.truth:
             self._truth(frames, truth)
         for t, phi in stretch.phi:
-            self.weights("abstraction/phi", t, phi)
+            (iteration,) = stretch.blocks.iteration(np.array([t])).tolist()
+            self.weights("abstraction/phi", t, iteration, phi)
         for event in stretch.events:
             self.event(event.t, event.iteration, event.text, event.level)
 
@@ -130,18 +130,17 @@ class RunView:
             outline: the run in short.
             modules: the frozen modules, for their weights.
         """
+        starts = {save.module: save.t for save in outline.saved}
         for module in modules:
-            t = module.iteration * self._tau
-            self.weights(f"modules/{module.index}/weights", t, module.phi)
+            t = starts.get(module.index, outline.end)
+            self.weights(f"modules/{module.index}/weights", t, module.iteration, module.phi)
         if outline.iterations:
-            end = max(outline.frames - outline.tau, 1)
-            self.threshold(np.array([0, end]), np.array([0, outline.iterations - 1]))
-        self._lanes.end(outline.frames)
+            self.threshold(outline.blocks.starts[[0, -1]], outline.blocks.iterations[[0, -1]])
+        self._lanes.end(outline.end)
         self.flush()
 
     def _add(self, columns: SignalColumns) -> None:
         """Take the records of consecutive iterations."""
-        self._tau = max(columns.tau, 1)
         self._signals(columns)
         self._attention(columns)
         self._decision(columns)
@@ -160,17 +159,17 @@ class RunView:
             at, frames = at[kept], frames[kept]
         if len(at):
             column = self._column("world/watched", frames_column, WIDTH)
-            column.add(at, self._iteration(at), frames)
+            column.add(at, self._blocks.iteration(at), frames)
 
     def _truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Take (n, D) of what the world knows at n frames, and the learner does not."""
         if self._spec.truth:
             line = self._line("world/truth", self._spec.truth)
-            line.add(at, self._iteration(at), values)
+            line.add(at, self._blocks.iteration(at), values)
 
-    def weights(self, path: str, t: int, phi: NDArray[np.float64]) -> None:
+    def weights(self, path: str, t: int, iteration: int, phi: NDArray[np.float64]) -> None:
         """Show (J, I) weights at an entity."""
-        self._set_time(t, self._iteration(t))
+        self._set_time(t, iteration)
         self._recording.log(path, self._picture(phi))
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
@@ -337,9 +336,6 @@ class RunView:
         if phi.size <= 256:
             return rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
         return rr.Tensor(phi.copy(), dim_names=("output", "input"))
-
-    def _iteration(self, t: Frames) -> Frames:
-        return t // self._tau
 
     def _set_time(self, t: int, iteration: int) -> None:
         self._recording.set_time(FRAME, sequence=t)

@@ -241,7 +241,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
     # Its own ranges would cut the others' curves off: the viewer chooses each run's.
     outline = replace(
         outline,
-        frames=max(int(result["frames"]) for result in results),
+        end=max(outline.end, *(int(result["frames"]) for result in results)),
         lines={name: values[:0] for name, values in outline.lines.items()},
     )
     file = place / "layout.rbl"

@@ -23,7 +23,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
-from replay.runs.columns import columns_of_records
+from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import RunHeader
 from replay.runs.outline import LINES, Outline
 from replay.runs.stretches import Stretch, read_stretches
@@ -156,9 +156,11 @@ class LiveView(Sink):
             starts, tau = np.array([s.t for s in self._records]), len(self._records[-1].y)
             every = (starts[:, None] + np.arange(tau)).reshape(-1)
             at = starts if self._images else every
+            signals = tuple(columns_of_records(self._records))
             self._show(
                 Stretch(
-                    signals=tuple(columns_of_records(self._records)),
+                    signals=signals,
+                    blocks=Blocks.joined([*map(Blocks.of, signals)]),
                     watched=((at, np.concatenate(self._watched)),),
                     truth=((every, np.concatenate(self._truth)),),
                     phi=tuple(self._phi),
@@ -174,9 +176,10 @@ class LiveView(Sink):
         for columns in stretch.signals:
             self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
             for i in np.flatnonzero(columns["saved"]).tolist():
-                t, module = int(columns.frames[i]), int(columns["module"][i])
+                t, iteration = int(columns.frames[i]), int(columns.iterations[i])
                 if t in weights:
-                    self._view.weights(f"modules/{module}/weights", t, weights[t])
+                    place = f"modules/{int(columns['module'][i])}/weights"
+                    self._view.weights(place, t, iteration, weights[t])
         self._view.flush()
         self._hand_over()
 
@@ -207,6 +210,8 @@ def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
         header=header,
         iterations=0,
         frames=0,
+        blocks=Blocks.joined(()),
+        end=0,
         tau=tau,
         outputs=outputs,
         modules=min(streams, MOST_MODULES),

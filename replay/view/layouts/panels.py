@@ -66,14 +66,14 @@ class Panels:
         self._all_views = all_views
         self._head = head
         self._tab = tab
-        self._axis = time_axis(outline.frames) if outline.frames else None
-        self._lanes_axis = time_axis(outline.frames, lanes=True) if outline.frames else None
+        self._axis = time_axis(outline.end) if outline.end else None
+        self._lanes_axis = time_axis(outline.end, lanes=True) if outline.end else None
 
     def tabs(self, *own: rrb.Container) -> rrb.Blueprint:
         """The layout of a run: tabs of its own, and those of every run."""
         views = [self._views()] if self._all_views else []
         tabs: list[rrb.Container | rrb.View] = [*own, self._modules(), *views, self._table()]
-        return blueprint(*tabs, name="Run", length=self.outline.frames, tab=self._tab)
+        return blueprint(*tabs, name="Run", length=self.outline.end, tab=self._tab)
 
     def lines(
         self,

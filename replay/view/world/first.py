@@ -10,7 +10,7 @@ import rerun as rr
 
 from replay.runs.log import RunHeader
 from replay.runs.outline import Outline
-from replay.runs.stretches import Stretch
+from replay.runs.stretches import Frames, Stretch
 from replay.view.world.known import world_of_run
 from replay.view.world.learned import Lesson, write_learned
 from replay.view.world.scene import SceneView
@@ -58,6 +58,7 @@ class FirstTab:
         self._recording, self._log, self._every = recording, log, every
         self._scene: SceneView | None = None
         self._wall: WallView | None = None
+        self._truth: list[Frames] = []
         scenery, unsure = world_of_run(header, log, learned_from)
         self.notes: list[str] = [] if unsure is None else [unsure]
         if scenery is not None:
@@ -69,6 +70,7 @@ class FirstTab:
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
+        self._truth += stretch.truth
         if self._wall is not None:
             self._wall.take(stretch)
         if self._scene is not None:
@@ -90,5 +92,5 @@ class FirstTab:
         return First(
             scene=self._scene is not None,
             wall=self._wall.bounds if self._wall is not None else None,
-            lessons=tuple(write_learned(self._recording, self._log, outline)),
+            lessons=tuple(write_learned(self._recording, self._log, outline, self._truth)),
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +10,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from replay.following import Following, read_outputs, read_truth
+from replay.following import Following, read_outputs
 from replay.palette import GREY, colour
 from replay.runs.outline import Outline
+from replay.runs.stretches import Frames
 from replay.view.columns import line_column
 from replay.view.labels import label
 
@@ -44,21 +46,23 @@ class Lesson:
     span: tuple[float, float]
 
 
-def write_learned(recording: rr.RecordingStream, log: Path, outline: Outline) -> list[Lesson]:
+def write_learned(
+    recording: rr.RecordingStream, log: Path, outline: Outline, truth: Sequence[Frames]
+) -> list[Lesson]:
     """Write each module's output where its stream was watched, and what it follows, everywhere.
 
     Args:
         recording: where it goes.
         log: of the run.
         outline: the run in short.
+        truth: what the world knew, piece after piece.
     """
     names, spec = outline.names(), outline.header.spec
-    truth = read_truth(log, outline.header) if outline.saved else None
-    if truth is None:
+    if not truth or not outline.saved:
         return []
-    frames, values = truth[0][-MOST_FRAMES:], truth[1][-MOST_FRAMES:]
-    lessons = []
-    for output in read_outputs(log, outline, MOST, MOST_FRAMES):
+    frames, values = (np.concatenate(part)[-MOST_FRAMES:] for part in zip(*truth, strict=True))
+    iterations, lessons = outline.blocks.iteration(frames), []
+    for output in read_outputs(log, outline, MOST, MOST_FRAMES, truth=(frames, values)):
         found = output.follows(spec.truth)
         if found is None:
             continue
@@ -77,7 +81,7 @@ def write_learned(recording: rr.RecordingStream, log: Path, outline: Outline) ->
         )
         for path, name, rgb, width, line in shown:
             column = line_column(recording, spec, path, [name], [rgb], width)
-            column.add(frames, frames // max(outline.tau, 1), line)
+            column.add(frames, iterations, line)
             column.flush()
         both = np.concatenate([followed, output.y])
         lessons.append(

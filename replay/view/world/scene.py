@@ -69,6 +69,10 @@ class SceneView:
         for s, gaze in enumerate(self._gazes):
             if gaze is not None:
                 _write_pyramid(recording, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
+        own = [gaze for gaze in self._gazes if gaze is not None]
+        if own:  # the eyes are the same in every view
+            thick = rr.LineStrips3D(pyramid(own[0].middle), radii=[THICK])
+            recording.log(f"{WATCHING}/edges", thick, static=True)
 
     def stand(self) -> str | None:
         """Show the robot's body, and return what to say where that cannot be."""
@@ -96,12 +100,9 @@ class SceneView:
         times = time_columns(self._spec, columns.frames[at], columns.iterations[at])
         rgbs = [colour(int(s)) for s in streams[at]]
         self._recording.send_columns(WATCHING, times, _poses(gazes))
-        edges = rr.LineStrips3D.columns(
-            strips=[edge for gaze in gazes for edge in pyramid(gaze.middle)],
-            colors=np.repeat(packed_all(rgbs), EDGES),
-            radii=[THICK] * (EDGES * len(gazes)),
-        ).partition([EDGES] * len(gazes))
-        self._recording.send_columns(f"{WATCHING}/edges", times, edges)
+        self._recording.send_columns(
+            f"{WATCHING}/edges", times, rr.LineStrips3D.columns(colors=packed_all(rgbs))
+        )
         if self._neck is not None:
             turned = self._neck.compute_transform_columns([math.radians(g.yaw) for g in gazes])
             self._recording.send_columns(f"{SCENE}/neck", times, turned)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from cdmisfa.core.signals import STATES
 from replay.palette import colour, packed_all
@@ -48,8 +46,6 @@ class WallView:
         height, width = self._spec.frame_shape
         self._places = places(len(self._streams), width, height)
         self._pictures: dict[int, ImageColumn] = {}
-        self._waiting: dict[int, tuple[int, NDArray[Any]]] = {}
-        self._watched: dict[int, int] = {}
         self._last, self._said = -1, dict.fromkeys(self._streams, "")
         for s, (x, y) in zip(self._streams, self._places, strict=True):
             path = f"{WALL}/{part(self._spec.streams, s)}"
@@ -67,22 +63,16 @@ class WallView:
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
         for columns in stretch.signals:
-            self._watched |= zip(
-                columns.iterations.tolist(), columns["stream"].tolist(), strict=True
-            )
             self._frame(columns)
             self._say(columns)
-        tau = max((columns.tau for columns in stretch.signals), default=1)
-        for frames, images in stretch.watched:
-            blocks = frames // tau
-            ends = np.flatnonzero(np.diff(blocks, append=blocks[-1] + 1))
-            self._waiting |= {int(blocks[i]): (int(frames[i]), images[i]) for i in ends}
-        for block in [b for b in self._waiting if b in self._watched]:
-            t, image = self._waiting.pop(block)
-            if (column := self._pictures.get(self._watched[block])) is not None:
-                column.add(np.array([t]), block, image[None])
-        newest = max(self._watched, default=0)
-        self._watched = {b: s for b, s in self._watched.items() if b >= newest}
+        blocks = stretch.blocks
+        for frames, images in stretch.watched if len(blocks.starts) else ():
+            places = blocks.places(frames)
+            for i in np.flatnonzero(np.diff(places, append=len(blocks.starts))).tolist():
+                column = self._pictures.get(int(blocks.streams[places[i]]))
+                if column is not None:
+                    iteration = int(blocks.iterations[places[i]])
+                    column.add(frames[i : i + 1], iteration, images[i : i + 1])
 
     def flush(self) -> None:
         """Hand over what waits."""

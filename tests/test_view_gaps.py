@@ -1,0 +1,118 @@
+"""The view of a run across a gap: every frame stands at the iteration that watched it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+
+import numpy as np
+import pytest
+from run_data import IMAGE, block_of, having, run_of
+from test_view import rows_of
+from test_view_layout import Built
+
+from cdmisfa.core.modules import Module
+from recorder.config import RecordConfig
+from recorder.log.viewfacts import Identity
+from recorder.log.viewlog import ViewLog
+from replay.recordings.source import RecordedSource
+from replay.runs.modules import save_modules
+from replay.runs.outline import read_outline
+from replay.runs.writer import RunWriter
+from replay.view.build import build_view
+from replay.viewer.moments import frame_at
+
+ITERATIONS, TAU, EVERY = 15, 40, 20
+GAP_AFTER, GAP = 4, 95
+"""Blocks before the gap, and its frames: no multiple of a block."""
+
+
+def after_the_gap(t: int) -> int:
+    return t + (GAP if t >= GAP_AFTER * TAU else 0)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """A run whose source had nothing to show for a while, its records, and the rows of its view."""
+    folder = tmp_path_factory.mktemp("gap")
+    recording = folder / "recording"
+    recording.mkdir()
+    identity = Identity("test", 0, IMAGE, {}, gaps=True)
+    logs = [ViewLog(recording, name, identity, RecordConfig()) for name in IMAGE.streams]
+    rng = np.random.default_rng(0)
+    for s, log in enumerate(logs):
+        for k in range(ITERATIONS):
+            log.write(block_of(IMAGE, s, after_the_gap(k * TAU), TAU, rng))
+        log.file.finish()
+    with contextlib.closing(RecordedSource(recording, loop=True)) as source:
+        described = source.describe()
+    learner = {"tau": TAU, "delta": 0.001}
+    manifest = {"config": {"learner": learner}, "seed": 0, "source": described}
+    writer, records, modules = RunWriter(folder / "run.mcap", IMAGE, manifest, phi_every=1), [], []
+    for made, _ in run_of(IMAGE, ITERATIONS, tau=TAU, saves=True):
+        t = after_the_gap(made.t)
+        signals = dataclasses.replace(made, t=t, log_time=IMAGE.time_ns(t))
+        phi = np.full((1, 12 * 16), float(signals.iteration))
+        writer.block(block_of(IMAGE, signals.stream, t, TAU, rng), signals, having(phi))
+        records.append(signals)
+        if signals.saved:
+            modules.append(
+                Module(
+                    *(len(modules) + 1, IMAGE.streams[signals.stream], signals.stream),
+                    *(signals.iteration, phi, np.zeros(12 * 16), np.zeros(1), np.ones(1)),
+                    *(np.ones(1), np.zeros(3, dtype=int)),
+                )
+            )
+    writer.finish()
+    save_modules(folder / "modules.npz", modules)
+    build_view(folder, folder / "run.rrd", every=EVERY, all_views=recording)
+    return folder, records, rows_of(folder / "run.rrd")
+
+
+def at(records, frame):
+    """The record of the block that a frame is of."""
+    return next(r for r in reversed(records) if r.t <= frame)
+
+
+@pytest.mark.parametrize(
+    "entity",
+    [
+        *("/world/watched", "/world/truth", "/abstraction/phi", "/learned/1/followed"),
+        *("/views/1_left", "/views/2_center", "/views/3_right"),
+    ],
+)
+def test_what_was_watched_stands_at_its_iteration(shown, entity):
+    _, records, rows = shown
+    frames = rows[entity]["frame"]
+    assert max(frames) >= records[-1].t
+    assert rows[entity]["iteration"] == [at(records, t).iteration for t in frames]
+
+
+def test_modules_stand_where_they_were_saved(shown):
+    _, records, rows = shown
+    saves = [record for record in records if record.saved]
+    assert len(saves) == 3
+    for number, save in enumerate(saves, 1):
+        weights = rows[f"/modules/{number}/weights"]
+        assert (weights["frame"], weights["iteration"]) == ([save.t], [save.iteration])
+
+
+def test_pictures_hang_with_the_stream_that_they_are_of(shown):
+    _, records, rows = shown
+    for s, name in enumerate(IMAGE.streams):
+        own = [r for r in records if r.stream == s]
+        pictures = rows[f"/wall/{s + 1}_{name}"]
+        assert pictures["iteration"] == [r.iteration for r in own]
+        for t, (image,) in zip(pictures["frame"], pictures["Image:buffer"], strict=True):
+            assert at(records, t).stream == s
+            assert {40 * s + 20, 250} == set(image)
+
+
+def test_axes_reach_to_the_end_of_the_run(shown):
+    folder, records, rows = shown
+    end = records[-1].t + TAU
+    assert read_outline(folder).end == end
+    assert rows["/attends"]["frame"][-1] == end
+    axes = {time["end"] for _, _, time, *_ in Built(folder / "run.rrd").views("TimeSeries")}
+    assert max(axes) >= end
+    assert frame_at(folder, str(end - 1)) == end - 1
