@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,10 @@ class Fields:
     def integer(self, width: int) -> int:
         """Take an unsigned little-endian number of `width` bytes."""
         return int.from_bytes(self.take(width), "little")
+
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Take what a layout describes."""
+        return layout.unpack(self.take(layout.size))
 
     def text(self) -> str:
         """Take a text with its length in front."""

@@ -23,7 +23,7 @@ Refuse = Callable[[str, str], None]
 """Takes (where, what) of a damage: raises, or notes it where damage is left out."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class IndexPart:
     """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
 

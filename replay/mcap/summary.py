@@ -30,6 +30,12 @@ from replay.storage.store import Store
 
 _FIXED = RECORD_HEADER.size + 40
 """Bytes of a chunk before its records, without the name of its compression."""
+_CHUNK: Final = struct.Struct("<QQQQI")
+"""Log times of a chunk's first and last message, its place and length, bytes of the next."""
+_PLACE: Final = struct.Struct("<HQ")
+"""A channel, and where its message index is."""
+_SIZES: Final = struct.Struct("<QQ")
+"""Bytes of a chunk's records, as stored and decompressed."""
 FOOTER_BYTES: Final = RECORD_HEADER.size + 20
 _INDEXES: Final = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
@@ -180,14 +186,13 @@ def _index(file: Store, content: int, length: int) -> Fields:
 
 def _segment(fields: Fields) -> Segment | None:
     """The chunk of a chunk index, or None where only the chunk tells what it holds."""
-    start, end, offset, length = (fields.integer(8) for _ in range(4))
-    raw = Fields(fields.take(fields.integer(4)), "a chunk index")
-    places: list[tuple[int, int]] = []
-    while raw.at < len(raw.data):
-        channel = raw.integer(2)
-        places.append((raw.integer(8), channel))
+    start, end, offset, length, mapped = fields.unpack(_CHUNK)
+    raw = fields.take(mapped)
+    if mapped % _PLACE.size:
+        raise MalformedRecord("a chunk index is cut short")
+    places = [(place, channel) for channel, place in _PLACE.iter_unpack(raw)]
     index_size, compression = fields.integer(8), fields.text()
-    stored, size = fields.integer(8), fields.integer(8)
+    stored, size = fields.unpack(_SIZES)
     data = offset + _FIXED + len(compression.encode())
     if length != data - offset + stored:
         raise MalformedRecord("a chunk index lies about its chunk's length")
