@@ -170,19 +170,44 @@ def open_source(
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
-    cameras = cameras or CameraOptions()
-    if follow is not None and (
-        len(words) > 1 or words[0] in SCENES or loop or salvage or cameras != CameraOptions()
-    ):
-        raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
-    if len(words) == 1 and words[0] in SCENES:
-        if cameras != CameraOptions():
+    if follow is None and len(words) == 1 and words[0] in SCENES:
+        if cameras not in (None, CameraOptions()):
             raise UsageError(
                 f"{words[0]} is a scene: --topic, --size, --align and --rate are for camera logs"
             )
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
         return configuration.open_scene(), configuration
+    source = open_logs(words, loop=loop, salvage=salvage, cameras=cameras, follow=follow)
+    try:
+        described = source.describe()
+        kind = scene_kind_for(source.spec, described, preset)
+        learner = None if described.get("scene") in SCENES else OF_CAMERAS
+        return source, configure(kind, preset, settings, seed, learner=learner)
+    except BaseException:
+        source.close()
+        raise
+
+
+def open_logs(
+    words: Sequence[str | Path],
+    *,
+    loop: bool = False,
+    salvage: bool = False,
+    cameras: CameraOptions | None = None,
+    follow: float | None = None,
+) -> SeekableSource:
+    """Open a recording, or other people's camera logs, as `open_source`, without a configuration.
+
+    Raises:
+        UsageError: no path that exists.
+        LogDamagedError: the log is damaged.
+    """
+    cameras = cameras or CameraOptions()
+    if follow is not None and (
+        len(words) > 1 or words[0] in SCENES or loop or salvage or cameras != CameraOptions()
+    ):
+        raise UsageError("--follow takes the folder of one recording, and neither loops nor skips")
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
@@ -197,23 +222,13 @@ def open_source(
                 f"{path}: no such file or folder, and no scene either: "
                 f"the scenes are {', '.join(SCENES)}"
             )
-    source: SeekableSource
-    if follow is not None:
-        from replay.recordings.followed import FollowedSource
+    if follow is None:
+        return open_log(paths, cameras, loop=loop, salvage=salvage)
+    from replay.recordings.followed import FollowedSource
 
-        if isinstance(paths[0], Url):
-            raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
-        source = FollowedSource(paths[0], timeout=follow)
-    else:
-        source = open_log(paths, cameras, loop=loop, salvage=salvage)
-    try:
-        described = source.describe()
-        kind = scene_kind_for(source.spec, described, preset)
-        learner = None if described.get("scene") in SCENES else OF_CAMERAS
-        return source, configure(kind, preset, settings, seed, learner=learner)
-    except BaseException:
-        source.close()
-        raise
+    if isinstance(paths[0], Url):
+        raise UsageError(f"{paths[0]}: only the folder of a recording can be followed")
+    return FollowedSource(paths[0], timeout=follow)
 
 
 def open_cameras_now(

@@ -17,7 +17,7 @@ from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.runs import module_table, run
-from cdmisfa.experiments.sources import Configuration, configure, open_source, scene_kind_for
+from cdmisfa.experiments.sources import Configuration, configure, open_logs, scene_kind_for
 from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
 from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
@@ -197,7 +197,7 @@ def _identify(words: tuple[str | Path, ...], preset: str | None, loop: bool) -> 
     """The scene's name, and what tells a recording's bytes from another's (None where live)."""
     if _is_live(words):
         return str(words[0]), None
-    source, _ = open_source(words, loop=loop)
+    source = open_logs(words, loop=loop)
     try:
         described = dict(source.describe())
         return scene_kind_for(source.spec, described, preset), described
@@ -250,7 +250,7 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
         source = configuration.open_scene()
     else:
         with limited(trial.limits):
-            source, _ = open_source(trial.source, loop=trial.loop)
+            source = open_logs(trial.source, loop=trial.loop)
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:

@@ -29,18 +29,27 @@ def head_poses(path: Path) -> dict[str, HeadPose]:
     for file in log_files(path):
         with LogReader(file) as reader:
             facts = next((r.values for r in reader.metadata if r.name == RECORDING_METADATA), {})
-            entry = next(reader.messages({POSE_TOPIC}), None)
-        if entry is None or "view" not in facts:
-            continue
-        try:
-            pose = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose
-        except message.DecodeError as error:
-            raise LogDamagedError(f"{file} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
-        place, turn = pose.position, pose.orientation
-        found[facts["view"]] = HeadPose(
-            (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w)
-        )
+            pose = first_pose(reader)
+        if pose is not None and "view" in facts:
+            found[facts["view"]] = pose
     return found
+
+
+def first_pose(reader: LogReader) -> HeadPose | None:
+    """Where the head is in a view's log, None where it does not say it.
+
+    Raises:
+        LogDamagedError: it cannot be read.
+    """
+    entry = next(reader.messages({POSE_TOPIC}), None)
+    if entry is None:
+        return None
+    try:
+        pose = PoseInFrame_pb2.PoseInFrame.FromString(entry.data).pose
+    except message.DecodeError as error:
+        raise LogDamagedError(f"{reader.path} {POSE_TOPIC}: not a foxglove.PoseInFrame") from error
+    place, turn = pose.position, pose.orientation
+    return HeadPose((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
 
 
 def yaw_of(pose: HeadPose) -> float:

@@ -14,7 +14,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, LearnerState
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.resume import FORK, read_command, restore
-from cdmisfa.experiments.sources import open_source
+from cdmisfa.experiments.sources import open_logs, open_source
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import run_log
@@ -176,14 +176,16 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     settings += [f"learner.{key}={begun[key]}" for key in LEARNERS_OWN if begun.get(key)]
     words = tuple(words) or named
     kept = () if not as_begun and _is_recording(words) else CAMERAS
+    cameras = CameraOptions(**{name: begun[name] for name in kept if name in begun})
+    if words[0] not in SCENES:
+        loop, salvage = bool(begun.get("loop")), bool(begun.get("salvage"))
+        return open_logs(words, loop=loop, salvage=salvage, cameras=cameras)
     source, _ = open_source(
         words,
-        preset=begun.get("preset") if as_begun else None,
-        settings=settings if as_begun else (),
+        preset=begun.get("preset"),
+        settings=settings,
         seed=begun.get("seed", 0),
-        loop=bool(begun.get("loop")),
-        salvage=bool(begun.get("salvage")),
-        cameras=CameraOptions(**{name: begun[name] for name in kept if name in begun}),
+        cameras=cameras,
     )
     return source
 

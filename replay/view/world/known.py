@@ -13,7 +13,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from replay.mcap.reader import LogReader
-from replay.recordings.poses import head_poses
+from replay.recordings.poses import first_pose
 from replay.runs.log import RunHeader
 from replay.storage.listing import log_files
 
@@ -68,14 +68,14 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
     with LogReader(file) as reader:
         own = [entry for entry in reader.attachments if entry.name == CONFIG_NAME]
         data = bytes(reader.attachment_data(own[0])) if own else b"{}"
+        pose = first_pose(reader)
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
         return None
     try:
         config = _table(_table(json.loads(data)).get("scene"))
     except (ValueError, RecursionError) as error:
         raise LogDamagedError(f"{file}: its {CONFIG_NAME} is broken ({error})") from error
-    poses = head_poses(path)
-    return scenery_of(config, next((p.position for p in poses.values()), NECK))
+    return scenery_of(config, NECK if pose is None else pose.position)
 
 
 def _places(header: RunHeader, log: Path, recording: Path | None) -> Iterator[Path]:
