@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arena_streams import tiny as tiny
-from source_contract import SourceContract
 
 from cdmisfa.arena import environments, pictures
 from cdmisfa.arena.library import Library, Wanted, refer
@@ -17,6 +16,7 @@ from cdmisfa.arena.source import ArenaSource
 from cdmisfa.arena.streams import BEGIN_APART, HELD_OUT, LEARNED_FROM, STREAMS, Signal, make, parse
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import UsageError
+from cdmisfa.testing.sources import SourceContract
 
 pytestmark = pytest.mark.usefixtures("tiny")
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
-from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.testing.sources import SourceContract
 from replay.camera_logs.opening import open_images
 from replay.camera_logs.source import ForeignSource
 

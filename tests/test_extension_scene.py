@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from source_contract import SourceContract
 
 from cdmisfa.core.blocks import (
     Block,
@@ -22,6 +21,7 @@ from cdmisfa.core.blocks import (
     freeze,
 )
 from cdmisfa.core.errors import UsageError
+from cdmisfa.testing.sources import SourceContract
 from recorder import RecordConfig, Scene, SceneConfig, open_scene, record, record_scene
 from recorder.world.scenes import SCENES
 

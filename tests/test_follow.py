@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from source_contract import SourceContract, same
 
 from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import RunResult, run
+from cdmisfa.testing.sources import SourceContract, same
 from recorder.log.split import Split
 from recorder.recording import record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource

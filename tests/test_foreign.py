@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from PIL import Image
-from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.testing.sources import SourceContract
 from recorder.images.messages import image_decoder
 from recorder.images.pixels import ENCODINGS, MalformedImage, gray, shrink
 from replay.camera_logs.source import ForeignSource

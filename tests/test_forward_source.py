@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from numpy.typing import NDArray
-from source_contract import ForwardContract, same
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import run
+from cdmisfa.testing.sources import ForwardContract, same
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError, record
 from replay.recordings.source import RecordedSource

@@ -14,11 +14,11 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
-from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.experiments.convert import convert
+from cdmisfa.testing.sources import SourceContract
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError
 from replay.camera_logs.alignment import between

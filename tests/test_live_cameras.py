@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedInbox, bar
-from source_contract import same
 
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
+from cdmisfa.testing.sources import same
 from recorder.cameras.live import LiveSource
 from recorder.cameras.readers import Readers
 from recorder.cameras.video import Steady

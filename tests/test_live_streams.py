@@ -22,11 +22,11 @@ from conftest import Cdmisfa
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from PIL import Image
-from source_contract import ForwardContract
 
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.words import LiveOptions, is_live, open_live, stream_names
 from replay.recordings.source import RecordedSource
 

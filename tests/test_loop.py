@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sink_contract import CONFIG, SinkContract
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.cli.commands.learn import Reporter
@@ -18,6 +17,7 @@ from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, learn
 from cdmisfa.experiments.resume import Keyframes
 from cdmisfa.paper.demo import Shown
+from cdmisfa.testing.sinks import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Cdmisfa
-from source_contract import SourceContract, same
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
+from cdmisfa.testing.sources import SourceContract, same
 from recorder.log.split import Split
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource

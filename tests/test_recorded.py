@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from source_contract import SourceContract, same
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.testing.sources import SourceContract, same
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog

@@ -7,11 +7,11 @@ import sys
 
 import numpy as np
 import pytest
-from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.testing.sources import SourceContract
 from recorder.config import RecordConfig
 from recorder.recording import save_picture
 from recorder.world.icub.config import EyesConfig, IcubConfig, SphereConfig

@@ -48,6 +48,7 @@ FORBIDDEN = {
     "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),
     "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "cdmisfa.presets": ("cdmisfa.core.config",),
+    "cdmisfa.testing": ("cdmisfa.paper.panels", "cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),
     "recorder.cameras": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner", "rerun"),
     "recorder.images": ("recorder.log.logfile", "recorder.cameras.live", "replay.palette"),

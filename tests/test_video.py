@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
-from source_contract import SourceContract
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.testing.sources import SourceContract
 from recorder.images.pixels import shrink
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.source import ForeignSource

@@ -50,8 +50,9 @@ LEARNERS: Registry[LearnerEntry] = Registry(
         "1.0": LearnerEntry(LearnerConfig, _curious),
         "progress": LearnerEntry(ProgressConfig, _progress, preset="cameras"),
     },
+    group="cdmisfa.learners",
 )
-"""Every learner; `LEARNERS.add` adds one."""
+"""Every learner; `LEARNERS.add` and entry points `cdmisfa.learners` add others."""
 
 
 def open_learner(config: Any, spec: SourceSpec, seed: int) -> Learner:

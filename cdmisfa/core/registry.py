@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Generic, TypeVar
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.plugins import find, plugins
 
 Entry = TypeVar("Entry")
 
@@ -14,9 +15,16 @@ Entry = TypeVar("Entry")
 class Registry(Mapping[str, Entry], Generic[Entry]):
     """Entries by name, in the order in which they were added.
 
+    A plugin counts as there; it is loaded, and one of those that are gone through, once it was
+    asked for.
+
     Args:
         kind: what an entry is, for messages: "expansion".
-        entries: those there are from the beginning.
+        entries: those there are from the beginning, all of one class.
+        group: of the entry points that add to them; see `cdmisfa.core.plugins`.
+
+    Attributes:
+        first: names of those from the beginning.
 
     Example:
         >>> sizes = Registry("size", {"small": 1})
@@ -25,9 +33,12 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         (['small', 'large'], 100)
     """
 
-    def __init__(self, kind: str, entries: Mapping[str, Entry] | None = None) -> None:
-        self._kind = kind
+    def __init__(
+        self, kind: str, entries: Mapping[str, Entry] | None = None, *, group: str | None = None
+    ) -> None:
+        self._kind, self._group = kind, group
         self._entries = dict(entries or {})
+        self.first = tuple(self._entries)
 
     def add(self, name: str, entry: Entry) -> None:
         """Add an entry.
@@ -47,18 +58,35 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """The entry of a name.
 
         Raises:
-            UsageError: there is none; it names the nearest.
+            UsageError: there is none, it names the nearest; or it is a plugin's and cannot be
+                loaded.
         """
         if name not in self._entries:
-            raise UsageError(f"no {self._kind} {name!r}: {did_you_mean(name, self._entries)}")
+            found = find(self._group, name) if self._group else None
+            if found is None:
+                hint = did_you_mean(name, self.names())
+                raise UsageError(f"no {self._kind} {name!r}: {hint}")
+            self._entries[name] = found.load(self.entry_class)
         return self._entries[name]
 
+    @property
+    def entry_class(self) -> type[Entry]:
+        """The class of the entries, of which there is one from the beginning."""
+        return type(self._entries[self.first[0]])
+
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self.names()
 
     def get(self, name: str, default: Entry | None = None) -> Entry | None:  # type: ignore[override]
         """The entry of a name, or the default."""
-        return self._entries.get(name, default)
+        if name not in self:
+            return default
+        return self[name]
+
+    def names(self) -> list[str]:
+        """All names, those of plugins that were not loaded last."""
+        others = plugins(self._group) if self._group else ()
+        return list(dict.fromkeys([*self._entries, *(other.name for other in others)]))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)

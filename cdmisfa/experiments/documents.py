@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from cdmisfa.core.plugins import loaded_versions
 from recorder.log.whole import whole
 
 PACKAGES = ("cdmisfa", "numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
@@ -41,9 +42,13 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
-@functools.cache
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages a result may depend on."""
+    """Versions of Python and of the packages a result may depend on, plugins that were used too."""
+    return {**_versions(), **loaded_versions()}
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):

@@ -15,6 +15,7 @@ from typing import Any, cast
 
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.plugins import loaded_versions
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_logs, scene_kind_for
@@ -162,9 +163,11 @@ def plan(
         seeded = _seeded(kind, preset, chosen)
         for seed in each:
             configuration = seeded(seed)
-            depends = [as_table(configuration.learner)]
+            depends: list[Any] = [as_table(configuration.learner)]
             if recorded is None:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
+            if used := loaded_versions():
+                depends.append(used)
             name = identity(depends, seed, recorded, ends, code())
             trial = SweepTrial(
                 id=name,

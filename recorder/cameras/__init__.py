@@ -9,6 +9,6 @@ __getattr__, __dir__, __all__ = face(
         "recorder.cameras.gym": "GymSource",
         "recorder.cameras.live": "LiveSource",
         "recorder.cameras.stepped": "ArraySource",
-        "recorder.cameras.words": "open_live",
+        "recorder.cameras.words": "CAMERAS CameraKind open_live",
     },
 )

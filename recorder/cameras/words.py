@@ -10,18 +10,50 @@ from urllib.parse import urlsplit
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.registry import Registry
 from recorder.cameras.camera import Camera
 from recorder.cameras.live import HOLD, LiveSource
 from recorder.cameras.readers import STALL, OnLoss, Readers
 from recorder.images.pixels import FRAME_SIZE, RECIPE, shrink
 
-SCHEMES: Final = ("camera", "av", "gym", "foxglove", "rtsp", "rtsps", "rtmp", "tcp", "udp")
-"""What live streams begin with; http and https are such streams by the ending of their path."""
+_VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp")
 
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
 
 _TIMEOUT: Final = 10.0
 """Seconds that opening a network stream may take."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraKind:
+    """What a word KIND:ADDRESS opens.
+
+    Attributes:
+        open: makes the camera of a word, KIND included, with the name of its stream; what it
+            cannot open is a UsageError.
+    """
+
+    open: Callable[[str, str], Camera]
+
+
+def _foxglove(word: str, name: str) -> Camera:
+    from recorder.cameras.foxglove import FoxgloveCamera
+
+    return FoxgloveCamera(word, name, timeout=_TIMEOUT)
+
+
+def _video(word: str, name: str) -> Camera:
+    from recorder.cameras.video import video_camera
+
+    return video_camera(word, name, timeout=_TIMEOUT)
+
+
+CAMERAS: Registry[CameraKind] = Registry(
+    "kind of camera",
+    {"foxglove": CameraKind(_foxglove), **{kind: CameraKind(_video) for kind in _VIDEO}},
+    group="cdmisfa.sources",
+)
+"""What cameras' words begin with; `CAMERAS.add` and entry points `cdmisfa.sources` add others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +82,7 @@ def is_live(word: str) -> bool:
     scheme = word.partition(":")[0].lower()
     if scheme in ("http", "https"):
         return urlsplit(word).path.lower().endswith(_STREAMED)
-    return ":" in word and scheme in SCHEMES
+    return ":" in word and (scheme == "gym" or scheme in CAMERAS)
 
 
 def open_live(
@@ -82,7 +114,8 @@ def open_live(
             )
         tasks = [word.removeprefix("gym:") for word in words]
         return GymSource(tasks, names=names, size=options.size, fps=options.rate, seed=options.seed)
-    cameras = [_camera(word, name) for word, name in zip(words, names, strict=True)]
+    kinds = [CAMERAS[word.partition(":")[0].lower()] for word in words]
+    cameras = [kind.open(*named) for kind, *named in zip(kinds, words, names, strict=True)]
     height, width = options.size
     inbox = Readers(
         cameras,
@@ -114,13 +147,3 @@ def stream_names(words: Sequence[str]) -> tuple[str, ...]:
         taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
         names.append(f"{plain}-{taken + 1}" if taken else plain)
     return tuple(names)
-
-
-def _camera(word: str, name: str) -> Camera:
-    if word.startswith("foxglove:"):
-        from recorder.cameras.foxglove import FoxgloveCamera
-
-        return FoxgloveCamera(word, name, timeout=_TIMEOUT)
-    from recorder.cameras.video import video_camera
-
-    return video_camera(word, name, timeout=_TIMEOUT)

@@ -1,4 +1,4 @@
-"""The scenes there are, opened by name; `SCENES.add` adds another."""
+"""The scenes there are, opened by name; others are added by `SCENES.add` and by plugins."""
 
 from __future__ import annotations
 
@@ -58,8 +58,9 @@ SCENES: Registry[Scene] = Registry(
         "icub": Scene(IcubConfig, IcubSource, "icub", scene_picture, ("pybullet", "icub-models")),
         "oscillatory": Scene(OscillatoryConfig, _open_oscillatory, "oscillatory"),
     },
+    group="cdmisfa.sources",
 )
-"""The live scenes."""
+"""The live scenes; `SCENES.add` and entry points `cdmisfa.sources` add others."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "replay.export.forms": "export",
+        "replay.export.forms": "FORMS Form export",
         "replay.export.tables": "export_signals",
         "replay.export.figures": "draw_figures",
         "replay.export.history": "read_history",

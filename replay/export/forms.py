@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.registry import Registry
 from recorder.log.whole import refuse_special, whole
 from replay.export.images import write_images
 from replay.export.lerobot import write_lerobot
@@ -14,11 +18,45 @@ from replay.export.tables import TABLES, export_signals
 from replay.export.videos import write_film, write_films
 from replay.inputs.opening import holds_run, open_to_look
 
-RECORDINGS = ("images", "mp4", "lerobot")
-"""What a recording can be written as."""
 
-FORMS = (*TABLES, *RECORDINGS)
-"""What can be written."""
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form in which other programs read what was logged.
+
+    Attributes:
+        of: what is written so: the signals of a "run", or the frames of a "recording".
+        write: writes a run's folder, or an open source of frames, to a path that does not exist,
+            as a file or a folder, and returns how many there are of `unit`. It takes the word
+            `lossless` where `lossy` is set.
+        unit: what is counted.
+        lossy: whether it may lose a little of what was logged.
+    """
+
+    of: Literal["run", "recording"]
+    write: Callable[..., int]
+    unit: str
+    lossy: bool = False
+
+
+def _table(form: str) -> Form:
+    return Form("run", partial(export_signals, form=form), "iterations")
+
+
+_RECORDINGS = {
+    "images": Form("recording", write_images, "images"),
+    "mp4": Form("recording", write_films, "frames", lossy=True),
+    "lerobot": Form("recording", write_lerobot, "frames", lossy=True),
+}
+
+FORMS: Registry[Form] = Registry(
+    "form",
+    {
+        **{form: _table(form) for form in TABLES},
+        **_RECORDINGS,
+    },
+    group="cdmisfa.exports",
+)
+"""Every form; `FORMS.add` and entry points `cdmisfa.exports` add others."""
 
 WRITTEN = frozenset({".png", ".mp4", ".parquet", ".json", ".md"})
 """Endings of the files that exports of recordings write; a folder with others is not theirs."""
@@ -36,7 +74,7 @@ def export(
     """Write a run's signals, or a recording's frames, in another form.
 
     Args:
-        path: a run; for a form of `RECORDINGS` a recording, or camera logs.
+        path: a run; for a form of recordings a recording, or camera logs.
         out: the file; for those forms the folder, or for one view's video a file *.mp4.
         form: one of `FORMS`; see `export_signals`.
         force: replace an existing file, or an earlier export in a folder.
@@ -53,20 +91,25 @@ def export(
         CdmisfaError: the file cannot be written.
     """
     if form not in FORMS:
-        raise UsageError(f"no form {form!r}: choose one of {', '.join(FORMS)} with --to")
-    if lossless and form not in ("mp4", "lerobot"):
-        raise UsageError(f"{form} loses nothing: --lossless is for mp4 and lerobot")
+        raise UsageError(f"no form {form!r}: choose one of {', '.join(FORMS.names())} with --to")
+    described = FORMS[form]
+    if lossless and not described.lossy:
+        lossy = " and ".join(name for name, other in FORMS.items() if other.lossy)
+        raise UsageError(f"{form} loses nothing: --lossless is for {lossy}")
     if out.exists() and not force:
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     refuse_special(out)
     paths = [path] if isinstance(path, Path) else list(path)
-    if form in RECORDINGS:
+    if described.of == "recording":
         return _export_recording(paths, out, form, lossless, rate)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
     if len(paths) > 1:
         raise UsageError(f"signals are of one run, {len(paths)} were named")
-    return export_signals(paths[0], out, form, force=force)
+    if form in TABLES:  # one of them is two files
+        return described.write(paths[0], out, force=force)
+    with whole(out) as place:
+        return described.write(paths[0], place)
 
 
 def _export_recording(
@@ -76,7 +119,7 @@ def _export_recording(
     if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
     with contextlib.closing(open_to_look(paths, rate)) as source:
-        if form != "lerobot" and not source.spec.images:
+        if form in ("images", "mp4") and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():
             if len(source.spec.streams) > 1:
@@ -85,13 +128,13 @@ def _export_recording(
                 write_film(source, 0, film, lossless=lossless)
             return source.frames
         _refuse_others(out)
-        with whole(out) as folder:
-            folder.mkdir()
+        options: dict[str, Any] = {"lossless": lossless} if FORMS[form].lossy else {}
+        with whole(out) as place:
+            if form in _RECORDINGS:
+                place.mkdir()
             if form == "lerobot":
-                return write_lerobot(source, folder, name=out.name, lossless=lossless)
-            if form == "mp4":
-                return write_films(source, folder, lossless=lossless)
-            return write_images(source, folder)
+                options["name"] = out.name
+            return FORMS[form].write(source, place, **options)
 
 
 def _refuse_others(out: Path) -> None:

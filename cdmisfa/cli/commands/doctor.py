@@ -6,7 +6,7 @@ import importlib.util
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from typing import Any
@@ -14,6 +14,9 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.plugins import GROUPS, find, plugins
+from cdmisfa.core.registry import Registry
 
 PACKAGES = ("numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
 """Packages that no command can do without for long."""
@@ -26,6 +29,7 @@ EXTRAS = {
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo"), "streams of the arena"),
     "sklearn": (("sklearn",), "the transformer for scikit-learn"),
+    "testing": (("pytest",), "the contract tests of cdmisfa.testing"),
     "dask": (("distributed",), "sweep and reproduce --engine dask"),
 }
 """Optional parts of the package: the modules they bring, and what needs them."""
@@ -81,6 +85,32 @@ def _extras() -> Iterator[Check]:
         yield Check(f"extra {extra}", has, detail, needed_for)
 
 
+def _plugins() -> Iterator[Check]:
+    try:
+        from cdmisfa.agents.learners import LEARNERS
+        from recorder.cameras.words import CAMERAS
+        from recorder.world.scenes import SCENES
+        from replay.export.forms import FORMS
+    except ImportError:  # `_packages` says which package is missing
+        return
+    registries: Mapping[str, tuple[Registry[Any], ...]] = {
+        "cdmisfa.sources": (SCENES, CAMERAS),
+        "cdmisfa.learners": (LEARNERS,),
+        "cdmisfa.exports": (FORMS,),
+    }
+    for group, needed_for in GROUPS.items():
+        for plugin in plugins(group):
+            ok, detail = False, f"{plugin}, which is never used: cdmisfa has its own"
+            if not any(plugin.name in registry.first for registry in registries[group]):
+                try:
+                    find(group, plugin.name)
+                    plugin.load(*(registry.entry_class for registry in registries[group]))
+                    ok, detail = True, str(plugin)
+                except UsageError as error:
+                    detail = str(error)
+            yield Check(f"plugin {plugin.name}", ok, detail, needed_for)
+
+
 def _simulator() -> Iterator[Check]:
     for name, module in (("pybullet", "pybullet"), ("icub-models", "icub_models")):
         if importlib.util.find_spec(module) is not None:
@@ -127,6 +157,7 @@ LOOKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _python,
     _packages,
     _extras,
+    _plugins,
     _simulator,
     _kernel_cache,
     _vulkan,

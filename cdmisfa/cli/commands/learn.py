@@ -44,7 +44,7 @@ TICK = 0.1
 @click.option(
     "--algorithm",
     metavar="NAME",
-    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}. "
+    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
 )
 @click.option(

@@ -107,8 +107,9 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["parquet", "npz", "csv", "arrow", "images", "mp4", "lerobot"]),
-    help="Form; by default what the file's name ends in.",
+    metavar="FORM",
+    help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
+    "file's name ends in.",
 )
 @options.out("The file to write, for a recording the folder.", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
@@ -132,7 +133,7 @@ def export_command(
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
     camera logs of others, several at once, too.
     """
-    from replay.export.forms import RECORDINGS, export
+    from replay.export.forms import FORMS, export
     from replay.export.tables import CSV_LEAVES_OUT
 
     if str(out) == "-":
@@ -154,8 +155,7 @@ def export_command(
             }
         )
         return
-    kind = "iterations" if form not in RECORDINGS else "images" if form == "images" else "frames"
-    click.echo(f"{rows} {kind} written to {out}")
+    click.echo(f"{rows} {FORMS[form].unit} written to {out}")
 
 
 @click.command("signals")

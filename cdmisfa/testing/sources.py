@@ -1,15 +1,16 @@
 """What every `FrameSource` promises, as tests: say what to open.
 
-`ForwardContract` is for all sources, `SourceContract` for those that can go back, too.
+`ForwardContract` is for all sources, `SourceContract` for those that can go back, too:
 
-class TestOscillatory(SourceContract):
-def open(self) -> SeekableSource:
-return OscillatorySource()
+    class TestOscillatory(SourceContract):
+        def open(self) -> SeekableSource:
+            return OscillatorySource()
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -42,7 +43,8 @@ class ForwardContract:
         raise NotImplementedError
 
     @pytest.fixture
-    def source(self):  # type: ignore[no-untyped-def]
+    def source(self) -> Iterator[FrameSource]:
+        """A fresh source, closed afterwards."""
         source = self.open()
         yield source
         source.close()

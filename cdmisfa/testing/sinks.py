@@ -1,8 +1,8 @@
-"""What every `Sink` promises, as tests: import `SinkContract` and say what to open.
+"""What every `Sink` promises, as tests: say what to open.
 
 class TestDigest(SinkContract):
-    def open(self, folder, source, learner) -> Sink:
-        return Digest()
+def open(self, folder, source, learner) -> Sink:
+return Digest()
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,8 @@ CONFIG = LearnerConfig(
 )
 """Saves its first module at iteration 8."""
 
+Opened = tuple[OscillatorySource, CuriousLearner, Sink]
+
 
 class SinkContract:
     """The tests; a subclass opens a fresh sink for a run in `open`."""
@@ -33,19 +36,21 @@ class SinkContract:
         raise NotImplementedError
 
     @pytest.fixture
-    def opened(self, tmp_path: Path) -> Iterator[tuple[OscillatorySource, CuriousLearner, Sink]]:
+    def opened(self, tmp_path: Path) -> Iterator[Opened]:
+        """A source, a learner for it, and a sink for their run."""
         source = OscillatorySource()
         learner = CuriousLearner(CONFIG, source.spec, seed=3)
         sink = self.open(tmp_path, source, learner)
-        with sink if hasattr(sink, "__exit__") else contextlib.nullcontext():
+        context: Any = sink if hasattr(sink, "__exit__") else contextlib.nullcontext()
+        with context:
             yield source, learner, sink
         if hasattr(sink, "abandon"):  # a log whose run did not finish it
             sink.abandon()
 
-    def test_it_is_a_sink(self, opened) -> None:
+    def test_it_is_a_sink(self, opened: Opened) -> None:
         assert isinstance(opened[2], Sink)
 
-    def test_it_changes_nothing_of_a_run(self, opened) -> None:
+    def test_it_changes_nothing_of_a_run(self, opened: Opened) -> None:
         source, learner, sink = opened
         digest, alone = Digest(), Digest()
         learn(source, learner, (sink, digest), max_iterations=20, max_modules=9)
@@ -58,11 +63,11 @@ class SinkContract:
         for name, array in expected.arrays.items():
             assert state.arrays[name].tobytes() == array.tobytes(), name
 
-    def test_it_takes_a_run_without_blocks(self, opened) -> None:
+    def test_it_takes_a_run_without_blocks(self, opened: Opened) -> None:
         source, learner, sink = opened
         assert learn(source, learner, (sink,), max_iterations=0) == "max_iterations"
 
-    def test_it_takes_events_of_every_level(self, opened) -> None:
+    def test_it_takes_events_of_every_level(self, opened: Opened) -> None:
         source, learner, sink = opened
         signals = learner.step(block := source.take(learner.stream, learner.tau))
         sink.block(block, signals, learner)

@@ -1,0 +1,18 @@
+"""What each interface promises, as tests for pytest: derive a class, and say what to open."""
+
+import pytest
+
+from cdmisfa.core.faces import face
+
+_CONTRACTS = {
+    "cdmisfa.testing.cameras": "CameraContract",
+    "cdmisfa.testing.exports": "FormContract",
+    "cdmisfa.testing.features": "FeatureContract",
+    "cdmisfa.testing.learners": "LearnerContract",
+    "cdmisfa.testing.sinks": "SinkContract",
+    "cdmisfa.testing.sources": "ForwardContract SourceContract same",
+}
+
+pytest.register_assert_rewrite(*_CONTRACTS)
+
+__getattr__, __dir__, __all__ = face(__name__, _CONTRACTS)

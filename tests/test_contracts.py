@@ -1,0 +1,76 @@
+"""The contracts that plugins are held to hold for what is built in.
+
+Those of sources and sinks are derived from where these are tested.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from cdmisfa.agents.blank import signals_of_block
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.learning import Learner
+from cdmisfa.core.signals import SIGNALS, values
+from cdmisfa.features.feature import Feature
+from cdmisfa.features.incsfa.abstraction import IncSFA
+from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
+from recorder.cameras.camera import Camera
+from recorder.cameras.words import CAMERAS
+from recorder.world.oscillatory import OscillatorySource
+from replay.export.forms import FORMS
+
+
+class TestCurious(LearnerContract):
+    def open(self, spec: SourceSpec, seed: int) -> Learner:
+        return open_learner(LearnerConfig(warm_up=3, eta_dot_window=4, delta=1.0), spec, seed)
+
+
+class TestCuriousOfTheFirstVersion(LearnerContract):
+    def open(self, spec: SourceSpec, seed: int) -> Learner:
+        return open_learner(LearnerConfig(algorithm="1.0", warm_up=3), spec, seed)
+
+
+class TestProgress(LearnerContract):
+    def open(self, spec: SourceSpec, seed: int) -> Learner:
+        return open_learner(ProgressConfig(), spec, seed)
+
+
+class TestIncSFA(FeatureContract):
+    def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
+        return IncSFA(config, n_inputs, rng)
+
+
+class TestVideo(CameraContract):
+    @pytest.fixture(autouse=True)
+    def _pyav(self) -> None:
+        pytest.importorskip("av")
+
+    def open(self) -> Camera:
+        return CAMERAS["av"].open("av:lavfi:testsrc=rate=100:size=64x48", "bars")
+
+
+class TestParquet(FormContract):
+    form = FORMS["parquet"]
+
+
+class TestLerobot(FormContract):
+    form = FORMS["lerobot"]
+    options: ClassVar = {"name": "robot"}
+
+
+def test_signals_that_are_not_said_do_not_exist() -> None:
+    source = OscillatorySource()
+    block: Block = source.take(1, 5)
+    record = signals_of_block(block, source.spec, 7, outputs=2, modules=3, reward=0.5)
+    assert (record.iteration, record.t, record.stream, record.reward) == (7, 0, 1, 0.5)
+    assert record.y_frozen.shape == (3, 5, 2)
+    floats = [array for signal, array in values(record) if signal.dtype == "float64"]
+    assert sum(np.isfinite(array).all() for array in floats if array.size) == 1
+    assert {field.name for field in dataclasses.fields(record)} == set(SIGNALS)

@@ -1,0 +1,199 @@
+"""Parts of other packages: found by name, loaded when needed, refused in words."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa, Outcome
+from PIL import Image
+
+from cdmisfa.agents.learners import LEARNERS
+from cdmisfa.core.errors import UsageError
+from cdmisfa.core.registry import Registry
+from recorder.cameras.words import CAMERAS
+from recorder.world.scenes import SCENES
+from replay.export.forms import FORMS
+
+ROOT = Path(__file__).parents[1]
+TOY = ROOT / "tests" / "toy_plugin"
+NAMES: tuple[tuple[Registry[object], tuple[str, ...]], ...] = (
+    (SCENES, ("swings",)),
+    (CAMERAS, ("bars",)),
+    (LEARNERS, ("watcher", "broken")),
+    (FORMS, ("contact", "rewards", "images")),
+)
+
+
+def install(folder: Path, name: str, version: str, groups: dict[str, dict[str, str]]) -> None:
+    """What pip leaves of a package in an environment, its modules aside."""
+    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    lines = [
+        f"[{group}]\n" + "".join(f"{key} = {place}\n" for key, place in entries.items())
+        for group, entries in groups.items()
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+
+
+@pytest.fixture
+def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of packages with the toy in it, as its pyproject.toml says."""
+    folder = tmp_path / "packages"
+    folder.mkdir()
+    (folder / "cdmisfa_toy").symlink_to(TOY / "cdmisfa_toy")
+    project = tomllib.loads((TOY / "pyproject.toml").read_text())["project"]
+    install(folder, project["name"], project["version"], project["entry-points"])
+    monkeypatch.syspath_prepend(folder)
+    before = [dict(registry) for registry, _ in NAMES]
+    yield folder
+    for (registry, _), known in zip(NAMES, before, strict=True):
+        for name in set(registry) - set(known):
+            registry.remove(name)
+    for module in [name for name in sys.modules if name.startswith("cdmisfa_toy")]:
+        del sys.modules[module]
+
+
+@pytest.mark.usefixtures("environment")
+def test_nothing_of_a_plugin_is_imported_before_it_is_asked_for(cdmisfa: Cdmisfa) -> None:
+    assert "watcher" in LEARNERS
+    assert "watcher" not in list(LEARNERS)
+    assert cdmisfa("learn", "oscillatory", "--max-iterations", 1).code == 0
+    assert not [name for name in sys.modules if name.startswith("cdmisfa_toy")]
+    assert LEARNERS["watcher"].configuration.__name__ == "WatcherConfig"
+    assert list(LEARNERS)[-1] == "watcher"
+    hint = cdmisfa("learn", "oscillatory", "--algorithm", "wacher").err
+    assert "did you mean watcher?" in hint
+
+
+@pytest.mark.usefixtures("environment")
+def test_a_plugins_scene_is_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    rec, words = tmp_path / "rec", ("--max-iterations", 6, "--seed", 2, "--no-rerun", "--json")
+    done = cdmisfa("record", "swings", "-o", rec, "--frames", 200, "--seed", 2, "--json")
+    assert [view["name"] for view in done.json["views"]] == ["quick", "slow"], done.err
+    live = cdmisfa("learn", "swings", *words, "-o", tmp_path / "live")
+    recorded = cdmisfa("learn", rec, *words)
+    assert live.json["signals_sha256"] == recorded.json["signals_sha256"]
+    assert '"cdmisfa-toy": "1.2"' in (tmp_path / "live" / "run.json").read_text()
+
+
+@pytest.mark.usefixtures("environment")
+def test_a_plugins_camera_is_recorded(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    done = cdmisfa("record", "bars:20", "bars:20", "-o", tmp_path / "rec", "--json")
+    assert [view["name"] for view in done.json["views"]] == ["20", "20-2"]
+    assert done.err.count(": 20 pictures;") == 2
+    refused = cdmisfa("record", "bars:many", "-o", tmp_path / "other")
+    assert (refused.code, refused.err.count("\n")) == (2, 1)
+    assert "say how many pictures" in refused.err
+
+
+@pytest.mark.usefixtures("environment")
+def test_a_plugins_learner_learns_and_goes_on_where_it_was(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    words = ("learn", "oscillatory", "--algorithm", "watcher", "--no-rerun", "--json")
+    words = (*words, "--set", "learner.patience=9")
+    whole = cdmisfa(*words, "-o", tmp_path / "whole").json
+    assert (whole["iterations"], whole["ended"]) == (9, "nothing_left")
+    cdmisfa(*words, "-o", tmp_path / "parts", "--max-iterations", 4, "--keyframes", 2)
+    resumed = cdmisfa(*words, "-o", tmp_path / "parts", "--resume").json
+    assert resumed["signals_sha256"] == whole["signals_sha256"]
+
+
+@pytest.mark.usefixtures("environment")
+def test_plugins_exports_are_written(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run.rewards"  # the form is what the name ends in
+    done = cdmisfa("export", oscillatory_run, "-o", out)
+    assert done.out == f"15 rewards written to {out}\n"
+    assert len(out.read_text().splitlines()) == 15
+    picture = tmp_path / "all.png"
+    icub = [ROOT / "sample_logs" / "icub" / f"{name}.mcap" for name in ("left", "right")]
+    done = cdmisfa("export", *icub, "--to", "contact", "-o", picture)
+    assert (done.code, done.out) == (0, f"2 views written to {picture}\n")
+    with Image.open(picture) as shown:
+        width, height = shown.size
+    assert height * 2.5 > width  # one above the other
+
+
+def test_the_page_shows_what_is_in_the_toy() -> None:
+    page = (ROOT / "docs" / "plugins.md").read_text("utf-8")
+    files = [*TOY.rglob("*.py"), TOY / "pyproject.toml"]
+    code = "\n".join(file.read_text("utf-8") for file in files)
+    shown = re.findall(r"^```\w+\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert len(shown) == 6
+    assert [block for block in shown if block not in code] == []
+
+
+def checks(done: Outcome) -> dict[str, tuple[bool, str]]:
+    rows = done.json["checks"]
+    return {r["what"]: (r["ok"], r["detail"]) for r in rows if r["what"].startswith("plugin ")}
+
+
+def test_doctor_lists_plugins_and_says_why_one_fails(cdmisfa: Cdmisfa, environment: Path) -> None:
+    (environment / "cdmisfa_toy_too.py").write_text("import no_such_package\n")
+    install(
+        environment,
+        "toy-too",
+        "0.1",
+        {
+            "cdmisfa.learners": {"broken": "cdmisfa_toy_too:LEARNER", "2.0": "cdmisfa_toy_too:X"},
+            "cdmisfa.exports": {"kind": "cdmisfa_toy.camera:BARS"},
+        },
+    )
+    other = environment / "other"
+    other.mkdir()
+    install(other, "toy-three", "3", {"cdmisfa.learners": {"broken": "cdmisfa_toy_too:X"}})
+    sys.path.insert(0, str(other))
+    try:
+        with pytest.raises(UsageError, match=r"both .* of toy-three 3 and .* uninstall one"):
+            LEARNERS["broken"]
+    finally:
+        sys.path.remove(str(other))
+    done = cdmisfa("doctor", "--json")
+    assert done.code == 0
+    why = "broken is cdmisfa_toy_too:LEARNER of toy-too 0.1, which fails to load: "
+    why += "ModuleNotFoundError: No module named 'no_such_package'"
+    kind = "kind is cdmisfa_toy.camera:BARS of toy-too 0.1"
+    assert checks(done) == {
+        "plugin bars": (True, "cdmisfa_toy.camera:BARS of cdmisfa-toy 1.2"),
+        "plugin swings": (True, "cdmisfa_toy.scene:SWINGS of cdmisfa-toy 1.2"),
+        "plugin watcher": (True, "cdmisfa_toy.learner:WATCHER of cdmisfa-toy 1.2"),
+        "plugin contact": (True, "cdmisfa_toy.export:CONTACT of cdmisfa-toy 1.2"),
+        "plugin rewards": (True, "cdmisfa_toy.export:REWARDS of cdmisfa-toy 1.2"),
+        "plugin broken": (False, why),
+        "plugin 2.0": (
+            False,
+            "cdmisfa_toy_too:X of toy-too 0.1, which is never used: cdmisfa has its own",
+        ),
+        "plugin kind": (False, f"{kind}, which is a CameraKind: a Form is needed here"),
+    }
+    failed = cdmisfa("learn", "oscillatory", "--algorithm", "broken")
+    assert (failed.code, failed.err) == (2, f"cdmisfa: {why}\n")
+    assert "a Scene is needed here" in cdmisfa("learn", "bars").err
+    assert "a CameraKind is needed here" in cdmisfa("learn", "swings:1").err
+
+
+def test_the_toys_own_tests_pass_with_the_contracts(environment: Path) -> None:
+    shutil.copytree(TOY / "tests", environment / "toy_tests")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "toy_tests"],
+        env={**os.environ, "PYTHONPATH": f"{environment}:{ROOT}"},
+        cwd=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
+    assert "skipped" not in done.stdout

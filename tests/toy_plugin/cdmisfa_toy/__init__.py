@@ -1,0 +1,1 @@
+"""A plugin of each kind, as small as they can be."""
