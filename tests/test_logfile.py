@@ -167,7 +167,7 @@ class FullDisk:
 
 def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch):
     disk = FullDisk(tmp_path / "a.mcap.partial", 40_000)
-    monkeypatch.setattr("recorder.log.logfile.open", lambda *_: disk, raising=False)
+    monkeypatch.setattr("recorder.log.appended.open", lambda *_: disk, raising=False)
     log, channel = open_log(tmp_path / "a.mcap", force=True, compression="none")
 
     def fill() -> None:

@@ -1,22 +1,33 @@
-"""However many parts a recording has, only a few of their files are open at once."""
+"""However many parts and views a recording has, few of their files are open at once."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import hashlib
+import os
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
+from cdmisfa.core.errors import LogDamagedError, LogWriteError
+from recorder.log import appended
+from recorder.log.appended import AppendedFile
+from recorder.log.folder import held
+from recorder.log.logfile import LogFile
 from recorder.log.split import Split
-from recorder.recording import record_scene
+from recorder.recording import record, record_scene
 from replay.recordings.source import RecordedSource
 from replay.storage import store
 from replay.storage.store import FileStore
 
+HERE = Path(__file__).parent
 LIMIT = 64
 FRAMES = 1250
 
@@ -95,3 +106,127 @@ def test_a_closed_file_stays_closed(files: list[Path]) -> None:
     one.close()
     with pytest.raises(ValueError, match="is closed"):
         one.read(0, 1)
+
+
+# Files that are written
+
+
+class ManyViews(ClockedSource):
+    """More streams than files may be open."""
+
+    def __init__(self, count: int) -> None:
+        names = tuple(f"v{i:04d}" for i in range(count))
+        self._spec = SourceSpec(names, (2,), "float64", (), 25.0, 0, 100)
+
+    def take(self, stream: int, n: int) -> Block:
+        check_request(self._spec, stream, n)
+        values = np.arange(self._t, self._t + n, dtype=np.float64)
+        self._t += n
+        frames = freeze(np.stack([values, np.full(n, float(stream))], axis=1))
+        return Block(stream, self._t - n, frames, freeze(np.zeros((n, 0))))
+
+    def describe(self) -> dict[str, object]:
+        return {"kind": "many"}
+
+
+def checksums(folder: Path) -> list[str]:
+    return [hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())]
+
+
+def test_the_bytes_are_the_same_however_few_files_are_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(ManyViews(5), tmp_path / "open")
+    monkeypatch.setattr(appended, "OPEN_FILES", 2)
+    record(ManyViews(5), tmp_path / "closed")
+    assert checksums(tmp_path / "closed") == checksums(tmp_path / "open")
+    assert len(checksums(tmp_path / "open")) == 5
+
+
+def test_more_views_than_files_may_be_open_are_recorded_learned_and_checked(
+    tmp_path: Path,
+) -> None:
+    record_them = (
+        "from test_open_files import ManyViews\n"
+        "from recorder.recording import record\n"
+        f"record(ManyViews({2 * LIMIT}), 'rec')\n"
+    )
+    for command in (
+        ["-c", record_them],
+        ["-m", "cdmisfa", "info", "rec"],
+        ["-m", "cdmisfa", "verify", "rec"],
+        ["-m", "cdmisfa", "learn", "rec", "--max-iterations", "1", "--set", "learner.tau=20"],
+    ):
+        done = subprocess.run(
+            [sys.executable, *command],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(HERE)])},
+            capture_output=True,
+            text=True,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (LIMIT, LIMIT)),
+        )
+        assert done.returncode == 0, (command, done.stderr[-600:])
+
+
+@pytest.fixture
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[AppendedFile]:
+    """A file that was closed while another one is written."""
+    monkeypatch.setattr(appended, "OPEN_FILES", 1)
+    file, other = AppendedFile(tmp_path / "a"), AppendedFile(tmp_path / "b")
+    file.write(b"first")
+    other.write(b"other")
+    assert (tmp_path / "a").read_bytes() == b"first"
+    yield file
+    file.close()
+    other.close()
+
+
+def test_a_closed_file_goes_on_where_it_was(tmp_path: Path, written: AppendedFile) -> None:
+    assert written.tell() == 5
+    written.write(b", second")
+    assert written.tell() == 13
+    written.sync()
+    assert (tmp_path / "a").read_bytes() == b"first, second"
+
+
+@pytest.mark.parametrize("change", ["longer", "another", "gone", "held"])
+def test_what_others_did_to_a_closed_file_is_an_error_once_and_for_all(
+    tmp_path: Path, written: AppendedFile, change: str
+) -> None:
+    path = tmp_path / "a"
+    with contextlib.ExitStack() as stack:
+        if change == "longer":
+            path.write_bytes(b"firstly")
+        elif change == "another":
+            path.rename(tmp_path / "c")
+            path.write_bytes(b"first")
+        elif change == "gone":
+            path.unlink()
+        else:
+            fcntl.flock(stack.enter_context(path.open("rb")), fcntl.LOCK_EX)
+        with pytest.raises(LogWriteError, match=r"another process|No such file") as first:
+            written.write(b"second")
+    for attempt in (written.flush, lambda: written.write(b"third")):
+        with pytest.raises(LogWriteError) as again:
+            attempt()
+        assert str(again.value) == str(first.value)
+    assert not path.exists() or path.read_bytes() in (b"first", b"firstly")
+
+
+def test_nobody_overwrites_what_a_recorder_has_closed(tmp_path: Path) -> None:
+    """Its folder is held, whichever of its files are open."""
+    (tmp_path / "a.mcap.partial").write_bytes(b"first")
+    overwrite = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from recorder.log.logfile import LogFile\n"
+        "LogFile(Path(sys.argv[1]), force=True).finish()\n"
+    )
+    command = [sys.executable, "-c", overwrite, str(tmp_path / "a.mcap")]
+    with held(tmp_path):
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert "is in use by another process" in done.stderr
+        LogFile(tmp_path / "b.mcap").finish()
+        LogFile(tmp_path / "b.mcap", force=True).finish()
+    assert (tmp_path / "a.mcap.partial").read_bytes() == b"first"
+    assert subprocess.run(command).returncode == 0

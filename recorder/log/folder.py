@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.whole import make_folder, refuse_special
@@ -17,6 +18,9 @@ RECORDING = "recording.json"
 
 Beside the logs, because these hold the same bytes whatever length was wanted first.
 """
+
+_HELD: Final[set[tuple[int, int]]] = set()
+"""Folders that this process holds."""
 
 _LOG = re.compile(r".+\.mcap(\.partial(\.kept)?)?")
 
@@ -41,9 +45,31 @@ def held(folder: Path) -> Iterator[None]:
             ) from error
         except OSError:
             pass  # A file system without locks: nothing can be held there.
-        yield
+        _HELD.add(_which(handle))
+        try:
+            yield
+        finally:
+            _HELD.discard(_which(handle))
     finally:
         os.close(handle)
+
+
+def refuse_held(folder: Path) -> None:
+    """Refuse to replace what is being written where another process holds the folder.
+
+    It writes many files, and has not all of them open.
+
+    Raises:
+        UsageError: so it is.
+    """
+    if _which(folder) not in _HELD:
+        with held(folder):
+            pass
+
+
+def _which(folder: Path | int) -> tuple[int, int]:
+    found = os.stat(folder)
+    return found.st_dev, found.st_ino
 
 
 def folder_here(place: str | Path) -> Path:

@@ -8,7 +8,6 @@ signal, kill -9, a full disk; after a power cut up to the last `sync`.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import math
 import os
 import time
@@ -20,6 +19,8 @@ from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
+from recorder.log.appended import AppendedFile, write_error
+from recorder.log.folder import refuse_held
 from recorder.log.whole import partial_path, refuse_special, refuse_taken, to_disk
 
 FLUSH_NS = 1_000_000_000
@@ -82,12 +83,14 @@ class LogFile:
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         refuse_taken(self.path, force=force)
         refuse_special(self.partial)
-        if self.partial.exists() and not force:
-            raise UsageError(
-                f"{self.partial} is left from a writing that was cut short: "
-                "recover or remove it, or overwrite with --force"
-            )
-        self._stream = _LatchedStream(self.partial)
+        if self.partial.exists():
+            if not force:
+                raise UsageError(
+                    f"{self.partial} is left from a writing that was cut short: "
+                    "recover or remove it, or overwrite with --force"
+                )
+            refuse_held(self.partial.parent)
+        self._stream = AppendedFile(self.partial)
         self._writer = Writer(
             self._stream,  # type: ignore[arg-type]
             chunk_size=chunk_size,
@@ -224,7 +227,7 @@ class LogFile:
         try:
             yield
         except OSError as error:
-            raise _write_error(self.path, error) from error
+            raise write_error(self.path, error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -234,93 +237,3 @@ class LogFile:
             self.abandon()
         elif not self.closed:
             self.finish()
-
-
-class _LatchedStream:
-    """A binary file that, once a write failed, refuses every later one.
-
-    The MCAP writer would go on after a failed write, and the log would have a hole in it.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._error: OSError | None = None
-        try:
-            self._file = open(path, "ab")  # noqa: SIM115 - open until `close`
-            try:
-                self._hold()
-                self._file.seek(0)
-                if self._stat().st_size:
-                    self._file.truncate()
-            except BaseException:
-                self._file.close()
-                raise
-        except OSError as error:
-            raise _write_error(path, error) from error
-
-    def _hold(self) -> None:
-        """Keep other processes from writing the file, until it is closed, too."""
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if not isinstance(error, BlockingIOError):
-                return  # a file system without locks: nothing can be held there
-            raise self._in_use() from error
-        if not (self._path.exists() and os.path.samestat(os.stat(self._path), self._stat())):
-            raise self._in_use()
-
-    def _stat(self) -> os.stat_result:
-        return os.fstat(self._file.fileno())
-
-    def _in_use(self) -> UsageError:
-        return UsageError(
-            f"{self._path} is being written by another process: wait for it, or choose another name"
-        )
-
-    @property
-    def closed(self) -> bool:
-        return self._file.closed
-
-    def check(self) -> None:
-        if self._error is not None:
-            raise _write_error(self._path, self._error) from self._error
-        if self._file.closed:
-            raise LogWriteError(f"{self._path}: this log is closed, nothing more can be written")
-
-    def write(self, data: bytes) -> int:
-        with self._latching():
-            return self._file.write(data)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def flush(self) -> None:
-        with self._latching():
-            self._file.flush()
-
-    def sync(self) -> None:
-        with self._latching():
-            self._file.flush()
-            os.fsync(self._file.fileno())
-
-    def close(self) -> None:
-        # Closing flushes again; an error in it is the one already told.
-        with contextlib.suppress(OSError):
-            self._file.close()
-
-    @contextlib.contextmanager
-    def _latching(self) -> Iterator[None]:
-        self.check()
-        try:
-            yield
-        except OSError as error:
-            self._error = error
-            self.close()
-            raise _write_error(self._path, error) from error
-
-
-def _write_error(path: Path, error: OSError) -> LogWriteError:
-    return LogWriteError(
-        f"{path} cannot be written: {error.strerror or error}; "
-        "check the free space and rights there, what was flushed is readable"
-    )
