@@ -21,11 +21,11 @@ from cdmisfa.experiments.convert import convert
 from cdmisfa.testing.sources import SourceContract
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError
-from replay.camera_logs.alignment import between
 from replay.camera_logs.framing import FRAME_PIXELS, default_size, fitted
 from replay.camera_logs.options import Align, Fit
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
+from replay.stored import in_laps, outside
 
 STEP_MS = 20
 PAUSED = (*range(0, 2000, STEP_MS), *range(5000, 9000, STEP_MS))
@@ -107,7 +107,7 @@ def test_stretches_are_the_frames_outside_gaps(gaps: np.ndarray, start: int, len
     period = int(gaps[-1]) + 3
     missing = {f for a, b in pairs for f in range(a, b)}
     wanted = [f for f in range(start, start + length) if f % period not in missing]
-    found = between(pairs, period, start, start + length)
+    found = in_laps(outside(pairs, period), 0, period, start, start + length)
     assert [f for low, high in found for f in range(low, high)] == wanted
     assert all(a[1] < b[0] for a, b in itertools.pairwise(found))
 
@@ -172,10 +172,11 @@ def test_a_conversion_keeps_its_clock_and_has_the_gaps_of_its_logs(
     assert done.json["frames"] == 300
     assert coverage(rec) == {"cam": [(0, 100), (250, 450)]}
     assert cdmisfa("verify", rec).code == 0
-    options = ["--set", "learner.tau=30", "--json", "--max-iterations", "8"]
-    runs = [cdmisfa("learn", path, *options) for path in (log, rec)]
-    assert [run.code for run in runs] == [0, 0]
-    assert runs[0].json["signals_sha256"] == runs[1].json["signals_sha256"]
+    options = ["--set", "learner.tau=30", "--json", "--max-iterations"]
+    for words in (["8"], ["30", "--loop"]):
+        runs = [cdmisfa("learn", path, *options, *words) for path in (log, rec)]
+        assert [run.code for run in runs] == [0, 0]
+        assert runs[0].json["signals_sha256"] == runs[1].json["signals_sha256"]
 
 
 def test_a_conversion_can_show_the_last_image_in_a_gap(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

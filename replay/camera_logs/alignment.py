@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS, times_of
 from cdmisfa.core.errors import UsageError
+from replay.stored import Span
 
 MAX_FRAMES: Final = 2**31
 """Most frames that streams are aligned to."""
@@ -25,11 +26,7 @@ Rows = NDArray[np.int64]
 """Which image of a stream each frame shows, (frames,)."""
 
 
-Gap = tuple[int, int]
-"""Frames [start, stop) in which a stream has no image, and shows the last before."""
-
-
-def counts(times: Times, rows: Rows, gaps: Sequence[Gap] = ()) -> dict[str, int]:
+def counts(times: Times, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
     """Images of a stream, frames that show one again, and images that no frame shows.
 
     Frames within gaps are not counted.
@@ -110,7 +107,7 @@ def missing(times: Times) -> int:
     return int(np.maximum(np.round(np.diff(times) / step) - 1, 0).sum())
 
 
-def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows], list[Gap]]:
+def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows], list[Span]]:
     """Put frames that show the last image again where all streams pause together.
 
     Args:
@@ -134,7 +131,7 @@ def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows
     return [stream[shows] for stream in rows], gaps
 
 
-def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Gap]:
+def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Span]:
     """The frames in which a stream that is aligned by time pauses.
 
     Args:
@@ -154,27 +151,7 @@ def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Gap]
     return found
 
 
-def between(gaps: Sequence[Gap], period: int, start: int, stop: int) -> list[tuple[int, int]]:
-    """The stretches [low, high) of the frames [start, stop) that lie between gaps.
-
-    Args:
-        gaps: in their order.
-        period: frames after which they come again.
-        start: the first frame.
-        stop: the frame after the last.
-    """
-    found: list[tuple[int, int]] = []
-    low = start
-    for lap in range(start // period, (stop - 1) // period + 1) if gaps else ():
-        for begins, ends in gaps:
-            high = min(begins + lap * period, stop)
-            if low < high:
-                found.append((low, high))
-            low = max(low, ends + lap * period)
-    return [*found, (low, stop)] if low < stop else found
-
-
-def in_words(gaps: Sequence[Gap], fps: float) -> str:
+def in_words(gaps: Sequence[Span], fps: float) -> str:
     """How many gaps there are, how long the longest is, and when it begins."""
     start, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
     many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"

@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
-from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.pixels import Depth, MalformedImage
 from replay.camera_logs.alignment import (
-    Gap,
     Rows,
-    between,
     by_index,
     by_time,
     counts,
@@ -38,13 +36,14 @@ from replay.camera_logs.options import Align, Fit, Gaps
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
+from replay.stored import Span, StoredSource, outside
 
 
 class UnequalError(UsageError):
     """Streams that are on no common clock unless they are aligned."""
 
 
-class ForeignSource(ClockedSource):
+class ForeignSource(StoredSource):
     """Cameras in MCAP logs, ROS bags, videos and folders of pictures, gray and small, on one clock.
 
     Args:
@@ -144,6 +143,7 @@ class ForeignSource(ClockedSource):
         )
         self.pauses = dict(zip(names, self._gaps, strict=True))
         self.gaps = gaps == "skip" and any(self._gaps)
+        self._held = [outside(own, self._count) for own in self._gaps]
         self.shapes = {
             name: self._shape(size) for name, size in zip(names, self._sizes, strict=True)
         }
@@ -151,87 +151,9 @@ class ForeignSource(ClockedSource):
         warnings += [self._said_of_gaps(stream) for stream, own in enumerate(self._gaps) if own]
         self.warnings = tuple(dict.fromkeys(warnings))
 
-    @property
-    def frames(self) -> int:
-        """Frames that every stream has."""
-        return self._count
-
-    @property
-    def first_frame(self) -> int:
-        """Number of the first frame."""
-        return 0
-
     def scene(self) -> Mapping[str, str]:
         """What was recorded: nobody says."""
         return {}
-
-    def take(self, stream: int, n: int) -> Block:
-        """The n frames that a stream shows at t .. t+n-1; moves t by n.
-
-        Of a stream with gaps the next n that follow one another; moves t behind them.
-
-        Raises:
-            LogExhaustedError: fewer than n frames are left; t stays.
-            LogDamagedError: a message is no image; t stays.
-            UsageError: an image is smaller than a frame; t stays.
-            ValueError: no such stream, or n < 1.
-        """
-        check_request(self._spec, stream, n)
-        t = self._unbroken(stream, n)
-        frames = np.empty((n, *self._spec.frame_shape), np.uint8)
-        rows = self._rows[stream]
-        for i in range(n):
-            frames[i] = self._frame(stream, int(rows[(t + i) % self._count]))
-        self._t = t + n
-        return Block(stream, t, freeze(frames), freeze(np.empty((n, 0))))
-
-    def take_all(self, n: int) -> tuple[Block, ...]:
-        """What every stream shows in the next n frames; with gaps each unbroken stretch."""
-        if not self.gaps:
-            return super().take_all(n)
-        check_request(self._spec, 0, n)
-        start, stop, blocks = self._t, self._t + n, []
-        if not self._loop and stop > self._count:
-            raise self._exhausted(n)
-        for stream in range(len(self._spec.streams)):
-            for low, high in self.spans(stream, start, stop):
-                self._t = low
-                blocks.append(self.take(stream, high - low))
-        self._t = stop
-        return tuple(blocks)
-
-    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
-        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
-        return between(self._gaps[stream] if self.gaps else [], self._count, start, stop)
-
-    def _unbroken(self, stream: int, n: int) -> int:
-        """Where the next n frames of a stream begin that follow one another."""
-        if not self.gaps and (self._loop or self._t + n <= self._count):
-            return self._t
-        # Looping, a stretch that holds them is in the rest of this lap or in the next two.
-        end = self._t + 3 * self._count if self._loop else self._count
-        for low, high in self.spans(stream, self._t, end):
-            if high - low >= n:
-                return low
-        raise self._exhausted(n)
-
-    def _exhausted(self, n: int) -> LogExhaustedError:
-        unbroken = " without a gap" if self.gaps else ""
-        return LogExhaustedError(
-            f"{self._files[0]}: {max(self._count - self._t, 0)} frames are left at frame "
-            f"{self._t}, {n} are needed{unbroken}; begin again at the end with --loop"
-        )
-
-    def seek(self, t: int) -> None:
-        """Move the clock to frame t.
-
-        Raises:
-            LogExhaustedError: the logs end before it.
-            ValueError: t is below 0.
-        """
-        if not self._loop and t > self._count:
-            raise LogExhaustedError(f"{self._files[0]}: it ends at frame {self._count}, before {t}")
-        super().seek(t)
 
     def describe(self) -> Mapping[str, Any]:
         """The logs with their SHA-256, the topics, and how they became frames.
@@ -287,6 +209,17 @@ class ForeignSource(ClockedSource):
         for stream in self._streams:
             stream.close()
 
+    def _block(self, stream: int, t: int, n: int) -> Block:
+        """The frames of a stream; an image smaller than a frame is a UsageError."""
+        frames = np.empty((n, *self._spec.frame_shape), np.uint8)
+        rows = self._rows[stream]
+        for i in range(n):
+            frames[i] = self._frame(stream, int(rows[(t + i) % self._count]))
+        return Block(stream, t, freeze(frames), freeze(np.empty((n, 0))))
+
+    def _name(self) -> str:
+        return str(self._files[0])
+
     def _frame(self, stream: int, row: int) -> Bytes:
         """A stream's image as a frame; decoded once where it is repeated."""
         shown = self._shown.get(stream)
@@ -329,7 +262,7 @@ class ForeignSource(ClockedSource):
             f"{size[1]}x{size[0]}; each is made a frame of {self._size[1]}x{self._size[0]}"
         )
 
-    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Gap]]]:
+    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Span]]]:
         """When frame 0 is, which image of each stream every frame shows, and each one's gaps."""
         first = self._times[0]
         if align == "time":

@@ -13,14 +13,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, ClockedSource, check_request, freeze
-from cdmisfa.core.errors import LogDamagedError, LogExhaustedError
+from cdmisfa.core.blocks import Block, freeze
+from cdmisfa.core.errors import LogDamagedError
 from recorder.log.whole import PARTIAL
 from replay.mcap.identity import identity
 from replay.mcap.reader import LogReader
 from replay.recordings.view_file import ViewFile, intersection
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url
+from replay.stored import StoredSource, joined
 
 CACHE_BYTES: Final = 1024 * 1024
 """Decoded chunks that are kept of each view; one always is.
@@ -34,7 +35,7 @@ _SCENE: Final = ("scene", "seed", "config_sha256")
 _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *_SCENE)
 
 
-class RecordedSource(ClockedSource):
+class RecordedSource(StoredSource):
     """The views of a recording on their common clock.
 
     Args:
@@ -48,6 +49,8 @@ class RecordedSource(ClockedSource):
         gaps: whether the recording is of live streams, which may lack frames.
         warnings: what the user should know: files that were cut, frames left out.
     """
+
+    more = "record more frames, or "
 
     def __init__(
         self,
@@ -117,109 +120,9 @@ class RecordedSource(ClockedSource):
         self._set_clock()
         return True
 
-    @property
-    def frames(self) -> int:
-        """Frames that every view has."""
-        return self._count
-
-    @property
-    def first_frame(self) -> int:
-        """Number of the first frame that every view has."""
-        return self._first
-
     def coverage(self) -> dict[str, list[tuple[int, int]]]:
         """The frames that are there of each view, as ranges [start, stop)."""
         return {p[0].facts.view: [r for view in p for r in view.ranges] for p in self._views}
-
-    def take(self, stream: int, n: int) -> Block:
-        """The n frames that a view shows at t .. t+n-1; moves t by n.
-
-        Of live streams, which have gaps, the next n that follow one another; moves t behind them.
-
-        Raises:
-            LogExhaustedError: fewer than n frames are left; t stays.
-            LogDamagedError: a chunk is damaged; t stays.
-            ValueError: no such stream, or n < 1.
-        """
-        check_request(self._spec, stream, n)
-        start = self._unbroken(stream, n)
-        played = start - self._first
-        frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
-        truth = np.empty((n, len(self._spec.truth)))
-        at = 0
-        while at < n:
-            view, frame, count = self._place(stream, (played + at) % self._count, n - at)
-            view.take(frame, frames[at : at + count], truth[at : at + count])
-            at += count
-        self._t = start + n
-        return Block(stream, start, freeze(frames), freeze(truth))
-
-    def take_all(self, n: int) -> tuple[Block, ...]:
-        """What every view shows in the next n frames; of live streams each unbroken stretch."""
-        if not self.gaps:
-            return super().take_all(n)
-        check_request(self._spec, 0, n)
-        start, stop = self._t, self._t + n
-        if not self._loop and stop > self._first + self._count:
-            raise self._exhausted(n)
-        blocks = []
-        for stream in range(len(self._spec.streams)):
-            for low, high in self.spans(stream, start, stop):
-                self._t = low
-                blocks.append(self.take(stream, high - low))
-        self._t = stop
-        return tuple(blocks)
-
-    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
-        """The unbroken stretches [low, high) that a view shows of the frames [start, stop)."""
-        if not self.gaps:
-            return [(start, stop)]
-        laps = range(
-            (start - self._first) // self._count, (stop - 1 - self._first) // self._count + 1
-        )
-        there = [
-            (low + lap * self._count, high + lap * self._count)
-            for lap in laps
-            for low, high in self._held[stream]
-        ]
-        return intersection(there, [(start, stop)])
-
-    def _unbroken(self, stream: int, n: int) -> int:
-        """Where the next n frames of a view begin that follow one another."""
-        end = self._first + self._count
-        if not self.gaps:
-            if self._loop or self._t + n <= end:
-                return self._t
-            raise self._exhausted(n)
-        # Looping, a stretch that holds them is in the rest of this lap or in the next one.
-        end = self._t + 2 * self._count if self._loop else end
-        for low, high in self.spans(stream, self._t, max(end, self._t + 1)):
-            if high - low >= n:
-                return low
-        raise self._exhausted(n)
-
-    def _exhausted(self, n: int) -> LogExhaustedError:
-        left = self._first + self._count - self._t
-        return LogExhaustedError(
-            f"{self._name()}: {left} frames are left at frame {self._t}, "
-            f"{n} are needed; record more frames, or begin again at its end with --loop"
-        )
-
-    def seek(self, t: int) -> None:
-        """Move the clock to frame t.
-
-        Raises:
-            LogExhaustedError: the recording ends before it.
-            ValueError: t lies before the recording's first frame.
-        """
-        if t < self._first:
-            raise ValueError(f"frame {t} lies before the recording's first, {self._first}")
-        if not self._loop and t > self._first + self._count:
-            raise LogExhaustedError(
-                f"{self._name()}: it ends at frame {self._first + self._count}, before frame {t}; "
-                "begin again at its end with --loop"
-            )
-        self._t = t
 
     def describe(self) -> Mapping[str, Any]:
         """The recording's views with the SHA-256 of their files, and what was recorded.
@@ -259,6 +162,16 @@ class RecordedSource(ClockedSource):
         for view in self._all():
             view.close()
 
+    def _block(self, stream: int, t: int, n: int) -> Block:
+        frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
+        truth = np.empty((n, len(self._spec.truth)))
+        at, played = 0, t - self._first
+        while at < n:
+            view, frame, count = self._place(stream, (played + at) % self._count, n - at)
+            view.take(frame, frames[at : at + count], truth[at : at + count])
+            at += count
+        return Block(stream, t, freeze(frames), freeze(truth))
+
     def _described(self, identify: Callable[[ViewFile], dict[str, Any]]) -> list[dict[str, Any]]:
         return [{"name": v.facts.view, "frames": v.count, **identify(v)} for v in self._all()]
 
@@ -273,12 +186,12 @@ class RecordedSource(ClockedSource):
         """Find the frames that every view has, whole."""
         coverage = self.coverage()
         covered = list(coverage.values())
-        self._held = [_joined(ranges) for ranges in covered]
+        self._held = [joined(ranges) for ranges in covered]
         self.gaps = self._views[0][0].facts.gaps
         common = self._whole() if self.gaps else functools.reduce(intersection, covered)
         if not common:
             raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
-        self._ranges = _joined(common)
+        self._ranges = joined(common)
         lengths = (stop - start for start, stop in self._ranges)
         self._range_starts = list(itertools.accumulate(lengths, initial=0))
         self._first = self._ranges[0][0]
@@ -359,14 +272,3 @@ def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
                 )
         arranged.append(parts)
     return arranged
-
-
-def _joined(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Sorted ranges with those that touch made one."""
-    found: list[tuple[int, int]] = []
-    for start, stop in ranges:
-        if found and found[-1][1] == start:
-            found[-1] = (found[-1][0], stop)
-        else:
-            found.append((start, stop))
-    return found

@@ -1,0 +1,159 @@
+"""Frames that are kept, in a recording or in logs of others: so many, with gaps or without."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import ClassVar
+
+from cdmisfa.core.blocks import Block, ClockedSource, check_request
+from cdmisfa.core.errors import LogExhaustedError
+
+Span = tuple[int, int]
+"""The frames [start, stop)."""
+
+
+class StoredSource(ClockedSource):
+    """A source of frames that are kept: all of them once, or looped, lap after lap.
+
+    A class that derives from it sets `_spec`, `gaps` and, with gaps, `_held`, and has `describe`.
+
+    Attributes:
+        more: what else than to begin again can be done where there are too few frames, in words.
+    """
+
+    more: ClassVar[str] = ""
+    _loop: bool
+    _first: int = 0
+    _count: int
+    _held: Sequence[Sequence[Span]]
+    """The frames that each stream has of the first lap."""
+
+    @property
+    def frames(self) -> int:
+        """How many there are of every stream, those of gaps included."""
+        return self._count
+
+    @property
+    def first_frame(self) -> int:
+        """Number of the first frame."""
+        return self._first
+
+    def take(self, stream: int, n: int) -> Block:
+        """The n frames that a stream shows at t .. t+n-1; moves t by n.
+
+        With gaps the next n that follow one another; moves t behind them.
+
+        Raises:
+            LogExhaustedError: fewer than n frames are left; t stays.
+            LogDamagedError: what is kept is damaged; t stays.
+            ValueError: no such stream, or n < 1.
+        """
+        check_request(self._spec, stream, n)
+        block = self._block(stream, self._unbroken(stream, n), n)
+        self._t = block.t + n
+        return block
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """What every stream shows in the next n frames, a block for each unbroken stretch.
+
+        Raises:
+            LogExhaustedError: fewer than n frames are left; t stays.
+            LogDamagedError: what is kept is damaged; t stays.
+            ValueError: n < 1.
+        """
+        check_request(self._spec, 0, n)
+        stop = self._t + n
+        if not self._loop and stop > self._first + self._count:
+            raise self._exhausted(n)
+        blocks = tuple(
+            self._block(stream, low, high - low)
+            for stream in range(len(self._spec.streams))
+            for low, high in self.spans(stream, self._t, stop)
+        )
+        self._t = stop
+        return blocks
+
+    def spans(self, stream: int, start: int, stop: int) -> list[Span]:
+        """The unbroken stretches [low, high) that a stream shows of the frames [start, stop)."""
+        if not self.gaps:
+            return [(start, stop)]
+        return in_laps(self._held[stream], self._first, self._count, start, stop)
+
+    def seek(self, t: int) -> None:
+        """Move the clock to frame t.
+
+        Raises:
+            LogExhaustedError: the frames end before it.
+            ValueError: t lies before the first frame.
+        """
+        if t < self._first:
+            raise ValueError(f"frame {t} lies before the first, {self._first}")
+        end = self._first + self._count
+        if not self._loop and t > end:
+            raise LogExhaustedError(
+                f"{self._name()}: it ends at frame {end}, before frame {t}; begin again at its end "
+                "with --loop"
+            )
+        self._t = t
+
+    @abstractmethod
+    def _block(self, stream: int, t: int, n: int) -> Block:
+        """The frames [t, t + n) of a stream, none of a gap; their numbers may be of a later lap."""
+
+    @abstractmethod
+    def _name(self) -> str:
+        """How an error names what is read."""
+
+    def _unbroken(self, stream: int, n: int) -> int:
+        """Where the next n frames of a stream begin that follow one another."""
+        # Looping, a stretch that holds them is in the rest of this lap or in the next two.
+        end = self._t + 3 * self._count + n if self._loop else self._first + self._count
+        for low, high in self.spans(stream, self._t, end):
+            if high - low >= n:
+                return low
+        raise self._exhausted(n)
+
+    def _exhausted(self, n: int) -> LogExhaustedError:
+        left = max(self._first + self._count - self._t, 0)
+        unbroken = " without a gap" if self.gaps else ""
+        return LogExhaustedError(
+            f"{self._name()}: {left} frames are left at frame {self._t}, {n} are needed{unbroken}; "
+            f"{self.more}begin again at its end with --loop"
+        )
+
+
+def joined(spans: Iterable[Span]) -> list[Span]:
+    """Spans in their order, with those that touch made one."""
+    found: list[Span] = []
+    for start, stop in spans:
+        if found and found[-1][1] == start:
+            found[-1] = (found[-1][0], stop)
+        else:
+            found.append((start, stop))
+    return found
+
+
+def outside(gaps: Iterable[Span], count: int) -> list[Span]:
+    """The spans of the frames [0, count) that lie between gaps, which are in their order."""
+    ends = [0, *(end for gap in gaps for end in gap), count]
+    return [(low, high) for low, high in zip(ends[::2], ends[1::2], strict=True) if low < high]
+
+
+def in_laps(held: Sequence[Span], first: int, count: int, start: int, stop: int) -> list[Span]:
+    """The unbroken stretches of the frames [start, stop) where the same come in every lap.
+
+    Args:
+        held: the frames that are there of the first lap.
+        first: the first frame.
+        count: frames of a lap.
+        start: the first frame that is wanted.
+        stop: the frame after the last.
+    """
+    laps = range((start - first) // count, (stop - 1 - first) // count + 1)
+    there = (
+        (max(low + lap * count, start), min(high + lap * count, stop))
+        for lap in laps
+        for low, high in held
+    )
+    return joined((low, high) for low, high in there if low < high)
