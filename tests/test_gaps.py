@@ -19,10 +19,10 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.experiments.convert import convert
 from cdmisfa.testing.sources import SourceContract
+from recorder.images.framing import FRAME_PIXELS, Fit, default_size, fitted
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError
-from replay.camera_logs.framing import FRAME_PIXELS, default_size, fitted
-from replay.camera_logs.options import Align, Fit
+from replay.camera_logs.options import Align
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 from replay.stored import in_laps, outside

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from recorder.images.framing import Fit, Size
+from recorder.images.pixels import Depth
+
 Align = Literal["index", "time"]
-Fit = Literal["crop", "pad", "stretch"]
 Gaps = Literal["skip", "hold"]
 
 
@@ -29,11 +31,11 @@ class CameraOptions:
     """
 
     topics: tuple[str, ...] = ()
-    size: tuple[int, int] | None = None
+    size: Size | None = None
     align: Align | None = None
     rate: float | None = None
     fit: Fit = "crop"
     gaps: Gaps = "skip"
     start: float = 0.0
     stop: float | None = None
-    depth: tuple[float, float] | None = None
+    depth: Depth | None = None

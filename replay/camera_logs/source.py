@@ -12,6 +12,7 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.framing import Fit, Framing, Size, default_size, size_of
 from recorder.images.pixels import Depth, MalformedImage
 from replay.camera_logs.alignment import (
     Rows,
@@ -28,11 +29,10 @@ from replay.camera_logs.alignment import (
     with_gaps,
 )
 from replay.camera_logs.catalogue import named_streams
-from replay.camera_logs.framing import Size, cut_or_added, default_size, fitted
 from replay.camera_logs.joined import excerpts, join_parts, known_times
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
-from replay.camera_logs.options import Align, Fit, Gaps
+from replay.camera_logs.options import Align, Gaps
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.storage.location import Location, Url
@@ -81,7 +81,7 @@ class ForeignSource(StoredSource):
         paths: str | Location | Sequence[str | Location],
         topics: Sequence[str] = (),
         *,
-        size: tuple[int, int] | None = None,
+        size: Size | None = None,
         fit: Fit = "crop",
         align: Align | None = None,
         gaps: Gaps = "skip",
@@ -128,8 +128,8 @@ class ForeignSource(StoredSource):
                 self._times = known_times(self._streams, self._fps)
             start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
-            self._sizes = [_size_of(image) for image in firsts]
-            self._size = size or default_size(self._sizes[0])
+            size = size or default_size(size_of(firsts[0]))
+            self._framings = [Framing(size_of(image), size, fit) for image in firsts]
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
         except BaseException:
@@ -137,16 +137,14 @@ class ForeignSource(StoredSource):
             raise
         self._count = len(self._rows[0])
         names, length = stream_names(self._streams), None if loop else self._count
-        self._spec = SourceSpec(names, self._size, "uint8", (), self._fps, start_ns, length)
+        self._spec = SourceSpec(names, size, "uint8", (), self._fps, start_ns, length)
         self.alignment = dict(
             zip(names, map(counts, self._times, self._rows, self._gaps), strict=True)
         )
         self.pauses = dict(zip(names, self._gaps, strict=True))
         self.gaps = gaps == "skip" and any(self._gaps)
         self._held = [outside(own, self._count) for own in self._gaps]
-        self.shapes = {
-            name: self._shape(size) for name, size in zip(names, self._sizes, strict=True)
-        }
+        self.shapes = dict(zip(names, map(str, self._framings), strict=True))
         warnings = [w for s in self._streams for w in s.warnings]
         warnings += [self._said_of_gaps(stream) for stream, own in enumerate(self._gaps) if own]
         self.warnings = tuple(dict.fromkeys(warnings))
@@ -199,7 +197,7 @@ class ForeignSource(StoredSource):
         if any(self._gaps):
             chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
-        if any(cut_or_added(size, self._size, self._fit) for size in self._sizes):
+        if any(framing.lossy for framing in self._framings):
             chosen["fit"] = self._fit
         if self._depth is not None:
             chosen["range_metres"] = list(self._depth)
@@ -226,21 +224,15 @@ class ForeignSource(StoredSource):
         if shown is not None and shown[0] == row:
             return shown[1]
         image = self._image(stream, row)
-        changed = _size_of(image) != self._sizes[stream]
-        if changed:
-            self._say_change(stream, row, _size_of(image))
+        framing = self._framings[stream]
+        if stream not in self.changes and (change := framing.change(image)):
+            self.changes[stream] = f"{self._streams[stream].where(row)}: {change}"
         try:
-            frame = fitted(image, self._size, self._fit, enlarge=changed)
+            frame = framing.frame(image)
         except UsageError as error:
             raise UsageError(f"{self._streams[stream].path}: {error}") from None
         self._shown[stream] = (row, frame)
         return frame
-
-    def _shape(self, size: Size) -> str:
-        words = [f"{size[1]}x{size[0]}", cut_or_added(size, self._size, self._fit)]
-        if size != self._size:
-            words.append(f"shown as {self._size[1]}x{self._size[0]}")
-        return ", ".join(filter(None, words))
 
     def _image(self, stream: int, row: int) -> Bytes:
         """A stream's image as it is."""
@@ -251,16 +243,6 @@ class ForeignSource(StoredSource):
             raise LogDamagedError(f"{images.where(row)}: {error}") from None
         except UsageError as error:
             raise UsageError(f"{images.path}: {error}") from None
-
-    def _say_change(self, stream: int, row: int, size: Size) -> None:
-        """Note once that a stream has images of another size than its first."""
-        if stream in self.changes:
-            return
-        before = self._sizes[stream]
-        self.changes[stream] = (
-            f"{self._streams[stream].where(row)}: images change from {before[1]}x{before[0]} to "
-            f"{size[1]}x{size[0]}; each is made a frame of {self._size[1]}x{self._size[0]}"
-        )
 
     def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Span]]]:
         """When frame 0 is, which image of each stream every frame shows, and each one's gaps."""
@@ -316,10 +298,6 @@ class ForeignSource(StoredSource):
             words += ["--fit", self._fit]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
-
-
-def _size_of(image: Bytes) -> Size:
-    return image.shape[0], image.shape[1]
 
 
 def _rate(streams: Sequence[ImageStream]) -> float:

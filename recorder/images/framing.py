@@ -2,19 +2,67 @@
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 
-from recorder.images.pixels import shrink
-from replay.camera_logs.options import Fit
-from replay.mcap.records import Bytes
+from recorder.images.pixels import Bytes, shrink
+
+Fit = Literal["crop", "pad", "stretch"]
+"""How an image of another ratio of the sides becomes a frame: see `fitted`."""
 
 FRAME_PIXELS: Final = 48 * 128
 """Most pixels of a frame where no size is given: those of the paper's."""
 
 Size = tuple[int, int]
 """(height, width) in pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Framing:
+    """How the images of one stream become frames.
+
+    Attributes:
+        first: size of its first image.
+        size: of a frame.
+        fit: see `fitted`.
+    """
+
+    first: Size
+    size: Size
+    fit: Fit
+
+    def frame(self, image: Bytes) -> Bytes:
+        """Make an image a frame; one of another size than the first may be smaller than a frame.
+
+        Raises:
+            UsageError: the image is smaller, as the first is.
+        """
+        return fitted(image, self.size, self.fit, enlarge=size_of(image) != self.first)
+
+    def change(self, image: Bytes) -> str:
+        """What the user should know of an image of another size; "" of one like the first."""
+        size = size_of(image)
+        if size == self.first:
+            return ""
+        before, now, frame = map(_in_words, (self.first, size, self.size))
+        return f"images change from {before} to {now}; each is made a frame of {frame}"
+
+    @property
+    def lossy(self) -> str:
+        """What a frame lacks of an image, or has besides it; see `cut_or_added`."""
+        return cut_or_added(self.first, self.size, self.fit)
+
+    def __str__(self) -> str:
+        """How an image becomes a frame, in words."""
+        shown = "" if self.first == self.size else f"shown as {_in_words(self.size)}"
+        return ", ".join(filter(None, [_in_words(self.first), self.lossy, shown]))
+
+
+def size_of(image: Bytes) -> Size:
+    """The size of an image, (height, width)."""
+    return image.shape[0], image.shape[1]
 
 
 def default_size(image: Size) -> Size:
@@ -42,10 +90,10 @@ def fitted(image: Bytes, size: Size, fit: Fit, *, enlarge: bool = False) -> Byte
     if image.shape == size:
         return image
     if fit == "crop":
-        image = _middle(image, _largest_within((image.shape[0], image.shape[1]), size))
+        image = _middle(image, _largest_within(size_of(image), size))
     if fit != "pad":
         return shrink(image, *size, enlarge=enlarge)
-    inner = _largest_within(size, (image.shape[0], image.shape[1]))
+    inner = _largest_within(size, size_of(image))
     frame = np.zeros(size, np.uint8)
     _middle(frame, inner)[:] = shrink(image, *inner, enlarge=enlarge)
     return frame
@@ -60,6 +108,10 @@ def cut_or_added(image: Size, size: Size, fit: Fit) -> str:
     if (height, width) == size:
         return ""
     return f"padded from {width}x{height}" if fit == "pad" else "stretched"
+
+
+def _in_words(size: Size) -> str:
+    return f"{size[1]}x{size[0]}"
 
 
 def _largest_within(outer: Size, ratio: Size) -> Size:
