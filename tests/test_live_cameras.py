@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
 from cdmisfa.testing.sources import same
+from recorder.cameras.framed import framed
 from recorder.cameras.live import LiveSource
 from recorder.cameras.readers import Readers
 from recorder.cameras.video import Steady
@@ -44,7 +45,7 @@ def steady(stream: int, start: float, count: int, fps: float = FPS) -> list[Arri
 def opened(script: Sequence[Arrival], streams: int = 1, **options: Any) -> LiveSource:
     names = ("left", "right", "third")[:streams]
     rate = options.pop("states", FPS)
-    return LiveSource(ScriptedInbox(script, streams, rate), names, {}, size=SHAPE, **options)
+    return LiveSource(ScriptedInbox(script, streams, rate), names, {}, **options)
 
 
 def values(source: FrameSource, n: int) -> list[tuple[int, int, list[int]]]:
@@ -133,7 +134,7 @@ def test_the_rate_is_stated_or_measured_or_asked_for() -> None:
 def test_a_camera_that_shows_nothing_is_named() -> None:
     inbox = ScriptedInbox([*steady(0, 0, 3000), Arrival(99, 1, flat(0))], 2)
     with pytest.raises(UsageError, match="right shows no picture"):
-        LiveSource(inbox, ("left", "right"), {}, size=SHAPE)
+        LiveSource(inbox, ("left", "right"), {})
     assert inbox.closed
 
 
@@ -212,13 +213,13 @@ class Cameras:
     def __init__(self, count: int = 2, **options: Any) -> None:
         self.said: list[str] = []
         self.hands = [Hand(name) for name in ("left", "right")[:count]]
-        self.inbox = Readers(self.hands, lambda image: image, say=self.said.append, **options)
+        self.inbox = Readers(self.hands, say=self.said.append, **options)
 
     def source(self) -> LiveSource:
         for hand in self.hands:
             hand.give(flat(0))
         names = [hand.name for hand in self.hands]
-        return LiveSource(self.inbox, names, {}, size=SHAPE)
+        return LiveSource(self.inbox, names, {})
 
     def close(self, source: LiveSource) -> None:
         for hand in self.hands:
@@ -315,7 +316,45 @@ def test_a_camera_that_cannot_be_opened_is_no_loss_but_an_error() -> None:
     cameras = Cameras(1)
     cameras.hands[0].give(CdmisfaError("rtsp://nowhere cannot be opened"))
     with pytest.raises(UsageError, match="rtsp://nowhere cannot be opened"):
-        LiveSource(cameras.inbox, ["left"], {}, size=SHAPE)
+        LiveSource(cameras.inbox, ["left"], {})
+
+
+def test_images_of_all_cameras_become_frames_of_the_first_ones_size() -> None:
+    hands, said = [Hand("left"), Hand("right")], list[str]()
+    left, right = (camera.pictures() for camera in framed(hands, None, "crop", say=said.append))
+    image = np.arange(96 * 128).reshape(96, 128).astype(np.uint8)
+    half = image[::2, ::2]
+    hands[0].give(image, half)
+    frames = [next(left)[1] for _ in range(2)]
+    assert [frame.shape for frame in frames] == [(48, 64)] * 2
+    np.testing.assert_array_equal(frames[1], half)
+    hands[1].give(image[24:72])
+    np.testing.assert_array_equal(next(right)[1], image[24:72, 32:96])
+    hands[1].give(half[:24, :32])  # of another size than its first, it may be smaller
+    assert next(right)[1].shape == (48, 64)
+    assert said == [
+        "left: 128x96, shown as 64x48",
+        "left: images change from 128x96 to 64x48; each is made a frame of 64x48",
+        "right: 128x48, cropped to 64x48, shown as 64x48",
+        "right: images change from 128x48 to 32x24; each is made a frame of 64x48",
+    ]
+    hands[0].give(half[:24, :32])
+    with pytest.raises(UsageError, match="left: an image of 32x24 is smaller than 64x48"):
+        next(framed(hands, (48, 64), "crop")[0].pictures())
+
+
+def test_images_before_the_size_is_known_are_passed_over() -> None:
+    first = Hand("first")
+    first.give(flat(0))
+
+    class Early(Hand):
+        def pictures(self) -> Iterator[tuple[int, Any]]:
+            yield 0, flat(1)
+            next(cameras[0].pictures())
+            yield 0, flat(2)
+
+    cameras = framed([first, Early("early")], None, "crop")
+    np.testing.assert_array_equal([image for _, image in cameras[1].pictures()], [flat(2)])
 
 
 def test_a_full_queue_is_emptied_and_says_so() -> None:

@@ -165,6 +165,21 @@ def test_a_video_plays_at_its_own_pace_and_ends(cdmisfa: Cdmisfa, tmp_path: Path
         assert source.take(0, 20).frames[:, 0, 0].tolist() == list(range(20))
 
 
+@pytest.mark.parametrize(
+    ("word", "shape"), [(TEST, (60, 80)), ("gym:CartPole-v1", (57, 85))], ids=["camera", "task"]
+)
+def test_frames_keep_the_ratio_of_the_sides(word: str, shape: tuple[int, int]) -> None:
+    with contextlib.closing(open_live([word], LiveOptions())) as source:
+        assert source.spec.frame_shape == shape
+    wide = LiveOptions(size=(30, 80), fit="pad")
+    with contextlib.closing(open_live([word], wide)) as source:
+        frames = source.take(0, 3).frames
+        assert frames.shape == (3, 30, 80)
+        inner = frames[:, :, 20:60] if word == TEST else frames[:, :, 17:62]
+        assert frames.sum() == inner.sum() > 0
+        assert source.describe()["fit"] == "pad"
+
+
 class Motion(http.server.BaseHTTPRequestHandler):
     """A web camera: MJPEG without end, but each connection breaks after 20 pictures."""
 
@@ -295,6 +310,30 @@ def test_images_of_a_running_robot_are_recorded_and_learned_from(
         assert (np.diff(shown[:, 0, 0].astype(int)) % 256 <= 3).all()
 
 
+def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> None:
+    channel = RawImageChannel("/depth", context=robot.context)
+    data = np.tile(np.array([0, 1, 2, 3, 9], "<f4"), (4, 1)).tobytes()
+    image = RawImage(width=5, height=4, encoding="32FC1", step=20, data=data)
+    over = threading.Event()
+
+    def show() -> None:
+        while not over.wait(0.02):
+            channel.log(image)
+
+    thread = threading.Thread(target=show)
+    thread.start()
+    try:
+        words = [f"{robot.address}/depth"]
+        with contextlib.closing(open_live(words, LiveOptions(depth=(1, 3)))) as source:
+            assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
+            assert source.describe()["range_metres"] == [1, 3]
+        with pytest.raises(UsageError, match="say which to show, as --range"):
+            open_live(words, LiveOptions())
+    finally:
+        over.set()
+        thread.join()
+
+
 @pytest.mark.parametrize(
     ("topic", "why"),
     [
@@ -322,12 +361,22 @@ def test_a_topic_that_is_no_image_is_refused(
         (["learn", TEST, "gym:CartPole-v1"], "record each apart"),
         (["learn", TEST, "--loop"], "live streams cannot go back"),
         (["learn", TEST, "--resume", "-o", "run"], "learn from a recording of them"),
-        (["learn", TEST, "--topic", "/x"], "of live streams only --size and --rate"),
+        (
+            ["learn", TEST, "--topic", "/x"],
+            "of live streams only --size, --fit, --range and --rate",
+        ),
         (["learn", "oscillatory", "--record", "x"], "--record is for live streams"),
         (["record", TEST, "-o", "x", "--resume"], "leave out --resume"),
         (["convert", TEST, "-o", "x", "--resume"], "live streams cannot go back"),
         (["record", "icub", "oscillatory", "-o", "x"], "record one scene at a time"),
-        (["record", "icub", "--size", "32x24", "-o", "x"], "--size and --rate are for cameras"),
+        (
+            ["record", "icub", "--fit", "pad", "-o", "x"],
+            "--fit, --rate and --range are for cameras",
+        ),
+        (
+            ["record", "icub", "--size", "32x24", "-o", "x"],
+            "--size, --fit, --rate and --range are for cameras",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(

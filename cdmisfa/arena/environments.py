@@ -19,6 +19,7 @@ import numpy as np
 from cdmisfa.arena.pictures import HEIGHT, WIDTH, Rng, Shown, stateless
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.gym import make, picture, play
+from recorder.images.pixels import shrink
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "icub"
 """The recording that comes with the project."""
@@ -73,7 +74,7 @@ def _play(
     with contextlib.closing(environment):
         for t, seen in enumerate(islice(play(environment, rng, hold), n)):
             shown, state[t] = look(seen)
-            frames[t] = picture(shown, (HEIGHT, WIDTH))
+            frames[t] = shrink(picture(shown), HEIGHT, WIDTH)
     return Shown(frames, state, names)
 
 

@@ -36,7 +36,16 @@ size_option = click.option(
     callback=_height_and_width,
     metavar="WxH",
     help="Shrink camera images to this size; by default to what has their ratio of the sides "
-    "and no more pixels than 128x48, of live ones 128x48.",
+    "and no more pixels than 128x48.",
+)
+
+fit_option = click.option(
+    "--fit",
+    type=click.Choice(["crop", "pad", "stretch"]),
+    default="crop",
+    show_default=True,
+    help="Where images have another ratio of the sides than --size: cut two sides, put black "
+    "at them, or change the ratio.",
 )
 
 rate_option = click.option(
@@ -45,8 +54,6 @@ rate_option = click.option(
     metavar="HZ",
     help="Frames a second of cameras and logs; by default the first stream's.",
 )
-
-size_and_rate = options.together(size_option, rate_option)
 
 
 def _seconds(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
@@ -74,6 +81,17 @@ def _near_and_far(
     return float(found[1]), float(found[2])
 
 
+range_option = click.option(
+    "--range",
+    "depth",
+    callback=_near_and_far,
+    metavar="NEAR:FAR",
+    help="Show distances of depth cameras, in metres, from black to white.",
+)
+
+frame_options = options.together(size_option, fit_option, rate_option, range_option)
+"""How images of cameras, live or stored, become frames."""
+
 camera_options = options.together(
     click.option(
         "--topic",
@@ -84,14 +102,7 @@ camera_options = options.together(
         "'/cam*'; repeatable.",
     ),
     size_option,
-    click.option(
-        "--fit",
-        type=click.Choice(["crop", "pad", "stretch"]),
-        default="crop",
-        show_default=True,
-        help="Where images have another ratio of the sides than --size: cut two sides, put black "
-        "at them, or change the ratio.",
-    ),
+    fit_option,
     click.option(
         "--align",
         type=click.Choice(["index", "time"]),
@@ -118,13 +129,7 @@ camera_options = options.together(
     click.option(
         "--to", "stop", callback=_seconds, metavar="TIME", help="Leave out images from then on."
     ),
-    click.option(
-        "--range",
-        "depth",
-        callback=_near_and_far,
-        metavar="NEAR:FAR",
-        help="Show distances of depth cameras, in metres, from black to white.",
-    ),
+    range_option,
     click.option(
         "--dry-run",
         is_flag=True,

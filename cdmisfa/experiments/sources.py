@@ -235,7 +235,7 @@ def open_cameras_now(
     words: Sequence[str | Path],
     live: LiveOptions,
     *,
-    cameras: CameraOptions | None = None,
+    cameras: CameraOptions,
     preset: str | None = None,
     settings: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
@@ -246,7 +246,7 @@ def open_cameras_now(
     Args:
         words: a stream each.
         live: how they become frames; its seed is also that of the configuration.
-        cameras: their size and rate; what is of logs alone is refused.
+        cameras: how their images become frames; what is of logs alone is refused.
         preset: instead of that of cameras.
         settings: `section.key=value` words.
         say: told in a line when a camera's state changes.
@@ -264,10 +264,12 @@ def open_cameras_now(
             f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
             "and logs apart"
         )
-    cameras = cameras or CameraOptions()
-    if cameras != CameraOptions(size=cameras.size, rate=cameras.rate):
-        raise UsageError("of live streams only --size and --rate are set: leave out the others")
-    live = replace(live, size=cameras.size or live.size, rate=cameras.rate or live.rate)
+    framing = {key: getattr(cameras, key) for key in ("size", "fit", "depth", "rate")}
+    if cameras != CameraOptions(**framing):
+        raise UsageError(
+            "of live streams only --size, --fit, --range and --rate are set: leave out the others"
+        )
+    live = replace(live, **framing)
     source = open_live([str(word) for word in words], live, say=say, stop=stop)
     try:
         kind = scene_kind_for(source.spec, source.describe(), preset)

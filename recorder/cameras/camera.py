@@ -31,7 +31,10 @@ class Camera(Protocol):
 
     name: str
     finite: bool
-    rate: float | None
+
+    @property
+    def rate(self) -> float | None:
+        """See above."""
 
     def pictures(self) -> Iterator[tuple[int, Bytes]]:
         """Open it and give its images as they come, until it ends.

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from recorder.images.messages import Decoder, image_decoder
-from recorder.images.pixels import Bytes
+from recorder.images.pixels import Bytes, Depth
 
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Names of the protocol, the newer first."""
@@ -33,6 +33,7 @@ class FoxgloveCamera:
         word: foxglove://HOST:PORT/TOPIC; without a topic the only one of images.
         name: of the stream.
         timeout: seconds in which the server must answer and name the topic.
+        depth: how distances are shown; see `gray`.
 
     Raises:
         UsageError: the word is no such address, or websockets is missing.
@@ -41,8 +42,8 @@ class FoxgloveCamera:
     finite = False
     rate: float | None = None
 
-    def __init__(self, word: str, name: str, *, timeout: float) -> None:
-        self.name = name
+    def __init__(self, word: str, name: str, *, timeout: float, depth: Depth | None = None) -> None:
+        self.name, self._depth = name, depth
         place = urlsplit(word)
         if not place.netloc:
             raise UsageError(f"{word} names no server: write foxglove://HOST:8765/TOPIC")
@@ -98,16 +99,20 @@ class FoxgloveCamera:
                 break
             if told.get("op") == "advertise":
                 channels |= {str(c.get("topic")): c for c in told.get("channels", ())}
-            images = {topic: c for topic, c in channels.items() if _decoder(c) is not None}
+            images = {t: d for t, c in channels.items() if (d := self._decoder(c)) is not None}
             found = self._topic or (next(iter(images)) if len(images) == 1 else "")
             if found in images:
-                return int(images[found]["id"]), _decoder(images[found])  # type: ignore[return-value]
+                return int(channels[found]["id"]), images[found]
             if found in channels:
                 kind = channels[found].get("schemaName")
                 raise CdmisfaError(f"{self._where}{found} holds {kind}, which is no image")
-        known = ", ".join(sorted(t for t, c in channels.items() if _decoder(c))) or "nothing"
+        known = ", ".join(sorted(t for t, c in channels.items() if self._decoder(c))) or "nothing"
         what = f"has no topic {self._topic}" if self._topic else "has not one topic of images"
         raise CdmisfaError(f"{self._where} {what}: it has images on {known}")
+
+    def _decoder(self, channel: Mapping[str, Any]) -> Decoder | None:
+        schema, encoding = str(channel.get("schemaName")), str(channel.get("encoding"))
+        return image_decoder(schema, encoding, self._depth)
 
     @staticmethod
     def _is_gone(message: str, number: int) -> bool:
@@ -122,7 +127,3 @@ def _told(message: str | bytes) -> Mapping[str, Any]:
     except ValueError:
         told = {}
     return told if isinstance(told, dict) else {}
-
-
-def _decoder(channel: Mapping[str, Any]) -> Decoder | None:
-    return image_decoder(str(channel.get("schemaName")), str(channel.get("encoding")))

@@ -6,6 +6,7 @@ import importlib
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,8 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, one_line
 from recorder.cameras.stepped import Step, SteppedSource
-from recorder.images.pixels import FRAME_SIZE, RECIPE, Bytes, shrink
+from recorder.images.framing import Fit, Framing, Size, default_size, size_of
+from recorder.images.pixels import RECIPE, Bytes
 
 LARGEST_SEED: Final = 2**31 - 1
 
@@ -34,7 +36,8 @@ class GymSource(SteppedSource):
     Args:
         tasks: the environments' ids, or environments made with `render_mode="rgb_array"`.
         names: of the streams; by default the ids.
-        size: (height, width) of a frame.
+        size: (height, width) of a frame; by default `default_size` of the first's pictures.
+        fit: how pictures of another aspect ratio become frames: see `fitted`.
         fps: frames a second; by default as the first environment states.
         seed: of the environments and of random actions.
         policy: gives the action for an observation; by default actions are random.
@@ -49,7 +52,8 @@ class GymSource(SteppedSource):
         tasks: Sequence[Any],
         *,
         names: Sequence[str] | None = None,
-        size: tuple[int, int] = FRAME_SIZE,
+        size: Size | None = None,
+        fit: Fit = "crop",
         fps: float | None = None,
         seed: int = 0,
         policy: Policy | None = None,
@@ -59,7 +63,7 @@ class GymSource(SteppedSource):
         self._tasks = [str(getattr(e.spec, "id", e)) for e in self._environments]
         stated = self._environments[0].metadata.get("render_fps")
         numbered = [_numbers(e.observation_space) for e in self._environments]
-        self._size, self._seed, self._hold, self._random = size, seed, hold, policy is None
+        self._fit, self._seed, self._hold, self._random = fit, seed, hold, policy is None
         names = tuple(names or self._tasks)
         truth = tuple(
             f"{re.sub(r'[^0-9A-Za-z]', '_', name)}_{i}"
@@ -67,7 +71,6 @@ class GymSource(SteppedSource):
             for i in range(n)
         )
         fps = float(fps or stated or FPS)
-        spec = SourceSpec(names, size, "uint8", truth, fps, START_NS)
         played = [
             play(environment, np.random.default_rng([seed, number]), hold, policy)
             for number, environment in enumerate(self._environments)
@@ -75,10 +78,21 @@ class GymSource(SteppedSource):
 
         def step(seen: Sequence[Any]) -> Step:
             known = [np.ravel(o) for o, n in zip(seen, numbered, strict=True) if n]
-            frames = [picture(environment.render(), size) for environment in self._environments]
-            return frames, np.concatenate([*known, np.empty(0)]).astype(np.float64)
+            pictures = [picture(environment.render()) for environment in self._environments]
+            return pictures, np.concatenate([*known, np.empty(0)]).astype(np.float64)
 
-        super().__init__(spec, map(step, zip(*played, strict=True)))
+        steps = map(step, zip(*played, strict=True))
+        first = next(steps)
+        sizes = [size_of(picture) for picture in first[0]]
+        size = size or default_size(sizes[0])
+        framings = [Framing(own, size, fit) for own in sizes]
+
+        def shown() -> Iterator[Step]:
+            for pictures, values in chain([first], steps):
+                framed = zip(framings, pictures, strict=True)
+                yield [framing.frame(picture) for framing, picture in framed], values
+
+        super().__init__(SourceSpec(names, size, "uint8", truth, fps, START_NS), shown())
 
     def describe(self) -> Mapping[str, Any]:
         """The environments, their seed, and how they were played."""
@@ -89,7 +103,8 @@ class GymSource(SteppedSource):
             "seed": self._seed,
             "policy": policy,
             "hold": self._hold,
-            "size": list(self._size),
+            "size": list(self._spec.frame_shape),
+            "fit": self._fit,
             "rate": self._spec.fps,
             "recipe": RECIPE,
         }
@@ -159,9 +174,9 @@ def package(name: str, extra: str) -> Any:
         raise UsageError(missing) from error
 
 
-def picture(seen: Any, size: tuple[int, int]) -> Bytes:
-    """A colour picture as a frame, (height, width) uint8."""
-    return shrink(np.asarray(Image.fromarray(seen).convert("L")), *size)
+def picture(seen: Any) -> Bytes:
+    """A colour picture in gray, (height, width) uint8."""
+    return np.asarray(Image.fromarray(seen).convert("L"))
 
 
 def _numbers(space: Any) -> int:

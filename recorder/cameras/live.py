@@ -62,10 +62,9 @@ class LiveSource:
     first stream that does.
 
     Args:
-        inbox: where the pictures come in; closed with the source.
+        inbox: where the pictures come in, all of one size; closed with the source.
         names: of the streams.
         about: what identifies the cameras.
-        size: (height, width) of a frame, the size of every picture.
         rate: ticks a second; by default the first camera's rate, stated or measured.
         hold, patience: see `Grid`.
         stop: asked while waiting; true ends the wait as if the cameras had ended.
@@ -85,7 +84,6 @@ class LiveSource:
         names: Sequence[str],
         about: Mapping[str, Any],
         *,
-        size: tuple[int, int],
         rate: float | None = None,
         hold: float = HOLD,
         patience: float = PATIENCE,
@@ -106,6 +104,7 @@ class LiveSource:
             # Half a tick later, so that a camera at the rate of the clock may jitter by as much.
             step = NANOSECONDS / fps
             start = max(pictures[0].time_ns for pictures in first) + round(step / 2)
+            size = first[0][0].image.shape
             self._spec = SourceSpec(tuple(names), size, "uint8", (), fps, start)
         except BaseException:
             inbox.close()

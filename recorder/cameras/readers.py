@@ -13,7 +13,6 @@ from typing import Final, Literal
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, one_line
 from recorder.cameras.camera import Camera, Picture
-from recorder.images.pixels import Bytes
 
 OnLoss = Literal["reconnect", "wait", "end"]
 """What is done about a camera that stalls or goes away."""
@@ -68,7 +67,6 @@ class Readers:
 
     Args:
         cameras: opened in their threads.
-        prepare: makes an image what waits of it, in the camera's thread.
         on_loss: see above.
         stall: seconds without a picture after which a camera has stalled.
         queue_bytes: most bytes that wait of one camera.
@@ -78,14 +76,13 @@ class Readers:
     def __init__(
         self,
         cameras: Sequence[Camera],
-        prepare: Callable[[Bytes], Bytes],
         *,
         on_loss: OnLoss = "reconnect",
         stall: float = STALL,
         queue_bytes: int = QUEUE_BYTES,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self._prepare, self._on_loss, self._say = prepare, on_loss, say
+        self._on_loss, self._say = on_loss, say
         self._stall, self._limit = round(stall * NANOSECONDS), queue_bytes
         # Time never goes back while cameras are read, whatever is done to the wall clock.
         self._offset = time.time_ns() - time.monotonic_ns()
@@ -150,7 +147,7 @@ class Readers:
             why = f"{name} ended"
             try:
                 for age, image in reading.camera.pictures():
-                    picture = Picture(self.now() - age, self._prepare(image))
+                    picture = Picture(self.now() - age, image)
                     if not self._put(reading, epoch, picture):
                         return
                     came, delay = True, shortest

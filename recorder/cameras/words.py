@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 from urllib.parse import urlsplit
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.cameras.camera import Camera
+from recorder.cameras.framed import framed
 from recorder.cameras.live import HOLD, LiveSource
 from recorder.cameras.readers import STALL, OnLoss, Readers
-from recorder.images.pixels import FRAME_SIZE, RECIPE, shrink
+from recorder.images.frames import VIDEO_RECIPE
+from recorder.images.framing import Fit, Size
+from recorder.images.pixels import RECIPE, Depth
 
 _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp")
 
@@ -31,15 +34,19 @@ class CameraKind:
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
             cannot open is a UsageError.
+        distances: whether `open` takes `depth`, too: how distances are shown, see `gray`.
+        recipe: how what it shows becomes gray and small, for the record.
     """
 
-    open: Callable[[str, str], Camera]
+    open: Callable[..., Camera]
+    distances: bool = False
+    recipe: str = RECIPE
 
 
-def _foxglove(word: str, name: str) -> Camera:
+def _foxglove(word: str, name: str, *, depth: Depth | None) -> Camera:
     from recorder.cameras.foxglove import FoxgloveCamera
 
-    return FoxgloveCamera(word, name, timeout=_TIMEOUT)
+    return FoxgloveCamera(word, name, timeout=_TIMEOUT, depth=depth)
 
 
 def _video(word: str, name: str) -> Camera:
@@ -50,7 +57,10 @@ def _video(word: str, name: str) -> Camera:
 
 CAMERAS: Registry[CameraKind] = Registry(
     "kind of camera",
-    {"foxglove": CameraKind(_foxglove), **{kind: CameraKind(_video) for kind in _VIDEO}},
+    {
+        "foxglove": CameraKind(_foxglove, distances=True),
+        **{kind: CameraKind(_video, recipe=VIDEO_RECIPE) for kind in _VIDEO},
+    },
     group="cdmisfa.sources",
 )
 """What cameras' words begin with; `CAMERAS.add` and entry points `cdmisfa.sources` add others."""
@@ -61,7 +71,9 @@ class LiveOptions:
     """How live streams become streams of frames.
 
     Attributes:
-        size: (height, width) of a frame.
+        size: (height, width) of a frame, or None for one from the first stream's images.
+        fit: how images of another aspect ratio become frames: see `fitted`.
+        depth: distances in metres that are shown black and white; None for none.
         rate: frames a second; None for the first stream's.
         hold: seconds for which a picture stands for those that are missing.
         on_loss: what is done about a camera that stalls or goes away.
@@ -69,7 +81,9 @@ class LiveOptions:
         seed: of simulated tasks.
     """
 
-    size: tuple[int, int] = FRAME_SIZE
+    size: Size | None = None
+    fit: Fit = "crop"
+    depth: Depth | None = None
     rate: float | None = None
     hold: float = HOLD
     on_loss: OnLoss = "reconnect"
@@ -113,21 +127,29 @@ def open_live(
                 "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
             )
         tasks = [word.removeprefix("gym:") for word in words]
-        return GymSource(tasks, names=names, size=options.size, fps=options.rate, seed=options.seed)
+        return GymSource(
+            tasks,
+            names=names,
+            size=options.size,
+            fit=options.fit,
+            fps=options.rate,
+            seed=options.seed,
+        )
     kinds = [CAMERAS[word.partition(":")[0].lower()] for word in words]
-    cameras = [kind.open(*named) for kind, *named in zip(kinds, words, names, strict=True)]
-    height, width = options.size
-    inbox = Readers(
-        cameras,
-        lambda image: shrink(image, height, width),
-        on_loss=options.on_loss,
-        stall=options.stall,
-        say=say,
-    )
-    about = {"cameras": [dict(camera.describe()) for camera in cameras], "recipe": RECIPE}
-    return LiveSource(
-        inbox, names, about, size=options.size, rate=options.rate, hold=options.hold, stop=stop
-    )
+    opened = [
+        kind.open(word, name, depth=options.depth) if kind.distances else kind.open(word, name)
+        for kind, word, name in zip(kinds, words, names, strict=True)
+    ]
+    cameras = framed(opened, options.size, options.fit, say=say)
+    inbox = Readers(cameras, on_loss=options.on_loss, stall=options.stall, say=say)
+    about: dict[str, Any] = {
+        "cameras": [dict(camera.describe()) for camera in cameras],
+        "recipe": "; ".join(dict.fromkeys(kind.recipe for kind in kinds)),
+        "fit": options.fit,
+    }
+    if options.depth is not None:
+        about["range_metres"] = list(options.depth)
+    return LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)
 
 
 def stream_names(words: Sequence[str]) -> tuple[str, ...]:

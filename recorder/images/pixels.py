@@ -53,9 +53,6 @@ ENCODINGS: Final = tuple(_LAYOUTS)
 Depth = tuple[float, float]
 """Distances, in metres, that are shown black and white."""
 
-FRAME_SIZE: Final = (48, 128)
-"""Height and width of the paper's frames, which images are shrunk to where nothing is said."""
-
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
     """What is no image that is read; who knows where it came from adds that."""

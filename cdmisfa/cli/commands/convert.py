@@ -71,7 +71,7 @@ def convert_command(
             force=force,
             as_json=as_json,
             live={"hold": hold, "lost": lost, "stall": stall, "seed": 0},
-            cameras=cameras,
+            cameras=CameraOptions(**cameras),
         )
         return
     named = places(source)

@@ -12,13 +12,14 @@ import click
 from click.core import ParameterSource
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import live_options, live_streams, say_counts, size_and_rate, tell
+from cdmisfa.cli.cameras import frame_options, live_options, live_streams, say_counts, tell
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
     from recorder.recording import ViewRecording
+    from replay.camera_logs.options import CameraOptions
 
 CONVERTED = ("foreign",)
 """What a recording names as its source where it was converted from camera logs."""
@@ -55,7 +56,7 @@ LIVE = ("cameras", "gym")
     "--resume as first asked for.",
 )
 @options.fsync_every
-@size_and_rate
+@frame_options
 @live_options
 @options.force
 @options.as_json
@@ -77,9 +78,10 @@ def record_command(
     resume: bool,
     split: str | None,
     as_json: bool,
-    size: tuple[int, int] | None,
-    rate: float | None,
-    **live: Any,
+    hold: float,
+    lost: str,
+    stall: float,
+    **framing: Any,
 ) -> None:
     """Record what a scene or cameras show, one MCAP file per view.
 
@@ -91,7 +93,9 @@ def record_command(
     from recorder.cameras.words import is_live
     from recorder.log.begun import Begun, read_recording
     from recorder.world.scenes import SCENES
+    from replay.camera_logs.options import CameraOptions
 
+    cameras = CameraOptions(**framing)
     if any(map(is_live, source)):
         if resume or views or jobs > 1 or scene_picture is not None:
             raise UsageError(
@@ -109,14 +113,16 @@ def record_command(
             fsync_every=fsync_every,
             force=force,
             as_json=as_json,
-            live={**live, "seed": seed},
-            cameras={"size": size, "rate": rate},
+            live={"hold": hold, "lost": lost, "stall": stall, "seed": seed},
+            cameras=cameras,
             preset=preset,
             settings=settings,
         )
         return
-    if size or rate:
-        raise UsageError("--size and --rate are for cameras: a scene has record.fps, and its own")
+    if cameras != CameraOptions():
+        raise UsageError(
+            "--size, --fit, --rate and --range are for cameras: a scene has record.fps, and its own"
+        )
     _refuse_logs(source)
     begun = read_recording(out) if resume and out is not None else Begun()
     if begun.source and begun.source[0] in LIVE:
@@ -212,7 +218,7 @@ def record_streams(
     force: bool,
     as_json: bool,
     live: Mapping[str, Any],
-    cameras: Mapping[str, Any],
+    cameras: CameraOptions,
     preset: str | None = None,
     settings: Sequence[str] = (),
 ) -> None:
@@ -222,22 +228,19 @@ def record_streams(
     from recorder.log.folder import refuse_existing
     from recorder.log.split import Split
     from recorder.recording import DEFAULT_FRAMES
-    from replay.camera_logs.options import CameraOptions
 
     refuse_existing(out, force=force)
     with stoppable(notice="finishing the recording; again to stop at once\n") as stop:
         source, configuration = open_cameras_now(
             words,
             live_streams(live),
-            cameras=CameraOptions(**cameras),
+            cameras=cameras,
             preset=preset,
             settings=settings,
             say=tell,
             stop=stop,
         )
         with contextlib.closing(source):
-            endless = getattr(source, "gaps", False)
-            frames = frames or (None if endless else DEFAULT_FRAMES)
             recorded = RecordedWhileWatched(
                 source,
                 out,
@@ -246,6 +249,7 @@ def record_streams(
                 fsync_every=fsync_every,
                 force=force,
             )
+            frames = frames or (None if recorded.gaps else DEFAULT_FRAMES)
             with bar("recording", "frames") as shown:
                 record_watched(
                     recorded,
