@@ -172,8 +172,8 @@ class SeekableSource(FrameSource, Protocol):
         return tuple(blocks)
 
 
-class ClockedSource(SeekableSource):
-    """A source that holds its spec and its clock, and so needs `take` and `describe` alone.
+class ForwardSource(FrameSource):
+    """A source that holds its spec and its clock, and need not be able to go back.
 
     A class that derives from it sets `_spec`, and `_t` where its first frame is not 0.
 
@@ -195,13 +195,17 @@ class ClockedSource(SeekableSource):
         """Global counter of the next frame."""
         return self._t
 
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class ClockedSource(ForwardSource, SeekableSource):
+    """A source of which any frame can be shown again, and so needs `take` and `describe` alone."""
+
     def seek(self, t: int) -> None:
         """Move the clock to frame t; see `SeekableSource.seek`."""
         check_frame(t)
         self._t = t
-
-    def close(self) -> None:
-        """Nothing to let go of."""
 
 
 @dataclass(frozen=True, slots=True)

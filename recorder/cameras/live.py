@@ -8,7 +8,14 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from cdmisfa.core.blocks import Block, SourceSpec, check_request, freeze, take_unbroken
+from cdmisfa.core.blocks import (
+    Block,
+    ForwardSource,
+    SourceSpec,
+    check_request,
+    freeze,
+    take_unbroken,
+)
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.camera import Picture
@@ -54,7 +61,7 @@ class Inbox(Protocol):
         """Let go of the cameras."""
 
 
-class LiveSource:
+class LiveSource(ForwardSource):
     """Live streams on one clock, with gaps where a stream has no picture; see `Grid`.
 
     It cannot go back: record what it shows to have it again. `take_all` gives a block for each
@@ -91,7 +98,6 @@ class LiveSource:
     ) -> None:
         self.stop = stop
         self._inbox = inbox
-        self._t = 0
         self._ahead: deque[list[Bytes | None]] = deque()
         self._ends: int | None = None
         self._why = ""
@@ -115,16 +121,6 @@ class LiveSource:
             before = sum(picture.time_ns <= start for picture in pictures)
             for picture in pictures[max(before - 1, 0) :]:
                 self._grid.put(stream, picture)
-
-    @property
-    def spec(self) -> SourceSpec:
-        """What the source delivers."""
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        """Global counter of the next frame."""
-        return self._t
 
     @property
     def alignment(self) -> dict[str, dict[str, int]]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import Block, SourceSpec, as_array, check_request, freeze
+from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 
@@ -17,7 +17,7 @@ Step = tuple[Sequence[Any], NDArray[np.float64]]
 """The frame of each stream, and what the world knows at it, (D,) float64."""
 
 
-class SteppedSource:
+class SteppedSource(ForwardSource):
     """Streams that are iterators, on one clock; it ends with the first of them.
 
     It cannot go back. A class that derives from it adds `describe`.
@@ -28,18 +28,8 @@ class SteppedSource:
     """
 
     def __init__(self, spec: SourceSpec, steps: Iterator[Step]) -> None:
-        self._spec, self._steps, self._t = spec, steps, 0
+        self._spec, self._steps = spec, steps
         self._ahead: list[Step] = []
-
-    @property
-    def spec(self) -> SourceSpec:
-        """What the source delivers."""
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        """Global counter of the next frame."""
-        return self._t
 
     def take(self, stream: int, n: int) -> Block:
         """See `FrameSource`."""
@@ -62,9 +52,6 @@ class SteppedSource:
         ]
         self._t += n
         return tuple(blocks)
-
-    def close(self) -> None:
-        """Nothing to let go of."""
 
 
 class ArraySource(SteppedSource):
