@@ -65,3 +65,21 @@ def test_the_second_signal_is_the_one_that_the_exit_code_names() -> None:
         with pytest.raises(KeyboardInterrupt):
             told_twice()
         assert outer.exit_code == 129
+
+
+def test_a_stop_inside_of_an_exec_ends_with_its_code_too(tmp_path: Path) -> None:
+    (tmp_path / "stopped.py").write_text(
+        "from cdmisfa.cli import app\n"
+        "kill = 'import os, signal; os.kill(os.getpid(), signal.SIGTERM)'\n"
+        "app.cli.main = lambda **words: exec(kill)\n"
+        "app.main()\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-m", "stopped"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (143, "cdmisfa: interrupted\n")

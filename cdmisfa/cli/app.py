@@ -106,7 +106,11 @@ def main() -> NoReturn:
     _open_standard_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    # An interrupt inside of an exec, as imports have them, is remembered until the next one:
+    # `python -m` would end by SIGINT, whatever the code.
+    exec("")
+    sys.exit(code)
 
 
 def _open_standard_streams() -> None:
