@@ -117,7 +117,7 @@ def test_only_who_has_the_address_is_given_the_run(tmp_path):
         reader = threading.Thread(target=lambda: taken.append(urlopen(view.address).read()))
         reader.start()
     reader.join()
-    pieces = list(view._stream.read())
+    pieces = list(view._broadcast._stream.read())
     assert taken == [b"".join(pieces)]
     (tmp_path / "a.rrd").write_bytes(pieces[-1])
     paths = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()}

@@ -40,10 +40,11 @@ FORMATS = (
     "glob",
 )
 BAGS = ("ros2 mcap folder", "bag", "db3", "db3 folder")
-COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record")
+COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play")
 REFUSED = {
     ("export", "run"): "name the recording",
     ("learn", "run"): "is a run, not a recording",
+    ("play", "run"): "is a run, not a recording",
     ("convert", "run"): "is a run, not a recording",
     **{("record", kind): "cdmisfa convert" for kind in FORMATS},
 }
@@ -157,6 +158,10 @@ def command_line(command: str, kind: str, words: list[object], out: Path) -> lis
         "export": ["export", *words, "--to", "images", "-o", out / "images", *rate],
         "learn": ["learn", *words, "--max-iterations", "1", "--json", *topics, *rate],
         "convert": ["convert", *words, "-o", out / "rec", "--json", *topics, *rate],
+        "play": [
+            *("play", *words, "--to", "foxglove", "--port", 0, "--wait", 0),
+            *("--rate", 100, "--json", *(["--fps", 50] if rate else [])),
+        ],
         "record": ["record", *words, "-o", out / "rec", "--frames", "5"],
     }[command]
 
@@ -189,6 +194,8 @@ def test_a_command_takes_a_log_or_says_why_not(
             assert len(list((tmp_path / "images").rglob("*.png"))) == streams * COUNT
         case "learn":
             assert done.json["iterations"] == 1
+        case "play":
+            assert done.json["messages"] >= streams * COUNT
         case "convert":
             assert [view["frames"] for view in done.json["views"]] == [COUNT] * streams
 

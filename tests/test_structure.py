@@ -62,6 +62,7 @@ FORBIDDEN = {
     "replay.inputs": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.images", "replay.viewer.program", "rerun"),
     "replay.mcap": ("replay.runs.log", "replay.recordings.source", "cdmisfa.agents.learner"),
+    "replay.playing": ("cdmisfa.experiments.runs", "cdmisfa.agents.learner", "recorder.recording"),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.mcap.records", "recorder.config", "rerun"),

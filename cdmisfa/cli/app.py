@@ -26,6 +26,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
     "learn": ("learn", "Learn slow feature modules from a scene or a recording."),
     "view": ("view", "Open a run in the Rerun viewer, or save, serve or picture it."),
+    "play": ("view", "Show a recording as it was seen, in real time."),
     "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),
     "verify": ("logs", "Check that a log is whole: structure, checksums, no gaps."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),

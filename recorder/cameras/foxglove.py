@@ -13,7 +13,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from recorder.cameras.video import Steady
 from recorder.images.messages import Decoder, image_decoder
 from recorder.images.pixels import Bytes, Depth
 
@@ -76,11 +78,14 @@ class FoxgloveCamera:
             number, decode = self._find(connection)
             wanted = [{"id": _SUBSCRIPTION, "channelId": number}]
             connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            steady = Steady()
             for message in connection:
                 if isinstance(message, bytes) and len(message) >= _HEADER.size:
-                    kind, subscription, _ = _HEADER.unpack_from(message)
+                    kind, subscription, log_time = _HEADER.unpack_from(message)
                     if (kind, subscription) == (_DATA, _SUBSCRIPTION):
-                        yield 0, decode(message[_HEADER.size :])
+                        logged = log_time / NANOSECONDS if log_time else None
+                        age = steady.age(time.monotonic(), logged)
+                        yield age, decode(message[_HEADER.size :])
                 elif isinstance(message, str) and self._is_gone(message, number):
                     return
 

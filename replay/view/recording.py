@@ -62,7 +62,7 @@ def write_recording(
     ours = isinstance(source, RecordedSource)
     poses = {name: pose for p in paths for name, pose in head_poses(p).items()} if ours else {}
     head = write_heads(recording, spec.streams, poses)
-    recording.send_blueprint(_layout(spec, first + count, head, tab))
+    recording.send_blueprint(recording_layout(spec, first + count, head, tab))
 
 
 def write_views(
@@ -82,7 +82,7 @@ def write_views(
         blocks: of a run, for its views; its truth is there already.
     """
     first, spec = source.t, source.spec
-    columns = [frames_column(recording, spec, view) for view in _views(spec)]
+    columns = [frames_column(recording, spec, view) for view in view_entities(spec)]
     truth = None
     if spec.truth and blocks is None:
         truth = line_column(recording, spec, "world/truth", spec.truth)
@@ -136,18 +136,19 @@ def _hashes(described: Any) -> list[str]:
     return [str(view["sha256"]) for view in views if "sha256" in view]
 
 
-def _views(spec: SourceSpec) -> list[str]:
+def view_entities(spec: SourceSpec) -> list[str]:
     """The entity of each view."""
     return [f"views/{part(spec.streams, s)}" for s in range(len(spec.streams))]
 
 
-def _layout(spec: SourceSpec, frames: int, head: bool, tab: str | None) -> rrb.Blueprint:
+def recording_layout(spec: SourceSpec, frames: int, head: bool, tab: str | None) -> rrb.Blueprint:
+    """The tab of a recording's views, the truth and where the head looks."""
     axis = time_axis(frames)
     shown = [
         rrb.Spatial2DView(origin=f"/{view}", name=label(name))
         if spec.images
         else lines(label(name), [f"/{view}"], axis)
-        for name, view in zip(spec.streams, _views(spec), strict=True)
+        for name, view in zip(spec.streams, view_entities(spec), strict=True)
     ]
     grid = (
         rrb.Grid(*shown, grid_columns=min(len(shown), 3)) if spec.images else rrb.Vertical(*shown)

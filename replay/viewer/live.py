@@ -6,11 +6,9 @@ learner hardly waits for it. Only who was given the address can connect, from th
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 from collections.abc import Mapping
-from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,7 +18,6 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
@@ -31,8 +28,7 @@ from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
-from replay.viewer.guarded import served
-from replay.viewer.stream import Stream
+from replay.viewer.broadcast import Broadcast
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
@@ -42,12 +38,6 @@ MOST_BLOCKS = 500
 
 PIECE = 10
 """Blocks of which lanes say what was mostly the case: how many there will be is not known."""
-
-LAST_SECONDS = 5.0
-"""Longest wait for viewers to take the last piece."""
-
-MEMORY = 1 << 30
-"""Most bytes that are kept for viewers that connect later; the oldest go first."""
 
 NAME = "live.rrd"
 
@@ -78,16 +68,8 @@ class LiveView(Sink):
         outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest), tau, outputs)
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
         self._recording.set_log_time_enabled(False)
-        if not rr.is_enabled(self._recording):
-            raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
-        self._encoded = rr.binary_stream(self._recording)
-        self._stream = Stream(MEMORY)
-        self._serving = contextlib.ExitStack()
-        try:
-            address = self._serving.enter_context(served(self._answer, port))
-        except OSError as error:
-            raise CdmisfaError(f"no live view at port {port}: {error.strerror}") from error
-        self.address = f"{address}{NAME}"
+        self._broadcast = Broadcast(self._recording, NAME, port)
+        self.address = self._broadcast.address
         self._recording.send_recording_name("live")
         self._recording.send_blueprint(run_layout(outline))
         # No image is left out here: of each block only the first is taken.
@@ -97,23 +79,8 @@ class LiveView(Sink):
         self._tau = tau
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
-        self._hand_over()
+        self._broadcast.hand_over()
         self._forget()
-
-    def _answer(self, request: BaseHTTPRequestHandler, path: str) -> None:
-        if path != NAME:
-            request.send_error(404)
-            return
-        request.send_response(200)
-        request.send_header("Content-Type", "application/octet-stream")
-        request.send_header("Cache-Control", "no-store")
-        request.end_headers()
-        for piece in self._stream.read():
-            request.wfile.write(piece)
-
-    def _hand_over(self) -> None:
-        if piece := self._encoded.read(flush=True):
-            self._stream.add(piece)
 
     def _forget(self) -> None:
         self._records: list[BlockSignals] = []
@@ -181,15 +148,12 @@ class LiveView(Sink):
                     place = f"modules/{int(columns['module'][i])}/weights"
                     self._view.weights(place, t, iteration, weights[t])
         self._view.flush()
-        self._hand_over()
+        self._broadcast.hand_over()
 
     def close(self) -> None:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
         self.flush()
-        self._hand_over()
-        self._stream.end(LAST_SECONDS)
-        self._serving.close()
-        self._recording.disconnect()
+        self._broadcast.close()
 
     def __enter__(self) -> Self:
         return self

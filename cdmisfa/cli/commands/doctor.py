@@ -24,7 +24,7 @@ PACKAGES = ("numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matpl
 EXTRAS = {
     "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
     "gym": (("gymnasium",), "gym: streams of simulated tasks"),
-    "foxglove": (("websockets",), "foxglove:// streams of running robots"),
+    "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
     "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo"), "streams of the arena"),

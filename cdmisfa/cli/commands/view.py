@@ -1,4 +1,4 @@
-"""`cdmisfa view`: look at a run in Rerun."""
+"""`cdmisfa view` and `play`: look at a run or a recording."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import rate_option
+from cdmisfa.cli.cameras import rate_option, tell
+from cdmisfa.cli.commands.learn import announce
+from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
@@ -136,3 +138,102 @@ def _view_sweep(
 
     with bar("preparing views", "runs") as done:
         serve_catalogue(folder, port=port, tab=tab, web=web, progress=done.update)
+
+
+@click.command("play")
+@options.fetched_argument("recording", nargs=-1)
+@click.option(
+    "--to",
+    "target",
+    type=click.Choice(["rerun", "foxglove"]),
+    default="rerun",
+    show_default=True,
+    help="To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(1e-3, 1e3),
+    default=1.0,
+    show_default=True,
+    metavar="TIMES",
+    help="How many times as fast as it was seen.",
+)
+@click.option(
+    "--fps",
+    type=click.FloatRange(1e-3, 1e6),
+    metavar="HZ",
+    help="Frames a second of what tells none, as folders of pictures.",
+)
+@click.option("--loop", is_flag=True, help="Start again at its end, until Ctrl-C.")
+@click.option(
+    "--wait",
+    type=click.IntRange(0),
+    metavar="TOPICS",
+    help="As a robot, begin once so many topics are watched; by default 1, with 0 at once.",
+)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    help="Where to serve, on this machine; by default 8765 as a robot, else a free one.",
+)
+@options.server_limits
+@options.as_json
+@click.pass_context
+def play_command(
+    ctx: click.Context,
+    recording: tuple[Path, ...],
+    target: str,
+    rate: float,
+    fps: float | None,
+    loop: bool,
+    wait: int | None,
+    port: int | None,
+    as_json: bool,
+) -> None:
+    """Show a recording as it was seen, in real time.
+
+    RECORDING is the folder of a recording, files of its views, or camera logs of others; of one
+    behind a URL a copy is made. As a robot, other tools and cdmisfa itself see it live at
+    ws://127.0.0.1:8765: record foxglove://127.0.0.1:8765/view/left
+    """
+    if wait is not None and target != "foxglove":
+        raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
+    with bar("playing", "s") as shown, stoppable(notice="") as stop:
+        if target == "foxglove":
+            from replay.playing.robot import PORT, play_as_robot
+
+            played = play_as_robot(
+                recording,
+                rate=rate,
+                fps=fps,
+                loop=loop,
+                port=PORT if port is None else port,
+                wait=1 if wait is None else wait,
+                say=tell,
+                stop=stop,
+                progress=shown.update,
+            )
+        else:
+            from replay.playing.picture import play_in_rerun
+
+            played = play_in_rerun(
+                recording,
+                rate=rate,
+                fps=fps,
+                loop=loop,
+                port=port,
+                announce=announce,
+                stop=stop,
+                progress=shown.update,
+            )
+    if played.behind > 1:
+        tell(f"it came to lag {played.behind:.1f} s behind: play it with a smaller --rate")
+    what = "messages" if target == "foxglove" else "frames"
+    if as_json:
+        options.print_json(
+            {"schema": options.SCHEMA, what: played.count, "seconds": played.seconds}
+        )
+    else:
+        click.echo(f"played {played.count} {what}, {played.seconds:.2f} s of the recording")
+    if stop() and not loop:
+        ctx.exit(stop.exit_code)

@@ -1,0 +1,8 @@
+"""A recording played in real time, to a viewer or as if it were a running robot."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {"replay.playing.robot": "play_as_robot", "replay.playing.picture": "play_in_rerun"},
+)

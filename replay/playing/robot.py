@@ -1,0 +1,139 @@
+"""A recording as a Foxglove WebSocket server: other tools see it as a running robot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from replay.playing.feed import Feed, opened_feed
+from replay.playing.pace import SLICE, Played, paced, rounds
+
+HOST: Final = "127.0.0.1"
+
+PORT: Final = 8765
+"""Where Foxglove looks first."""
+
+BACKLOG: Final = 4096
+"""Messages that wait for a client that is slow; then the oldest are dropped."""
+
+LAST_SECONDS: Final = 0.5
+"""For which clients may take the last messages."""
+
+
+def play_as_robot(
+    paths: Sequence[Path],
+    *,
+    rate: float = 1.0,
+    loop: bool = False,
+    fps: float | None = None,
+    port: int = PORT,
+    wait: int = 1,
+    say: Callable[[str], None] = lambda line: None,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[float, float | None], None] = lambda done, total: None,
+) -> Played:
+    """Serve a recording's messages on this machine when they are due.
+
+    Messages are those of the files, and so are their log times; at another rate than 1 these pass
+    as fast as real time does. Logs that are no MCAP files are played frame by frame.
+
+    Args:
+        paths: the recording's folder, or files; or camera logs of others.
+        rate: how many seconds of the recording pass in one.
+        fps: frames a second of logs that tell none, as folders of pictures.
+        loop: begin again at the end.
+        port: to listen at; 0 for a free one.
+        wait: begin once clients have subscribed to so many topics.
+        say: told the address.
+        stop: asked while waiting; true ends it.
+        progress: told the seconds that were played, and all that there are.
+
+    Raises:
+        UsageError: no such log, or foxglove-sdk is missing.
+        LogDamagedError: it is damaged.
+        CdmisfaError: the port is taken.
+    """
+    played = Played()
+    with opened_feed(paths, fps) as feed, _Robot(feed, port) as robot:
+        say(f"playing at ws://{HOST}:{robot.port}{', once watched' if wait else ''}")
+        while robot.watched < wait and not stop():
+            time.sleep(SLICE / 10)
+        total = None if loop else (feed.stop - feed.start) / 1e9
+        items = rounds(feed.messages, feed.start, feed.stop, loop=loop)
+        for since, message in paced(items, rate, played, stop=stop):
+            robot.publish(message.topic, message.data, feed.start + round(since / rate))
+            progress(played.seconds, total)
+    return played
+
+
+class _Robot:
+    """The server, with a channel for each topic."""
+
+    def __init__(self, feed: Feed, port: int) -> None:
+        try:
+            import foxglove
+            from foxglove.websocket import ServerListener
+        except ImportError:
+            raise UsageError(
+                "to play as a robot needs foxglove-sdk: pip install 'cdmisfa[foxglove]'"
+            ) from None
+        subscribed: set[tuple[int, int]] = set()
+
+        class Listener(ServerListener):
+            def on_subscribe(self, client: Any, channel: Any) -> None:
+                subscribed.add((client.id, channel.id))
+
+            def on_unsubscribe(self, client: Any, channel: Any) -> None:
+                subscribed.discard((client.id, channel.id))
+
+        self._subscribed = subscribed
+        self._context = context = foxglove.Context()  # channels are gone with it
+        self._channels: dict[Any, Any] = {}
+        for topic in feed.topics:
+            schema = foxglove.Schema(
+                name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema
+            )
+            self._channels[topic] = foxglove.Channel(
+                topic.name,
+                schema=schema if topic.schema_name else None,
+                message_encoding=topic.encoding,
+                context=context,
+            )
+        try:
+            self._server = foxglove.start_server(
+                name="cdmisfa play",
+                host=HOST,
+                port=port,
+                server_listener=Listener(),
+                context=context,
+                message_backlog_size=BACKLOG,
+            )
+        except Exception as error:  # of the network
+            raise CdmisfaError(
+                f"no robot at port {port}: {one_line(error)}: choose another with --port"
+            ) from None
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return int(self._server.port)
+
+    @property
+    def watched(self) -> int:
+        """Subscriptions that there are."""
+        return len(self._subscribed)
+
+    def publish(self, topic: Any, data: bytes, time_ns: int) -> None:
+        """Tell a message to who has subscribed to its topic."""
+        self._channels[topic].log(data, log_time=time_ns)
+
+    def __enter__(self) -> _Robot:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._subscribed and not any(error):
+            time.sleep(LAST_SECONDS)
+        self._server.stop()
