@@ -15,7 +15,7 @@ from moving_pictures import LENGTH, MovingPictures
 
 from cdmisfa import Run
 from cdmisfa.agents.learners import LEARNERS, open_learner
-from cdmisfa.agents.progress import learner as progress
+from cdmisfa.agents.progress import held
 from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, relative_progress
 from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_error
 from cdmisfa.agents.progress.config import ATTENTIONS, ProgressConfig
@@ -177,7 +177,7 @@ def test_units_do_not_matter() -> None:
 
 
 def test_candidates_are_held_for_so_many_streams_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "HELD", 3)
+    monkeypatch.setattr(held, "HELD", 3)
     names = [f"noise.{i}" for i in range(8)] + ["swing", "constant"]
     source = MovingPictures(*names)
     learner = ProgressLearner(CONFIG, source.spec, 0)

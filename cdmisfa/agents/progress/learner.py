@@ -18,6 +18,7 @@ from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate
 from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.agents.progress.held import Candidates
 from cdmisfa.agents.progress.judging import (
     NO_PROGRESS,
     PATIENCE,
@@ -57,12 +58,6 @@ FEW_VALUES = 32
 FEWEST_BLOCKS = 20
 """Of a window of tests, however long a block is."""
 
-HELD = 32
-"""Candidates that are held at once; those of other streams are begun anew when they are watched."""
-
-MEMORY = 2 * 1024**3
-"""Bytes that candidates may take together; where frames are large fewer of them are held."""
-
 SHADOW = 5
 """Windows of tests after which the candidate of a stream that is not being learned begins anew."""
 
@@ -71,8 +66,6 @@ COUNTS = np.dtype([("iteration", "i8"), ("stream", "i8"), ("stay", "i8"), ("idle
 
 class ProgressLearner:
     """One candidate a stream, attention by learning progress, and an end of its own.
-
-    At most `HELD` candidates are held at once, and no more than fit into `MEMORY`.
 
     Args:
         config: what it is told.
@@ -93,13 +86,13 @@ class ProgressLearner:
         self._n_inputs = count_inputs(self._expansion, spec)
         self._n_outputs = min(config.outputs, self._n_inputs)
         self._scale = PIXEL if spec.dtype == "uint8" else 1.0
-        size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
-        self._held = max(2, min(HELD, MEMORY // size))
         self._window = max(FEWEST_BLOCKS, -(-config.test_frames // config.tau))
         self._rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         self._counts = np.zeros(1, COUNTS)
         self._counts["stream"] = int(self._rng.random() * len(spec.streams))
-        self._streams, self._candidates = new_streams(len(spec.streams)), dict[int, Candidate]()
+        self._streams = new_streams(len(spec.streams))
+        size = 8 * self._n_inputs * (2 * config.components + self._n_outputs + 4)
+        self._candidates = Candidates(self._new_candidate, size)
         self._freeze()
 
     @property
@@ -143,14 +136,8 @@ class ProgressLearner:
     @property
     def state(self) -> LearnerState:
         """The learner's state, a copy."""
-        held = sorted(self._candidates)
-        arrays = {
-            f"candidate.{stream}.{name}": array.copy()
-            for stream in held
-            for name, array in self._candidates[stream].arrays.items()
-        }
+        arrays = self._candidates.arrays
         arrays["streams"], arrays["counts"] = self._streams.copy(), self._counts.copy()
-        arrays["held"] = np.array(held, dtype=np.int64)
         return LearnerState(arrays, tuple(self.modules), self._rng.bit_generator.state)
 
     def restore(self, state: LearnerState) -> None:
@@ -159,14 +146,8 @@ class ProgressLearner:
         Raises:
             ValueError: an array is missing or of another shape or type.
         """
-        arrays = state.arrays
-        overwrite({"streams": self._streams, "counts": self._counts}, arrays)
-        self._candidates = {}
-        for stream in arrays.get("held", np.zeros(0, np.int64)).tolist():
-            prefix = f"candidate.{stream}."
-            parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-            self._candidates[stream] = self._new_candidate()
-            self._candidates[stream].restore(parts)
+        overwrite({"streams": self._streams, "counts": self._counts}, state.arrays)
+        self._candidates.restore(state.arrays)
         self.modules = list(state.modules)
         self._freeze()
         self._rng.bit_generator.state = dict(state.policy_rng)
@@ -187,7 +168,7 @@ class ProgressLearner:
         stream, count = block.stream, len(self.modules)
         own, counts = self._streams[stream], self._counts[0]
         novel = int(own["state"]) == LEARNING
-        candidate = self._candidate(stream)
+        candidate = self._candidates.begun(stream, self._streams)
         y_frozen = outputs(self._phi, self._offset, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(own["next"]) != block.t)
@@ -267,16 +248,6 @@ class ProgressLearner:
     def _new_candidate(self) -> Candidate:
         c = self.config
         return Candidate(self._n_inputs, c.components, c.outputs, c.window, self._window)
-
-    def _candidate(self, stream: int) -> Candidate:
-        """The candidate of a stream, for which another may have to go."""
-        if stream not in self._candidates:
-            while len(self._candidates) >= self._held:
-                idle = [s for s in self._candidates if self._streams["state"][s] != LEARNING]
-                oldest = min(idle or self._candidates, key=lambda s: self._streams["last"][s])
-                del self._candidates[oldest]
-            self._candidates[stream] = self._new_candidate()
-        return self._candidates[stream]
 
     def _judge(self, stream: int, candidate: Candidate) -> tuple[str, ...]:
         """Decide what the stream has come to; the lines that say so."""
@@ -381,7 +352,7 @@ class ProgressLearner:
         counts, learning = self._counts[0], self._streams["state"] == LEARNING
         held = np.zeros(len(learning), dtype=bool)
         held[list(self._candidates)] = True
-        if (learning & held).sum() >= self._held:
+        if (learning & held).sum() >= self._candidates.most:
             learning &= held
         errors = {s: c.recent_errors(RECENT) for s, c in self._candidates.items()}
         situation = Situation(
