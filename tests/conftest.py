@@ -10,6 +10,7 @@ from typing import Any
 
 import hypothesis
 import pytest
+from ignored_signals import let_children_be_signalled
 
 # Compiling takes longer than any deadline, and a test run says the same thing every time.
 hypothesis.settings.register_profile("cdmisfa", deadline=None, derandomize=True)
@@ -33,6 +34,12 @@ class Outcome:
 collect_ignore = ["toy_plugin"]  # a package's own tests, run where it is installed
 
 Cdmisfa = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _signalled_children() -> None:
+    """What tests begin and end with signals ends, though the tests were begun under nohup."""
+    let_children_be_signalled()
 
 
 @pytest.fixture

@@ -19,6 +19,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from ignored_signals import let_children_be_signalled
+
 from . import __doc__ as about
 from . import harness, page
 from .campaigns import CAMPAIGNS, campaign
@@ -49,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     unknown = [name for name in chosen.campaigns if name not in CAMPAIGNS]
     if unknown:
         parser.error(f"no campaign {unknown[0]}: there are {', '.join(CAMPAIGNS)}")
+    let_children_be_signalled()
     if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
         tempfile.tempdir = str(MEMORY)
     names = chosen.campaigns or CAMPAIGNS
