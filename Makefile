@@ -9,7 +9,7 @@ demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
 
 test: lint
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadgroup
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -28,6 +28,9 @@ from cdmisfa.features.inner_products import measure_tile
 from cdmisfa.features.projection import outputs
 from recorder.world.oscillatory import OscillatorySource
 
+# One process compiles what these need, twice, in minutes: another would do so again.
+pytestmark = pytest.mark.xdist_group("portable")
+
 OLD_PROCESSOR = {
     "NUMBA_CPU_NAME": "x86-64",
     "NUMBA_CPU_FEATURES": "",

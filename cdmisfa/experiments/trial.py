@@ -21,6 +21,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.agents.policy import action_values
 from cdmisfa.core.arithmetic.choice import in_own_arithmetic
 from cdmisfa.core.arithmetic.compiled import compiled, spliced
+from cdmisfa.core.blocks import freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
@@ -254,10 +255,13 @@ def run_trial(
 
 
 def _expand(config: LearnerConfig, tables: Sequence[Float]) -> tuple[Float, Float]:
-    """One period of every stream and the tau frames after it, as shown and as learned from."""
+    """One period of every stream and the tau frames after it, as shown and as learned from.
+
+    Not to be written, as blocks are not: then what was compiled for learners serves trials, too.
+    """
     index = np.arange(PERIOD + config.tau) % PERIOD
     frames = np.stack([table[index] for table in tables])
-    return frames, np.stack([expand(config.expansion, table) for table in frames])
+    return freeze(frames), freeze(np.stack([expand(config.expansion, table) for table in frames]))
 
 
 def _records(n: int, outputs: int, streams: int) -> dict[str, NDArray[Any]]:
