@@ -17,12 +17,16 @@ import pytest
 
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError, LogWriteError
-from recorder.log import appended
+from recorder.log import appended, viewfacts
 from recorder.log.appended import AppendedFile
 from recorder.log.folder import held
 from recorder.log.logfile import LogFile
+from recorder.log.messages import RECORDING_METADATA
 from recorder.log.split import Split
-from recorder.recording import record, record_scene
+from recorder.log.viewfacts import MOST_NAMED
+from recorder.recording import RecordingStoppedError, record, record_scene, recorded
+from replay.integrity.verify import check_log
+from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.storage import store
 from replay.storage.store import FileStore
@@ -166,6 +170,64 @@ def test_more_views_than_files_may_be_open_are_recorded_learned_and_checked(
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (LIMIT, LIMIT)),
         )
         assert done.returncode == 0, (command, done.stderr[-600:])
+
+
+def stated(folder: Path, view: str) -> dict[str, str]:
+    with LogReader(folder / f"{view}.mcap") as reader:
+        (record,) = (r for r in reader.metadata if r.name == RECORDING_METADATA)
+        return dict(record.values)
+
+
+def test_each_of_many_views_names_only_its_own(tmp_path: Path) -> None:
+    few, many, more = (tmp_path / name for name in ("few", "many", "more"))
+    for folder, count in ((few, MOST_NAMED), (many, MOST_NAMED + 1), (more, MOST_NAMED + 50)):
+        record(ManyViews(count), folder, frames=5)
+    assert stated(few, "v0001")["streams"].split(",") == list(ManyViews(MOST_NAMED).spec.streams)
+    assert "stream_count" not in stated(few, "v0001")
+    facts = stated(more, "v0007")
+    assert (facts["streams"], facts["stream_count"], facts["stream_index"]) == ("", "150", "7")
+    one, other = (folder / "v0007.mcap" for folder in (many, more))
+    assert one.stat().st_size == other.stat().st_size < (few / "v0007.mcap").stat().st_size
+    for folder in (few, many, more):
+        with contextlib.closing(RecordedSource(folder)) as source:
+            assert source.spec.streams == ManyViews(len(list(folder.iterdir()))).spec.streams
+            (config,) = LogReader(folder / "v0000.mcap").attachments
+            assert config.name == "config.json"
+        assert check_log(folder).ok
+        assert len(recorded(folder)) == len(list(folder.iterdir()))
+
+
+def test_a_missing_one_of_many_views_is_noticed(tmp_path: Path) -> None:
+    record(ManyViews(MOST_NAMED + 3), tmp_path, frames=5)
+    for number in (17, 99):
+        (tmp_path / f"v{number:04d}.mcap").unlink()
+    (problem,) = check_log(tmp_path).problems
+    assert problem.what == "of the recording's views 0 to 102 2 have no file, the first is 17"
+    assert not recorded(tmp_path)
+
+
+def test_many_views_are_resumed(tmp_path: Path) -> None:
+    source = ManyViews(MOST_NAMED + 3)
+    record(source, tmp_path / "whole", frames=80)
+    calls = iter(range(1000))
+    with pytest.raises(RecordingStoppedError):
+        record(source, tmp_path / "rec", frames=80, stop=lambda: next(calls) == 120)
+    record(source, tmp_path / "rec", resume=True)
+    assert checksums(tmp_path / "rec") == checksums(tmp_path / "whole")
+
+
+def test_a_recording_that_names_many_views_in_each_file_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As they were before, whatever their number."""
+    monkeypatch.setattr(viewfacts, "MOST_NAMED", 1000)
+    record(ManyViews(MOST_NAMED + 3), tmp_path, frames=5)
+    monkeypatch.undo()
+    assert check_log(tmp_path).ok
+    assert len(recorded(tmp_path)) == MOST_NAMED + 3
+    (tmp_path / "v0007.mcap").unlink()
+    (problem,) = check_log(tmp_path).problems
+    assert problem.what == "the view 'v0007' of the recording has no file"
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ bytes of a log that was never interrupted.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import struct
 from collections.abc import Callable, Iterator, Mapping
@@ -190,18 +191,21 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
     logs = logs_in(folder) if folder.is_dir() and not (folder / RECORDING).exists() else []
     found: list[tuple[str, Path, int]] = []
     streams: set[str] = set()
+    count = ""
     stops: dict[str, int] = {}
     for path in sorted(logs, key=lambda path: (len(path.name), path.name)):
         record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
         if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
             return []
-        streams.update(record.metadata.get("streams", "").split(","))
+        streams.update(filter(None, record.metadata.get("streams", "").split(",")))
+        count = record.metadata.get("stream_count", "")
         held = frames_held(path, view := record.metadata.get("view", ""))
         if held.first != stops.get(view, 0) or held.stop != held.end:
             return []
         stops[view] = held.stop
         found.append((view, path, held.stop - held.first))
-    return found if stops.keys() == streams and len(set(stops.values())) == 1 else []
+    every = stops.keys() == streams if streams else str(len(stops)) == count
+    return found if every and len(set(stops.values())) == 1 else []
 
 
 def other_recordings(folder: Path, identity: Identity) -> list[Path]:
@@ -213,7 +217,7 @@ def other_recordings(folder: Path, identity: Identity) -> list[Path]:
     others = []
     if not folder.is_dir():
         return []
-    own = [path for view in identity.spec.streams for path in view_logs(folder, view)]
+    own = set(itertools.chain(*view_logs(folder, identity.spec.streams).values()))
     for path in logs_in(folder):
         record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
         if record is None:

@@ -24,10 +24,17 @@ MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
 MAX_STREAMS: Final = 100_000
 MAX_FRAMES: Final = 2**33
 
+MOST_NAMED = 100
+"""Streams that every file of a recording names; of more each names its own, so that all together
+do not grow with their square."""
+
 PACKAGES: Final = ("cdmisfa", "numpy", "zstandard")
 """Packages whose versions every file states."""
 
 _VERSION = "version_"
+
+_AT_NEED = ("gaps", "stream_count")
+"""Keys that stand in a file only where they say something."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +45,7 @@ class ViewFacts:
         scene: name of what was recorded.
         view: name of the stream.
         stream_index: its place among the streams of the recording, from 0.
-        streams: all of them.
+        streams: all of them; none where they are more than `MOST_NAMED`.
         frame_shape: (height, width) or (I,).
         dtype: "uint8" or "float64".
         truth: a name for each column of ground truth.
@@ -49,6 +56,7 @@ class ViewFacts:
         config_sha256: checksum of the configuration that is attached.
         gaps: whether frames may be missing, of live streams that had none to show; a key only
             where they may.
+        stream_count: how many streams there are where they are not named; a key only there.
         versions: of packages that the bytes may depend on, each a key, too.
         values: the record as it stands in the file, where it was read from one.
     """
@@ -66,6 +74,7 @@ class ViewFacts:
     seed: str
     config_sha256: str
     gaps: bool = False
+    stream_count: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
     values: Mapping[str, str] = field(default_factory=dict, compare=False)
 
@@ -86,7 +95,7 @@ class ViewFacts:
 
     def as_metadata(self) -> dict[str, str]:
         """The file's metadata record."""
-        others = ("versions", "values", *(() if self.gaps else ("gaps",)))
+        others = ["versions", "values", *(n for n in _AT_NEED if not getattr(self, n))]
         names = [f.name for f in dataclasses.fields(self) if f.name not in others]
         stated = {name: _text(getattr(self, name)) for name in names}
         return {"schema": str(SCHEMA_VERSION), **stated, **self.versions}
@@ -152,6 +161,7 @@ class ViewFacts:
             seed=values.get("seed", ""),
             config_sha256=values.get("config_sha256", ""),
             gaps=values.get("gaps") == str(True),
+            stream_count=number("stream_count", 0, MAX_STREAMS, "0"),
             versions={key: v for key, v in values.items() if key.startswith(_VERSION)},
             values=dict(values),
         )
@@ -183,12 +193,12 @@ class Identity:
 
     def facts(self, view: str, first_frame: int = 0) -> ViewFacts:
         """What the file of a view that begins with a frame states."""
-        spec = self.spec
+        spec, named = self.spec, len(self.spec.streams) <= MOST_NAMED
         return ViewFacts(
             scene=self.kind,
             view=view,
             stream_index=spec.streams.index(view),
-            streams=spec.streams,
+            streams=spec.streams if named else (),
             frame_shape=spec.frame_shape,
             dtype=spec.dtype,
             truth=spec.truth,
@@ -198,6 +208,7 @@ class Identity:
             seed=str(self.seed),
             config_sha256=hashlib.sha256(self.config_json()).hexdigest(),
             gaps=self.gaps,
+            stream_count=0 if named else len(spec.streams),
             versions={_VERSION + name: version(name) for name in (*PACKAGES, *self.packages)},
         )
 

@@ -104,10 +104,12 @@ class ViewLog:
             chunk_size=settings.chunk_size,
             fsync_every=fsync_every,
         )
-        log.add_metadata(RECORDING_METADATA, identity.facts(view, first_frame).as_metadata())
-        log.add_attachment(
-            CONFIG_NAME, "application/json", identity.config_json(), log_time=spec.start_ns
-        )
+        facts = identity.facts(view, first_frame)
+        log.add_metadata(RECORDING_METADATA, facts.as_metadata())
+        if not facts.stream_count or facts.stream_index == 0:  # it may name all streams, too
+            log.add_attachment(
+                CONFIG_NAME, "application/json", identity.config_json(), log_time=spec.start_ns
+            )
         self._channels = {
             topic: (
                 log.add_channel(topic, log.add_schema(e.schema, ENCODING, e.schema_data())),

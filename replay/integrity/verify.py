@@ -187,11 +187,15 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
     folder = str(passes[0].path.parent)
     streams: set[str] = set()
     names: set[str] = set()
+    numbers: set[int] = set()
+    count = 0
     for checked in passes:
         if checked.view is not None:
             facts = checked.view.facts
             names.add(facts.view)
-            streams |= set(filter(None, facts.values.get("streams", "").split(",")))
+            streams |= set(filter(None, facts.streams))
+            numbers.add(facts.stream_index)
+            count = max(count, facts.stream_count)
             edges = [(0, facts.first_frame), *checked.view.ranges]
             for (_, end), (start, _) in itertools.pairwise(edges):
                 if start > end and not facts.gaps:
@@ -200,6 +204,9 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
             yield said(checked.path, checked.error)
     for name in () if alone else sorted(streams - names):
         yield Problem(folder, f"the view {name!r} of the recording has no file")
+    if absent := set() if alone else set(range(count)) - numbers:
+        what = f"of the recording's views 0 to {count - 1} {len(absent)} have no file, the first is"
+        yield Problem(folder, f"{what} {min(absent)}")
     if any(checked.error is not None for checked in passes):
         return
     views = [checked.view for checked in passes if checked.view is not None]

@@ -64,11 +64,12 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
         UsageError: there is no such recording.
         LogDamagedError: it cannot be read.
     """
-    file = log_files(path)[0]
-    with LogReader(file) as reader:
-        own = [entry for entry in reader.attachments if entry.name == CONFIG_NAME]
-        data = bytes(reader.attachment_data(own[0])) if own else b"{}"
-        pose = first_pose(reader)
+    data, pose = b"{}", None
+    for file in log_files(path):  # the first has it, unless they are many
+        with LogReader(file) as reader:
+            if own := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
+                data, pose = bytes(reader.attachment_data(own[0])), first_pose(reader)
+                break
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
         return None
     try:
