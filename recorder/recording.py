@@ -339,10 +339,8 @@ def _as_begun(
     if split is None and limit is not None:
         split = Split.parse(limit)
     earlier = {
-        view: {
-            path: frames_held(path, view, gaps=identity.gaps) for path in view_logs(folder, view)
-        }
-        for view in views
+        view: {path: frames_held(path, view, gaps=identity.gaps) for path in logs}
+        for view, logs in view_logs(folder, views).items()
     }
     unfinished = not all(
         files and all(p.suffix == ".mcap" for p in files) for files in earlier.values()

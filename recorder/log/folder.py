@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +23,8 @@ Beside the logs, because these hold the same bytes whatever length was wanted fi
 _HELD: Final[set[tuple[int, int]]] = set()
 """Folders that this process holds."""
 
-_LOG = re.compile(r".+\.mcap(\.partial(\.kept)?)?")
+_LOG = re.compile(r"(?P<name>.+)\.mcap(\.partial(\.kept)?)?")
+_PART = re.compile(r"-\d{3,}$")
 
 
 @contextlib.contextmanager
@@ -94,15 +96,18 @@ def part_number(path: Path, view: str) -> int | None:
     return int(number[1:]) if number else None
 
 
-def view_logs(folder: Path, view: str) -> list[Path]:
-    """Files of a view in a folder, finished or not.
+def view_logs(folder: Path, views: Collection[str]) -> dict[str, list[Path]]:
+    """Files of some views in a folder, finished or not; a name may be of a part of another view.
 
     Raises:
         UsageError: one is no file but a device or a pipe.
     """
-    pattern = re.compile(rf"{re.escape(view)}(-\d{{3,}})?\.mcap(\.partial(\.kept)?)?")
-    found = sorted(p for p in folder.iterdir() if pattern.fullmatch(p.name))
-    refuse_special(*found)
+    found: dict[str, list[Path]] = {view: [] for view in views}
+    for path in sorted(folder.iterdir()):
+        if log := _LOG.fullmatch(path.name):
+            for view in {log["name"], _PART.sub("", log["name"])} & found.keys():
+                refuse_special(path)
+                found[view].append(path)
     return found
 
 
@@ -151,7 +156,7 @@ def prepared_folder(
         try:
             make_folder(folder)
             stack.enter_context(held(folder))
-            old = {*stale, *(path for view in views for path in view_logs(folder, view))}
+            old = {*stale, *itertools.chain(*view_logs(folder, views).values())}
             old |= {folder / RECORDING} if stale else set()
             for path in sorted(old, reverse=True):  # what is left by a kill has its first parts
                 path.unlink(missing_ok=True)
