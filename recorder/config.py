@@ -53,7 +53,7 @@ class RecordConfig:
     def __post_init__(self) -> None:
         within(self, "record", *RECORDED_FPS, "fps")
         within(self, "record", 0, 2**62, "start_ns")
-        within(self, "record", 1024, 2**28, "chunk_size")
+        within(self, "record", 1024, 2**27, "chunk_size")
 
 
 def check_view_names(names: tuple[str, ...], key: str) -> None:

@@ -140,6 +140,22 @@ def test_a_bag_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -
     assert again.json["signals_sha256"] == learned.json["signals_sha256"]
 
 
+@pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
+def test_a_packed_rosbag2_is_the_same(tmp_path: Path, mode: str) -> None:
+    whole, packed = open_images(ros2_bag(tmp_path), TOPICS[0]), tmp_path / "packed"
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = rosbag2.Writer(packed, version=9)
+    writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        fill(writer, store, store.serialize_cdr, False)
+    images = open_images(packed, TOPICS[0])
+    np.testing.assert_array_equal(images.times, whole.times)
+    for row in (0, 1, COUNT - 1, 3):
+        np.testing.assert_array_equal(images.image(row), whole.image(row))
+    images.close()
+    whole.close()
+
+
 @pytest.mark.parametrize("kind", ["BZ2", "LZ4"])
 def test_a_packed_bag_is_the_same_and_unpacks_to_no_more_than_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str

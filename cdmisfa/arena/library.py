@@ -5,7 +5,6 @@ FOLDER/NAME-SEED/ holds a stream, K-EXPANSION.npz in it a reference.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,11 +15,12 @@ from numpy.typing import NDArray
 from cdmisfa.arena.pictures import Shown
 from cdmisfa.arena.streams import LEARNED_FROM, STREAMS, make, parse
 from cdmisfa.core.blocks import PIXEL, UINT8
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
+from recorder.log.regular import read_json
 from recorder.log.whole import whole
 from replay.storage.arrays import read_arrays
 
@@ -231,6 +231,6 @@ def _save(path: Path, found: Reference) -> None:
 def _recipe(folder: Path) -> Any:
     """How the stream in a folder was made; None where there is none."""
     try:
-        return json.loads((folder / "about.json").read_text("utf-8"))["recipe"]
-    except (OSError, ValueError, KeyError, TypeError):
+        return read_json(folder / "about.json", "delete it")["recipe"]
+    except (CdmisfaError, KeyError, TypeError):
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from typing import Any
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.experiments.statistics import Summary, summary
 from cdmisfa.experiments.store import DONE, FAILED, ROWS, read_rows
-from cdmisfa.experiments.sweep import REQUEST
+from replay.runs.folders import REQUEST, read_request
 
 SCHEMA = 1
 
@@ -56,13 +55,7 @@ def results(folder: Path) -> list[PointResult]:
     path = folder / REQUEST
     if not path.is_file():
         raise UsageError(f"{folder} holds no {REQUEST}: name the folder of a sweep")
-    try:
-        request = json.loads(path.read_text("utf-8"))
-        trials = [(str(t["id"]), dict(t["point"])) for t in request["trials"]]
-    except OSError as error:
-        raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise LogDamagedError(f"{path} is damaged: run the sweep again to write it") from error
+    trials = read_request(folder)
     rows = {row["id"]: row for row in read_rows(folder)}
     points: dict[tuple[tuple[str, str], ...], list[Any]] = {}
     for number, point in trials:

@@ -14,12 +14,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
+from io import RawIOBase
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
+from cdmisfa.core.memory import BUDGET, MAX_LIST, budget, parse_json
 from cdmisfa.experiments.engines import WorkerDied, run_all
 from recorder.log.folder import held
+from recorder.log.regular import opened_regular
 from recorder.log.whole import make_folder, refuse_special, to_disk
 
 ROWS = "rows.jsonl"
@@ -86,7 +89,7 @@ class TrialStore:
         rows: the last row of every trial, by its identity.
 
     Raises:
-        UsageError: another process holds the folder.
+        UsageError: another process holds the folder, or its rows are no file.
         LogDamagedError: a line is not a row.
         LogWriteError: the disk does not take it, here or in any later call.
     """
@@ -97,11 +100,11 @@ class TrialStore:
             with self._telling():
                 make_folder(folder)
             opened.enter_context(held(folder))
+            refuse_special(self._path)
             with self._telling():
                 # Unbuffered: what a disk refused once is not tried again when it is closed.
                 self._file = opened.enter_context(open(self._path, "a+b", buffering=0))
-                self._file.seek(0)
-                self._file.truncate(self._file.read().rfind(b"\n") + 1)  # a kill cut the rest short
+                self._file.truncate(_whole_lines(self._file))  # a kill cut the rest short
                 to_disk(folder)
             self.rows = {row["id"]: row for row in read_rows(folder)}
             self._opened = opened.pop_all()
@@ -144,20 +147,46 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
     A last line that a kill cut short does not count.
 
     Raises:
-        LogDamagedError: a line is not a row.
+        UsageError: they are in no regular file.
+        LogDamagedError: a line is not a row, or together they take more memory than `budget`.
     """
     path = folder / ROWS
     rows: dict[str, dict[str, Any]] = {}
-    data = path.read_bytes() if path.is_file() else b""
-    for number, line in enumerate(data[: data.rfind(b"\n") + 1].splitlines(), start=1):
-        try:
-            row = json.loads(line)
-            rows[row["id"]] = {**row, "status": row["status"], "point": dict(row["point"])}
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise LogDamagedError(
-                f"{path} line {number} is no trial's row: remove the line"
-            ) from error
+    if not path.exists():
+        return
+    try:
+        with budget(), opened_regular(path) as file:
+            lines = iter(lambda: file.readline(MAX_LIST + 1), b"")
+            for number, line in enumerate(lines, start=1):
+                if not line.endswith(b"\n") and len(line) <= MAX_LIST:
+                    break
+                try:
+                    row = parse_json(line, MAX_LIST)
+                    rows[row["id"]] = {**row, "status": row["status"], "point": dict(row["point"])}
+                except (ValueError, KeyError, TypeError) as error:
+                    raise LogDamagedError(
+                        f"{path} line {number} is no trial's row: remove the line"
+                    ) from error
+    except MemoryError:
+        rows.clear()
+        raise LogDamagedError(
+            f"{path}: its rows take more than {BUDGET >> 20} MiB of memory, the limit: "
+            "split the grid over several folders"
+        ) from None
     yield from rows.values()
+
+
+def _whole_lines(file: RawIOBase) -> int:
+    """Bytes of a file up to the end of its last whole line."""
+    stop = file.seek(0, os.SEEK_END)
+    while stop:
+        start = max(stop - MAX_LIST, 0)
+        file.seek(start)
+        end = (file.read(stop - start) or b"").rfind(b"\n")
+        if end >= 0:
+            return start + end + 1
+        stop = start
+    return 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any, cast
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.plugins import loaded_versions
+from cdmisfa.core.memory import MAX_LIST
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_logs, scene_kind_for
@@ -117,6 +119,11 @@ def sweep(
         max_modules=max_modules,
         logs=folder / "trials" if keep_logs else None,
     )
+    request = _request(grid or {}, trials)
+    if len(json.dumps(request, indent=2)) >= MAX_LIST:
+        raise UsageError(
+            f"{len(trials)} trials are more than a folder takes: split them over several -o"
+        )
     return run_trials(
         trials,
         folder,
@@ -125,7 +132,7 @@ def sweep(
         engine=engine,
         scheduler=scheduler,
         retry_failed=retry_failed,
-        begin=lambda missing: write_json(folder / REQUEST, _request(grid or {}, trials)),
+        begin=lambda missing: write_json(folder / REQUEST, request),
         progress=progress,
     )
 

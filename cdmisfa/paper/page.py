@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.memory import MAX_LIST
 from cdmisfa.paper.reproduce import NAMES, markdown_table
+from recorder.log.regular import read_json
 
 
 def write_page(root: Path, page: Path) -> None:
@@ -56,10 +57,10 @@ def read_results(folder: Path) -> dict[str, Any]:
     """The results.json of an experiment."""
     path = folder / "results.json"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path, "run it again", most=MAX_LIST)
         if document["schema"] != 1:
             raise ValueError(document["schema"])
-    except (OSError, ValueError, KeyError) as error:
+    except (CdmisfaError, ValueError, KeyError, TypeError) as error:
         raise UsageError(
             f"{path} cannot be read: run cdmisfa reproduce {folder.name} again"
         ) from error

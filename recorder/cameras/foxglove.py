@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from recorder.cameras.video import Steady
+from cdmisfa.core.memory import parse_json
 from recorder.images.messages import Decoder, image_decoder
 from recorder.images.pixels import Bytes, Depth
 
@@ -128,7 +129,7 @@ class FoxgloveCamera:
 def _told(message: str | bytes) -> Mapping[str, Any]:
     """What a server says in words; nothing where it says it in bytes."""
     try:
-        told = json.loads(message) if isinstance(message, str) else {}
+        told = parse_json(message) if isinstance(message, str) else {}
     except ValueError:
         told = {}
     return told if isinstance(told, dict) else {}

@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 
 from recorder.images.pixels import Bytes, Depth, MalformedImage, compressed_gray, gray
 
-Decoder = Callable[[bytes], Bytes]
+Decoder = Callable[[bytes | memoryview], Bytes]
 """Turns a message into a gray image, (height, width) uint8; raises MalformedImage."""
 
 
@@ -33,23 +33,23 @@ def image_decoder(schema: str, encoding: str, depth: Depth | None = None) -> Dec
     return decoder if raw is None or depth is None else partial(raw, depth=depth)
 
 
-def _foxglove_raw(data: bytes, depth: Depth | None = None) -> Bytes:
+def _foxglove_raw(data: bytes | memoryview, depth: Depth | None = None) -> Bytes:
     m = _parse(RawImage, data)
     return gray(m.data, m.height, m.width, m.encoding, m.step, depth=depth)
 
 
-def _foxglove_compressed(data: bytes) -> Bytes:
+def _foxglove_compressed(data: bytes | memoryview) -> Bytes:
     return compressed_gray(_parse(CompressedImage, data).data)
 
 
-def _parse(kind: Any, data: bytes) -> Any:
+def _parse(kind: Any, data: bytes | memoryview) -> Any:
     try:
         return kind.FromString(data)
     except DecodeError:
         raise MalformedImage(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
 
 
-def _json_raw(data: bytes, depth: Depth | None = None) -> Bytes:
+def _json_raw(data: bytes | memoryview, depth: Depth | None = None) -> Bytes:
     fields = _json(data)
     numbers = [fields.get(k) for k in ("height", "width", "step")]
     if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
@@ -58,13 +58,13 @@ def _json_raw(data: bytes, depth: Depth | None = None) -> Bytes:
     return gray(_base64(fields), height, width, str(fields.get("encoding")), step, depth=depth)
 
 
-def _json_compressed(data: bytes) -> Bytes:
+def _json_compressed(data: bytes | memoryview) -> Bytes:
     return compressed_gray(_base64(_json(data)))
 
 
-def _json(data: bytes) -> Mapping[str, Any]:
+def _json(data: bytes | memoryview) -> Mapping[str, Any]:
     try:
-        fields = json.loads(data)
+        fields = json.loads(bytes(data))
     except (ValueError, RecursionError):
         raise MalformedImage("a message is no JSON") from None
     if not isinstance(fields, dict):
@@ -82,7 +82,7 @@ def _base64(fields: Mapping[str, Any]) -> bytes:
 class _RosFields:
     """Fields of a ROS message after its header, aligned (ROS 2) or packed (ROS 1)."""
 
-    def __init__(self, data: bytes, *, ros1: bool) -> None:
+    def __init__(self, data: bytes | memoryview, *, ros1: bool) -> None:
         self._data = memoryview(data)
         self._at = 0
         self._ros1 = ros1
@@ -115,14 +115,14 @@ class _RosFields:
         return str(raw if self._ros1 else raw.removesuffix(b"\0"), "utf-8", "replace")
 
 
-def _ros_raw(data: bytes, *, ros1: bool, depth: Depth | None = None) -> Bytes:
+def _ros_raw(data: bytes | memoryview, *, ros1: bool, depth: Depth | None = None) -> Bytes:
     fields = _RosFields(data, ros1=ros1)
     height, width, encoding = fields.u32(), fields.u32(), fields.text()
     big_endian, step = bool(fields.take(1)[0]), fields.u32()
     return gray(fields.data(), height, width, encoding, step, big_endian=big_endian, depth=depth)
 
 
-def _ros_compressed(data: bytes, *, ros1: bool) -> Bytes:
+def _ros_compressed(data: bytes | memoryview, *, ros1: bool) -> Bytes:
     fields = _RosFields(data, ros1=ros1)
     fields.text()
     return compressed_gray(bytes(fields.data()))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.memory import BUDGET, budget
 
 Bytes = NDArray[np.uint8]
 
@@ -199,11 +200,16 @@ def compressed_gray(data: bytes) -> Bytes:
         MalformedImage: it is neither, broken, or too large.
     """
     try:
-        with warnings.catch_warnings():
+        with budget(), warnings.catch_warnings():
             warnings.simplefilter("error")
             image: Image.Image = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
             if not 0 < image.width * image.height <= MAX_PIXELS:
                 raise MalformedImage(f"an image of {image.width}x{image.height} is not read")
+            if image.info.get("progressive") and _progressive_bytes(image) > BUDGET:
+                raise MalformedImage(
+                    f"a progressive JPEG of {image.width}x{image.height} in {image.mode} takes "
+                    f"more than {BUDGET >> 20} MiB of memory, the limit"
+                )
             if image.mode in ("I;16", "I;16B", "I"):
                 return _high_bytes(np.asarray(image))
             if image.mode not in ("L", "RGB"):
@@ -212,5 +218,14 @@ def compressed_gray(data: bytes) -> Bytes:
             return np.array(image, np.uint8)
     except MalformedImage:
         raise
+    except MemoryError:
+        raise MalformedImage(
+            f"its JPEG or PNG takes more than {BUDGET >> 20} MiB of memory, the limit"
+        ) from None
     except Exception as error:  # Pillow raises whatever its codecs raise
         raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
+
+
+def _progressive_bytes(image: Image.Image) -> int:
+    """Memory of decoding a progressive JPEG, whose coefficients are all held until its end."""
+    return image.width * image.height * (2 * len(image.getbands()) + 4)

@@ -22,8 +22,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.memory import MAX_JSON, parse_json
 from recorder.log.folder import RECORDING
+from recorder.log.regular import read_regular
 from recorder.log.whole import to_disk, whole
 
 
@@ -80,17 +81,17 @@ def read_recording(folder: Path) -> Begun:
         given for each unfinished view.
 
     Raises:
+        UsageError: its file is larger than any that says so.
         LogDamagedError: the disk does not give it.
     """
     path = folder / RECORDING
+    data = read_regular(path, MAX_JSON) if path.is_file() else b""
     try:
-        values = json.loads(path.read_text("utf-8") if path.is_file() else "")
+        values = parse_json(data)
         frames = {str(view): n for view, n in values["frames"].items() if _is_count(n) and n > 0}
         split = {v: limit for v, limit in values.get("split", {}).items() if isinstance(limit, str)}
         scene, seed = values.get("scene", ""), values.get("seed")
-    except OSError as error:
-        raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return Begun((), {"frames": {}, "split": {}})
     known = {"seed": seed} if _is_count(seed) and 0 <= seed < 2**63 else {}
     source = (scene,) if scene and isinstance(scene, str) else ()

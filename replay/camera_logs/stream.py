@@ -6,12 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.memory import BUDGET, budget
 from recorder.images.messages import SCHEMAS, Decoder, image_decoder
 from recorder.images.pixels import RECIPE, Depth
 from replay.mcap.records import Bytes
@@ -130,7 +131,7 @@ def choose_images(
     raise UsageError(f"{path}: no topic {topic}; it has images on: {known}")
 
 
-def sorted_times(where: str, times: Sequence[int] | NDArray[np.uint64]) -> NDArray[np.uint64]:
+def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) -> NDArray[np.uint64]:
     """The times of a stream in their order, as every stream holds them.
 
     Args:
@@ -146,12 +147,23 @@ def sorted_times(where: str, times: Sequence[int] | NDArray[np.uint64]) -> NDArr
 
 
 @contextmanager
-def explained(path: Location, program: str) -> Iterator[None]:
-    """Say in one line what a library that lets any exception through cannot read."""
+def explained(path: Location, program: str, *, held: int = 0) -> Iterator[None]:
+    """Say in one line what a library cannot read that lets any exception through, or any size.
+
+    Args:
+        path: what is read.
+        program: the library.
+        held: bytes of the memory that it may take which are taken already.
+    """
     try:
-        yield
-    except (CdmisfaError, MemoryError):
+        with budget(max(BUDGET - held, 0)):
+            yield
+    except CdmisfaError:
         raise
+    except MemoryError:
+        raise LogDamagedError(
+            f"{path}: {program} takes more than {BUDGET >> 20} MiB of memory for it, the limit"
+        ) from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise LogDamagedError(f"{path}: {program} cannot read it ({reason})") from None

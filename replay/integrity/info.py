@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from cdmisfa.core.memory import parse_json
 from replay.camera_logs.catalogue import channels_of
 from replay.camera_logs.opening import only_foreign
 from replay.inputs.words import places
@@ -162,8 +162,8 @@ def _seed(records: Sequence[Mapping[str, str]]) -> int | None:
     """The one seed that all metadata names."""
     seeds: set[int] = set()
     for values in records:
-        with contextlib.suppress(ValueError, TypeError, AttributeError, RecursionError):
-            manifest = json.loads(values.get("manifest", "{}"))
+        with contextlib.suppress(ValueError, TypeError, AttributeError):
+            manifest = parse_json(values.get("manifest", "{}"))
             seeds.add(int(values.get("seed", manifest.get("seed"))))
     return seeds.pop() if len(seeds) == 1 else None
 

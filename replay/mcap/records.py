@@ -18,7 +18,7 @@ from cdmisfa.core.errors import LogDamagedError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD_HEADER: Final = struct.Struct("<BQ")
-MAX_CHUNK: Final = 192 * 1024 * 1024
+MAX_CHUNK: Final = 144 * 1024 * 1024
 """Largest decompressed chunk, in bytes, that is read; asked for before decompressing."""
 MAX_DEFINITION: Final = 64 * 1024 * 1024
 """Largest schema, channel or metadata record, in bytes, that is read."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -20,6 +21,9 @@ from replay.mcap.records import (
     walk,
 )
 from replay.mcap.segments import Segment
+
+MAX_MESSAGES: Final = 1 << 20
+"""Most messages of a chunk that are read; their table takes some 100 bytes of each."""
 
 _NO_TIMES: Final = np.empty(0, np.uint64)
 
@@ -58,12 +62,17 @@ class MessageTable:
         return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
 
     def payload(self, row: int) -> bytes:
+        return self.view(row).tobytes()
+
+    def view(self, row: int) -> memoryview:
+        """A payload where it lies in the chunk."""
         at = int(self.at[row])
-        return self.data[at : at + int(self.size[row])].tobytes()
+        return self.data[at : at + int(self.size[row])].data
 
 
 def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
     """Build the table of the message records that begin at n places of a chunk, and check them."""
+    _check_count(len(offsets))
     if len(offsets) == 0:
         return MessageTable(data, np.empty(0, MESSAGE_HEADER), offsets, offsets)
     width = MESSAGE_HEADER.itemsize
@@ -83,19 +92,25 @@ def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
     return MessageTable(data, headers, at, size)
 
 
+def _check_count(messages: int) -> None:
+    if messages > MAX_MESSAGES:
+        raise MalformedRecord(f"it holds more than {MAX_MESSAGES} messages, the limit of a chunk")
+
+
 def walked_table(raw: Bytes, *, cut: bool = False) -> tuple[MessageTable, Spans]:
     """Build the table of a chunk by walking over its records, without the broken end of a cut one.
 
     Raises:
         MalformedRecord: the chunk holds something that is no record, or that has no place there.
     """
-    offsets: list[int] = []
+    offsets = array("q")
     definitions: Spans = []
     try:
         for opcode, at, end in walk(raw.data, 0, len(raw)):
             if opcode == Opcode.MESSAGE:
                 if end - at < MESSAGE_HEADER.itemsize:
                     raise MalformedRecord("a message is shorter than its own header")
+                _check_count(len(offsets))
                 offsets.append(at)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.append((opcode, at + RECORD_HEADER.size, end))

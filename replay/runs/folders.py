@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.memory import MAX_LIST
+from recorder.log.regular import read_json
 from recorder.log.whole import partial_path
 from replay.mcap.reader import LogReader
-from replay.storage.regular import read_regular
 
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""
@@ -29,9 +29,6 @@ RUN_METADATA = "cdmisfa.run"
 
 FINAL_METADATA = "cdmisfa.final"
 """Name of the metadata record by which a finished run proves itself; see `final`."""
-
-MAX_JSON: Final = 16 * 1024 * 1024
-"""Largest run.json that is read, in bytes; in memory it may take twenty times as much."""
 
 REQUEST = "sweep.json"
 """File of a sweep that names the trials it was asked for last."""
@@ -70,8 +67,8 @@ def is_run(path: Path) -> bool:
 def read_run_json(folder: Path) -> Mapping[str, Any]:
     """How a run was begun and what came of it; empty where nothing readable says so."""
     try:
-        document = json.loads(read_regular(folder / RUN_JSON, MAX_JSON).decode("utf-8"))
-    except (CdmisfaError, ValueError, RecursionError):
+        document = read_json(folder / RUN_JSON, "learn again")
+    except CdmisfaError:
         return {}
     return document if isinstance(document, Mapping) else {}
 
@@ -89,7 +86,7 @@ def runs_in(folder: Path) -> list[Path]:
         return []
     trials = list((folder / "trials").glob("*"))
     if is_sweep(folder):
-        wanted = _requested(folder / REQUEST)
+        wanted = {trial for trial, _ in read_request(folder)}
         trials = [trial for trial in trials if trial.name.partition(".")[0] in wanted]
     return sorted(p for p in (*folder.iterdir(), *trials) if p.is_dir() and is_run(p))
 
@@ -99,8 +96,16 @@ def is_sweep(folder: Path) -> bool:
     return (Path(folder) / REQUEST).is_file()
 
 
-def _requested(request: Path) -> set[str]:
+def read_request(folder: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The trials that a sweep was asked for last, in the order of its grid: each id and point.
+
+    Raises:
+        UsageError: the file that says so is none, or too large.
+        LogDamagedError: it is damaged, or the disk does not give it.
+    """
+    path, remedy = folder / REQUEST, "run the sweep again to write it"
+    request = read_json(path, remedy, most=MAX_LIST)
     try:
-        return {str(trial["id"]) for trial in json.loads(request.read_text("utf-8"))["trials"]}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise LogDamagedError(f"{request} is damaged: run the sweep again to write it") from error
+        return [(str(trial["id"]), dict(trial["point"])) for trial in request["trials"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise LogDamagedError(f"{path} is damaged: {remedy}") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Keyframe
+from cdmisfa.core.memory import parse_json
 from cdmisfa.core.signals import SCHEMA_VERSION
 from replay.mcap.reader import LogReader
 from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
@@ -114,11 +114,11 @@ def read_header(path: Path) -> RunHeader:
             f"{SCHEMA_VERSION}: install a newer cdmisfa to read it"
         )
     try:
-        spec = json.loads(found["spec"])
+        spec = parse_json(found["spec"])
         for name in ("streams", "frame_shape", "truth"):
             spec[name] = tuple(spec[name])
-        return RunHeader(schema, SourceSpec(**spec), json.loads(found["manifest"]))
-    except (KeyError, TypeError, ValueError, RecursionError, UsageError) as error:
+        return RunHeader(schema, SourceSpec(**spec), parse_json(found["manifest"]))
+    except (KeyError, TypeError, ValueError, UsageError) as error:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, one_line
 from cdmisfa.core.learning import Keyframe, LearnerState
+from cdmisfa.core.memory import parse_json
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import (
     CODES,
@@ -176,7 +177,7 @@ def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
     """
     decoded = parsed(_KEYFRAME, data, where)
     try:
-        facts = json.loads(decoded.facts)
+        facts = parse_json(decoded.facts)
         if facts["version"] != KEYFRAME_VERSION:
             raise LogDamagedError(f"{where}: a keyframe of version {facts['version']!r}")
         arrays = stored_arrays(facts["arrays"], decoded.values)
@@ -188,7 +189,7 @@ def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
         state = LearnerState(arrays, _modules(columns), dict(facts["policy_rng"]))
         taken = facts["taken"] if isinstance(facts["taken"], str) else None
         return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]), taken)
-    except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise LogDamagedError(f"{where}: not a keyframe ({one_line(error)})") from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import contextlib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.images.messages import Decoder, image_decoder
 from recorder.images.pixels import Depth
+from replay.camera_logs.formats.bag_folder import plain_bag, unpacked_message
 from replay.camera_logs.stream import (
     ChannelFacts,
     ImageStream,
@@ -39,10 +41,11 @@ class BagImages(ImageStream):
         self.path = path
         self._messages: Iterator[tuple[int, bytes]] = iter(())
         self._next = -1
-        ros1 = _is_ros1(path)
-        self._reader = _opened(path, ros1=ros1)
+        self._ros1 = _is_ros1(path)
+        self._opened = contextlib.ExitStack()
         try:
-            self._connections, self._decode = self._find(topic, depth, ros1=ros1)
+            self._reader, self._packed = self._opened.enter_context(_opened(path))
+            self._connections, self._decode = self._find(topic, depth)
             self.topic = str(self._connections[0].topic)
             with explained(path, "rosbags"):
                 stamps = [stamp for stamp, _ in self._from(None)]
@@ -62,13 +65,13 @@ class BagImages(ImageStream):
             while self._next <= row:
                 _, data = next(self._messages, (0, b""))
                 self._next += 1
+            if self._packed:
+                data = unpacked_message(data)
         return self._decode(data)
 
     def close(self) -> None:
-        reader, self._reader = self._reader, None
-        if reader is not None:
-            self._messages = iter(())
-            reader.close()
+        self._messages = iter(())
+        self._opened.close()
 
     def _from(self, start: int | None) -> Iterator[tuple[int, bytes]]:
         before = 0
@@ -80,11 +83,8 @@ class BagImages(ImageStream):
             before = stamp
             yield stamp, data
 
-    def _find(
-        self, topic: str | None, depth: Depth | None, *, ros1: bool
-    ) -> tuple[list[Any], Decoder]:
-        kinds = _kinds(self._reader, ros1=ros1)
-        encoding = "ros1" if ros1 else "cdr"
+    def _find(self, topic: str | None, depth: Depth | None) -> tuple[list[Any], Decoder]:
+        kinds, encoding = _kinds(self._reader, ros1=self._ros1)
         channels = [(name, kind, encoding, name) for name, kind in kinds.items()]
         chosen, decode = choose_images(self.path, topic, channels, depth)
         return [c for c in self._reader.connections if c.topic == chosen], decode
@@ -97,16 +97,12 @@ def bag_channels(path: Path) -> list[ChannelFacts]:
         CdmisfaError: the package rosbags is missing.
         LogDamagedError: rosbags cannot read it.
     """
-    ros1 = _is_ros1(path)
-    reader = _opened(path, ros1=ros1)
-    try:
-        kinds, encoding = _kinds(reader, ros1=ros1), "ros1" if ros1 else "cdr"
+    with _opened(path) as (reader, _):
+        kinds, encoding = _kinds(reader, ros1=_is_ros1(path))
         stamps: dict[str, list[int]] = {name: [] for name in kinds}
         with explained(path, "rosbags"):
             for connection, stamp, _ in reader.messages():
                 stamps[str(connection.topic)].append(stamp)
-    finally:
-        reader.close()
     return [
         ChannelFacts(
             name,
@@ -123,10 +119,8 @@ def bag_channels(path: Path) -> list[ChannelFacts]:
 
 def bag_topics(path: Path) -> list[str]:
     """The topics of images in a bag; raises as `bag_channels` does."""
-    ros1 = _is_ros1(path)
-    reader = _opened(path, ros1=ros1)
-    kinds, encoding = _kinds(reader, ros1=ros1), "ros1" if ros1 else "cdr"
-    reader.close()
+    with _opened(path) as (reader, _):
+        kinds, encoding = _kinds(reader, ros1=_is_ros1(path))
     return [name for name, kind in kinds.items() if image_decoder(kind, encoding)]
 
 
@@ -134,13 +128,20 @@ def _is_ros1(path: Path) -> bool:
     return path.suffix == ".bag" and path.is_file()
 
 
-def _kinds(reader: Any, *, ros1: bool) -> dict[str, str]:
-    """The type of each topic's messages; several publishers of ROS 1 are several connections."""
+def _kinds(reader: Any, *, ros1: bool) -> tuple[dict[str, str], str]:
+    """The type of each topic's messages, and how all are encoded.
+
+    Several publishers of ROS 1 are several connections.
+    """
     kinds = {str(c.topic): str(c.msgtype) for c in reader.connections}
-    return {name: kind.replace("/msg/", "/") if ros1 else kind for name, kind in kinds.items()}
+    if not ros1:
+        return kinds, "cdr"
+    return {name: kind.replace("/msg/", "/") for name, kind in kinds.items()}, "ros1"
 
 
-def _opened(path: Path, *, ros1: bool) -> Any:
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, bool]]:
+    """A bag's reader, and whether the messages that it gives are packed."""
     try:
         from rosbags.rosbag1 import Reader as Rosbag1
         from rosbags.rosbag2 import Reader as Rosbag2
@@ -148,16 +149,17 @@ def _opened(path: Path, *, ros1: bool) -> Any:
         raise CdmisfaError(
             f"{path} is a ROS bag, which needs rosbags: pip install rosbags (the extra [ros])"
         ) from None
-    with explained(path, "rosbags"):
-        reader: Any = Rosbag1(path) if ros1 else Rosbag2(path)
-        reader.open()
-        try:
-            if ros1:
+    with plain_bag(path) as (plain, packed), contextlib.ExitStack() as opened:
+        with explained(path, "rosbags"):
+            reader: Any = Rosbag1(plain) if _is_ros1(path) else Rosbag2(plain)
+            reader.open()
+            opened.callback(reader.close)
+            if _is_ros1(path):
                 reader.chunks = {place: _bounded(chunk) for place, chunk in reader.chunks.items()}
-        except BaseException:
-            reader.close()
-            raise
-        return reader
+            elif packed:  # rosbags would unpack whatever comes of it
+                storage = reader.storage
+                storage.metadata = storage.metadata._replace(compression_mode=None)
+        yield reader, packed
 
 
 def _bounded(chunk: Any) -> Any:

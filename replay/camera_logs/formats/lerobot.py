@@ -5,7 +5,6 @@ The layout is read as it is published (github.com/huggingface/lerobot), with PyA
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -15,9 +14,10 @@ import numpy as np
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.pixels import compressed_gray
+from recorder.log.regular import check_regular, read_json
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.stream import ChannelFacts, ImageStream, explained
-from replay.mcap.records import Bytes, MalformedRecord
+from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
 
 INFO: Final = "meta/info.json"
 PAUSE: Final = 20
@@ -97,8 +97,8 @@ class LeRobotImages(ImageStream):
     def _table(self, file: Path) -> Any:
         import pyarrow.parquet as pq
 
-        with explained(file, "PyArrow"):
-            return pq.read_table(file, columns=["index", self.topic])
+        with explained(file, "PyArrow", held=MAX_CHUNK):
+            return pq.read_table(file, columns=["index", self.topic], use_threads=False)
 
     def _picture(self, table: Any, index: int) -> Bytes:
         row = index - int(table["index"][0].as_py())
@@ -108,7 +108,8 @@ class LeRobotImages(ImageStream):
         data = value.get("bytes") if isinstance(value, Mapping) else None
         if not isinstance(data, bytes):
             raise MalformedRecord("its table holds no picture there")
-        return compressed_gray(data)
+        with explained(self.path, "Pillow", held=table.nbytes + len(data)):
+            return compressed_gray(data)
 
 
 def is_dataset(path: Path) -> bool:
@@ -144,11 +145,11 @@ _IMAGES: Final = ("video", "image")
 
 def _info(path: Path) -> Any:
     try:
-        info = json.loads((path / INFO).read_text("utf-8"))
+        info = read_json(path / INFO, "it describes no LeRobot dataset")
         version = str(info["codebase_version"])
         sound = all(isinstance(f, dict) for f in info["features"].values()) and info["fps"] > 0
         int(info["total_frames"])
-    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+    except (LogDamagedError, ValueError, KeyError, TypeError, AttributeError):
         sound, version = False, "v3"
     if not version.startswith("v3"):
         raise UsageError(
@@ -169,6 +170,7 @@ def _episodes(path: Path, columns: list[str]) -> list[dict[str, Any]]:
     if not files:
         raise LogDamagedError(f"{path}: there is no table of its episodes")
     for file in files:
+        check_regular(file)
         with explained(file, "PyArrow"):
-            rows += pq.ParquetFile(file).read(columns=columns).to_pylist()
+            rows += pq.ParquetFile(file).read(columns=columns, use_threads=False).to_pylist()
     return sorted(rows, key=lambda row: int(row["episode_index"]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.messages import image_decoder
 from recorder.images.pixels import Depth
-from replay.camera_logs.stream import ImageStream, choose_images, sorted_times
+from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Bytes, MalformedRecord
 from replay.mcap.segments import Segment
@@ -63,7 +63,8 @@ class McapImages(ImageStream):
             if place >= len(own) or table.log_time[own[place]] != self.times[row]:
                 raise MalformedRecord("its chunk holds other messages than the summary names")
             place = int(own[place])
-        return self._decode(table.payload(place))
+        with explained(self.path, "its decoder", held=table.data.nbytes):
+            return self._decode(table.view(place))
 
     def confirm(self) -> None:
         self.reader.confirm()

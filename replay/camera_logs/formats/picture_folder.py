@@ -10,9 +10,9 @@ import numpy as np
 
 from cdmisfa.core.errors import UsageError
 from recorder.images.pixels import compressed_gray
+from recorder.log.regular import check_regular, read_regular
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
-from replay.storage.regular import check_regular, read_regular
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 

@@ -6,6 +6,7 @@ on the processor, comes between; only videos without luma are taken by their col
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.memory import data_bytes
 from recorder.images.frames import VIDEO_RECIPE, frame_gray
 from recorder.images.pixels import MAX_PIXELS
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
@@ -47,9 +49,11 @@ class VideoImages(ImageStream):
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a video has no topics, leave {topic} out")
         try:
+            before = data_bytes()
             with explained(path, "FFmpeg"):
                 self._container = self._av.open(str(path))
                 self._open()
+            self._held = data_bytes() - before
         except BaseException:
             self.close()
             raise
@@ -60,7 +64,7 @@ class VideoImages(ImageStream):
 
     def image(self, row: int) -> Bytes:
         stamp = int(self._stamps[row])
-        with explained(self.path, "FFmpeg"):
+        with explained(self.path, "FFmpeg", held=self._held):
             if not self._next <= row < self._next + _FORWARD:
                 self._container.seek(stamp, stream=self._stream, backward=True)
                 self._frames = self._container.decode(self._stream)
@@ -93,7 +97,7 @@ class VideoImages(ImageStream):
             raise LogDamagedError(f"{self.path}: images of {pixels} pixels are not read")
         self.encoding = str(stream.codec_context.name)
         self._tick = Fraction(stream.time_base)
-        stamps: list[int] = []
+        stamps = array("q")
         packets = 0
         for packet in self._container.demux(stream):
             packets += packet.size > 0
@@ -116,8 +120,9 @@ class VideoImages(ImageStream):
         self._stated_seconds = (self._container.duration or 0) / self._av.time_base
         # From the video's beginning, or its first frame if that is before.
         first = min(int(self._stamps[0]), 0)
-        exact = [round((int(stamp) - first) * self._tick * NANOSECONDS) for stamp in self._stamps]
-        self.times = sorted_times(f"{self.path}: it", exact)
+        exact = (round((int(stamp) - first) * self._tick * NANOSECONDS) for stamp in self._stamps)
+        nanoseconds = np.fromiter(exact, np.int64, len(self._stamps))
+        self.times = sorted_times(f"{self.path}: it", nanoseconds)
         self._container.seek(0, stream=stream, backward=True)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.memory import parse_json
 from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from replay.mcap.reader import LogReader
@@ -73,8 +73,8 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
         return None
     try:
-        config = _table(_table(json.loads(data)).get("scene"))
-    except (ValueError, RecursionError) as error:
+        config = _table(_table(parse_json(data)).get("scene"))
+    except ValueError as error:
         raise LogDamagedError(f"{file}: its {CONFIG_NAME} is broken ({error})") from error
     return scenery_of(config, NECK if pose is None else pose.position)
 

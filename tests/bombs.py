@@ -1,0 +1,259 @@
+"""Small files that would take far more memory than they have bytes, one for each decoder."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from mcap.writer import CompressionType, IndexType, Writer
+from PIL import Image
+
+Writing = Callable[[Path], Path]
+"""Writes into a folder, and says what."""
+
+PART = 1 << 20
+
+EPISODES = "meta/episodes/a.parquet"
+
+METADATA = """rosbag2_bagfile_information:
+  version: 5
+  storage_identifier: sqlite3
+  duration: {{nanoseconds: 1}}
+  starting_time: {{nanoseconds_since_epoch: 1}}
+  message_count: 1
+  topics_with_message_count:
+    - topic_metadata: {{name: /cam, type: sensor_msgs/msg/Image, serialization_format: cdr,
+                        offered_qos_profiles: ""}}
+      message_count: 1
+  compression_format: zstd
+  compression_mode: {mode}
+  relative_file_paths: [{name}]
+"""
+
+TABLES = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,
+                    offered_qos_profiles TEXT);
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data {data});
+INSERT INTO topics VALUES(1, '/cam', 'sensor_msgs/msg/Image', 'cdr', '');
+"""
+
+
+def zeros(mebibytes: int) -> bytes:
+    """Nothing but zeros, packed by zstd."""
+    packing = zstandard.ZstdCompressor().compressobj()
+    return b"".join(packing.compress(bytes(PART)) for _ in range(mebibytes)) + packing.flush()
+
+
+def database(path: Path, message: bytes | None, data: str = "BLOB") -> None:
+    """A rosbag2's file with one message, or with one that its table makes up."""
+    connection = sqlite3.connect(path)
+    connection.executescript(TABLES.format(data=data))
+    if message is None:
+        connection.execute("INSERT INTO messages(topic_id, timestamp) VALUES(1, 5)")
+    else:
+        connection.execute("INSERT INTO messages VALUES(1, 1, 5, ?)", (message,))
+    connection.commit()
+    connection.close()
+
+
+def made_up_message(folder: Path) -> Path:
+    database(folder / "a.db3", None, "BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL")
+    return folder / "a.db3"
+
+
+def packed_message(folder: Path) -> Path:
+    (folder / "bag").mkdir()
+    database(folder / "bag" / "a.db3", zeros(400))
+    (folder / "bag" / "metadata.yaml").write_text(METADATA.format(mode="MESSAGE", name="a.db3"))
+    return folder / "bag"
+
+
+def packed_file(folder: Path) -> Path:
+    (folder / "bag").mkdir()
+    (folder / "bag" / "a.db3.zstd").write_bytes(zeros(300))
+    (folder / "bag" / "metadata.yaml").write_text(METADATA.format(mode="FILE", name="a.db3.zstd"))
+    return folder / "bag"
+
+
+def ros1_chunks(size: int) -> Writing:
+    """A bag of ROS 1 with a chunk of one message."""
+
+    def write(folder: Path) -> Path:
+        from rosbags import rosbag1
+        from rosbags.typesys import Stores, get_typestore
+
+        writer = rosbag1.Writer(folder / "a.bag")
+        writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+        with writer:
+            store = get_typestore(Stores.ROS1_NOETIC)
+            topic = writer.add_connection("/cam", "sensor_msgs/msg/Image", typestore=store)
+            writer.write(topic, 1, bytes(size))
+        return folder / "a.bag"
+
+    return write
+
+
+def png(side: int) -> bytes:
+    """The beginning of a square PNG."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        crc = zlib.crc32(kind + data)
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc)
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    parts = head, chunk(b"IDAT", zlib.compress(bytes(10**8), 1)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def picture(folder: Path) -> Path:
+    """A PNG of 60,000x60,000."""
+    (folder / "pictures").mkdir()
+    (folder / "pictures" / "0.png").write_bytes(png(60_000))
+    return folder / "pictures"
+
+
+def progressive(folder: Path) -> Path:
+    """A JPEG whose coefficients are all held until its end."""
+    (folder / "pictures").mkdir()
+    image = Image.new("CMYK", (9000, 4000), 3)
+    image.save(folder / "pictures" / "0.jpg", progressive=True)
+    return folder / "pictures"
+
+
+def log(schema: str, encoding: str, payloads: Iterable[bytes], chunk: int = 1) -> Writing:
+    """An MCAP log of messages, a chunk each or more."""
+
+    def write(folder: Path) -> Path:
+        with (folder / "a.mcap").open("wb") as file:
+            writer = Writer(
+                file, chunk_size=chunk, compression=CompressionType.ZSTD, index_types=IndexType.NONE
+            )
+            writer.start()
+            kind = writer.register_schema(schema, "protobuf", b"")
+            topic = writer.register_channel("/cam", encoding, kind)
+            for payload in payloads:
+                writer.add_message(topic, 5, payload, 5)
+            writer.finish()
+        return folder / "a.mcap"
+
+    return write
+
+
+def video(folder: Path) -> Path:
+    """Three frames of a video, as its container has them."""
+    import av
+
+    with av.open(str(folder / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for number in range(3):
+            frame = av.VideoFrame.from_ndarray(np.zeros((48, 64), np.uint8), format="gray")
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return folder / "a.mp4"
+
+
+def endless_index(folder: Path) -> Path:
+    """A video that says that it has sixty million frames."""
+    path = video(folder)
+    raw = bytearray(path.read_bytes())
+    struct.pack_into(">II", raw, raw.index(b"stsz") + 8, 1, 60_000_000)
+    struct.pack_into(">III", raw, raw.index(b"stts") + 8, 1, 60_000_000, 512)
+    struct.pack_into(">II", raw, raw.index(b"stsc") + 16, 60_000_000, 1)
+    path.write_bytes(raw)
+    return path
+
+
+def huge_frames(folder: Path) -> Path:
+    """A video of 64x48 whose frames are pictures of 16,384x16,384."""
+    import av
+
+    picture = png(16_384)
+    with av.open(str(folder / "a.mp4"), "w") as container:
+        stream = container.add_stream("png", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "rgb24"
+        stream.codec_context.open()
+        for number in range(3):
+            packet = av.Packet(picture)
+            packet.stream, packet.is_keyframe = stream, True
+            packet.pts = packet.dts = number
+            packet.time_base = stream.codec_context.time_base
+            container.mux(packet)
+    return folder / "a.mp4"
+
+
+def says_huge(folder: Path) -> Path:
+    """A video whose container says that it is 16,384x16,384."""
+    path = video(folder)
+    raw = bytearray(path.read_bytes())
+    struct.pack_into(">HH", raw, raw.index(b"avc1", raw.index(b"stsd")) + 28, 16_384, 16_384)
+    struct.pack_into(">II", raw, raw.index(b"tkhd") + 80, 16_384 << 16, 16_384 << 16)
+    path.write_bytes(raw)
+    return path
+
+
+def table_of_pictures(folder: Path) -> Path:
+    """A LeRobot dataset whose picture is 300 MiB of zeros."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = {"codebase_version": "v3.0", "fps": 25, "total_frames": 1, "data_path": "data.parquet"}
+    features = {"cam": {"dtype": "image", "shape": [1, 1, 1]}}
+    (folder / "meta/episodes").mkdir(parents=True)
+    (folder / "meta/info.json").write_text(json.dumps({**names, "features": features}))
+    episode = {"episode_index": 0, "length": 1, "dataset_from_index": 0}
+    places = {"data/chunk_index": 0, "data/file_index": 0}
+    pq.write_table(pa.Table.from_pylist([{**episode, **places}]), folder / EPISODES)
+    pictures = [{"index": 0, "cam": {"bytes": bytes(300 << 20), "path": ""}}]
+    pq.write_table(pa.Table.from_pylist(pictures), folder / "data.parquet", compression="zstd")
+    return folder
+
+
+def table_of_episodes(folder: Path) -> Path:
+    """A LeRobot dataset with ten million episodes, which are all the same."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = table_of_pictures(folder)
+    columns = pq.read_schema(path / EPISODES).names
+    part = pa.table({name: pa.array(np.zeros(10**7, np.int64)) for name in columns})
+    with pq.ParquetWriter(path / EPISODES, part.schema, compression="zstd") as file:
+        file.write_table(part)
+    return path
+
+
+CAMERAS: dict[str, Writing] = {
+    "made up message of .db3": made_up_message,
+    "packed message of .db3": packed_message,
+    "packed .db3": packed_file,
+    "chunk of .bag": ros1_chunks(160_000_000),
+    "PNG": picture,
+    "progressive JPEG": progressive,
+    "video's index": endless_index,
+    "video's frames": huge_frames,
+    "video's size": says_huge,
+    "dataset's pictures": table_of_pictures,
+    "dataset's episodes": table_of_episodes,
+    "JSON image": log("foxglove.RawImage", "json", [b"[" + b"[]," * 8_000_000 + b"[]]"]),
+    "protobuf image": log("foxglove.RawImage", "protobuf", [bytes(140_000_000)]),
+    "CDR image": log("sensor_msgs/msg/Image", "cdr", [bytes(140_000_000)]),
+    "messages of a chunk": log(
+        "foxglove.RawImage", "protobuf", (b"" for _ in range(1_100_000)), 130_000_000
+    ),
+}
+"""By what they are bombs of; each is written to a folder."""
+
+
+def write_all(folder: Path) -> None:
+    """Write each of `CAMERAS` to a folder of its own, with where it is in `path`."""
+    for number, write in enumerate(CAMERAS.values()):
+        place = folder / str(number)
+        place.mkdir()
+        (folder / f"{number}.path").write_text(str(write(place)))

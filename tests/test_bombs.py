@@ -1,0 +1,166 @@
+"""Small files that unpack to gigabytes take 512 MB at most, and one clear line."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bombs import CAMERAS, METADATA, write_all
+from test_modules import learned
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.learning import Keyframe
+from cdmisfa.core.memory import BUDGET, budget
+from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.experiments.results import results
+from cdmisfa.experiments.store import ROWS
+from cdmisfa.experiments.sweep import sweep
+from recorder.log.begun import read_recording
+from recorder.log.folder import RECORDING
+from recorder.log.logfile import LogFile
+from replay.camera_logs.opening import open_images
+from replay.mcap.records import MalformedRecord
+from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
+from replay.runs.log import read_header
+from replay.runs.messages import decode_keyframe, encode_keyframe
+
+OWN = 112
+"""Megabytes of a command that has read nothing yet."""
+
+
+def kilobytes(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(name)).split()[1])
+
+
+def growth(work: Callable[[], object]) -> float:
+    """Megabytes that some work takes at most, and lets go of again."""
+    Path("/proc/self/clear_refs").write_text("5")
+    before = kilobytes("VmRSS")
+    work()
+    return (kilobytes("VmHWM") - before) / 1024
+
+
+def first_image(path: Path) -> None:
+    images = open_images(path, None)
+    try:
+        for row in range(min(images.count, 2)):
+            images.image(row)
+    finally:
+        images.close()
+
+
+@pytest.fixture(scope="module")
+def bombs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """All of them, from a process of its own: what writing takes is not there to be read with."""
+    folder = tmp_path_factory.mktemp("bombs")
+    writing = multiprocessing.get_context("fork").Process(target=write_all, args=(folder,))
+    writing.start()
+    writing.join()
+    assert writing.exitcode == 0
+    return {n: Path((folder / f"{i}.path").read_text()) for i, n in enumerate(CAMERAS)}
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_camera_logs(kind: str, bombs: dict[str, Path]) -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    said = []
+
+    def read() -> None:
+        try:
+            first_image(bombs[kind])
+        except (CdmisfaError, MalformedRecord) as error:
+            said.append(str(error))
+
+    took = growth(read)
+    assert took + OWN < 512
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+    assert [(10 < len(x) < 400, "\n" in x) for x in said] in ([(True, False)], [])
+    assert bool(said) == (kind != "video's size")
+
+
+LISTS = b"[" + b"[]," * (1 << 21) + b"[]]"
+"""6 MiB of JSON that take some 150."""
+
+
+def test_documents_of_logs(tmp_path: Path) -> None:
+    run = tmp_path / "run.mcap"
+    with LogFile(run) as log:
+        values = {"schema": str(SCHEMA_VERSION), "spec": LISTS.decode(), "manifest": LISTS.decode()}
+        log.add_metadata(RUN_METADATA, values)
+    learner, _ = learned("uint8", "none")
+    keyframe = encode_keyframe(Keyframe(1, 0, learner.state, {"python": LISTS.decode()}))
+
+    def read() -> None:
+        for decode in (lambda: read_header(run), lambda: decode_keyframe(keyframe)):
+            with pytest.raises(LogDamagedError, match="JSON, above the limit"):
+                decode()
+
+    assert growth(read) < 150
+
+
+def test_side_files(tmp_path: Path) -> None:
+    def read() -> None:
+        for name in (REQUEST, RECORDING, RUN_JSON):
+            (tmp_path / name).write_bytes(LISTS)
+        with pytest.raises(UsageError, match=rf"{RECORDING}: \d+ bytes, above the limit of"):
+            read_recording(tmp_path)
+        assert read_run_json(tmp_path) == {}
+        with pytest.raises(LogDamagedError, match=f"{REQUEST} is damaged: run the sweep again"):
+            results(tmp_path)
+        os.truncate(tmp_path / REQUEST, 1 << 33)
+        with pytest.raises(UsageError, match="above the limit"):
+            results(tmp_path)
+
+    assert growth(read) + OWN < 512
+
+
+@pytest.mark.parametrize("line", [b'{"id":"%d","status":"done","point":{},"a":%b}\n', b"%d%b"])
+def test_rows(tmp_path: Path, line: bytes) -> None:
+    (tmp_path / REQUEST).write_text('{"trials": []}')
+    (tmp_path / ROWS).write_bytes(b"".join(line % (i, LISTS) for i in range(6)))
+
+    def read() -> None:
+        with pytest.raises(LogDamagedError, match=rf"{ROWS}.*(MiB of memory|remove the line)"):
+            results(tmp_path)
+
+    assert growth(read) + OWN < 512
+
+
+@pytest.mark.parametrize("name", [REQUEST, ROWS])
+def test_side_files_that_are_none_are_not_waited_for(tmp_path: Path, name: str) -> None:
+    (tmp_path / REQUEST).write_text('{"trials": []}')
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(UsageError, match=name):
+        results(tmp_path)
+
+
+def test_a_sweep_that_nobody_could_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdmisfa.experiments.sweep.MAX_LIST", 1000)
+    with pytest.raises(UsageError, match="20 trials are more than a folder takes"):
+        sweep(["oscillatory"], tmp_path / "out", seeds=range(20))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_of_a_bag_that_is_none_is_not_waited_for(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text(METADATA.format(mode="", name="a.db3"))
+    os.mkfifo(tmp_path / "a.db3")
+    with pytest.raises(UsageError, match=r"a\.db3: no regular file"):
+        first_image(tmp_path)
+
+
+def test_the_budget_ends_with_its_body() -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with budget(64 << 20), budget():
+        bytearray(32 << 20)
+        with pytest.raises(MemoryError):
+            bytearray(BUDGET)
+    bytearray(128 << 20)
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
