@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -153,6 +155,7 @@ def test_a_simulator_goes_on(tmp_path: Path) -> None:
 SLOW = """
 import sys, time
 from pathlib import Path
+from typing import Any
 import test_resume as case
 from recorder.world.oscillatory import OscillatorySource
 case.go(OscillatorySource(), Path(sys.argv[1]), case.LENGTH, resume=sys.argv[2] == "resume",
@@ -302,6 +305,35 @@ def test_a_forced_run_keeps_nothing_of_the_one_before(tmp_path: Path) -> None:
     go(OscillatorySource(), out, 60)
     go(OscillatorySource(), out, 20, seed=4, force=True)
     assert keyframes(out) == [20]
+
+
+@pytest.mark.parametrize("removed", range(3))
+def test_a_kill_while_a_run_is_replaced_leaves_none_or_says_how_to_go_on(
+    whole: Path, tmp_path: Path, cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch, removed: int
+) -> None:
+    run = Path(shutil.copytree(whole, tmp_path / "run"))
+    words = ("learn", "oscillatory", "--max-iterations", 3, "--no-rerun", "-o", run, "--force")
+    unlink, left = Path.unlink, [removed]
+
+    def killed(path: Path, *words: Any, **options: Any) -> None:
+        if path.exists() and path.parent == run:
+            if not left[0]:
+                raise SystemExit(9)
+            left[0] -= 1
+        unlink(path, *words, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", killed)
+        cdmisfa(*words)
+    verified = cdmisfa("verify", run)
+    if removed:
+        assert (verified.code, "record or learn first" in verified.err) == (2, True)
+        resumed = cdmisfa("learn", "--resume", "-o", run)
+        assert (resumed.code, "begin one there with --force" in resumed.err) == (2, True)
+    else:
+        assert verified.code == 0
+    assert cdmisfa(*words).code == 0
+    assert cdmisfa("verify", run).code == 0
 
 
 def test_a_keyframe_gives_the_state_back(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from conftest import Cdmisfa
 from test_cli import assert_one_line
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.experiments.documents import write_json
 from recorder.log.logfile import LogFile
 from recorder.log.whole import whole
@@ -125,6 +125,21 @@ def test_two_processes_write_one_name(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
     write_json(path, {})
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_two_processes_write_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one that ends last says that the other was first."""
+    path = tmp_path / "a"
+
+    def appears(removed: Path) -> None:
+        if removed == path:
+            (path / "other").mkdir(parents=True)
+
+    monkeypatch.setattr("recorder.log.whole._remove", appears)
+    why = "a was written by another process meanwhile"
+    with pytest.raises(LogWriteError, match=why), whole(path) as partial:
+        partial.mkdir()
+    assert names(path) == {"other"}
 
 
 @pytest.mark.parametrize("force", [False, True])

@@ -246,7 +246,9 @@ def log_to_resume(run: Path) -> Path:
     for found in (run / SET_ASIDE, partial_path(finished), finished):
         if found.is_file():
             return found
-    raise UsageError(f"{run} holds no {RUN_FILE}: there is no run to resume")
+    raise UsageError(
+        f"{run} holds no {RUN_FILE}: there is no run to resume, begin one there with --force"
+    )
 
 
 def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:

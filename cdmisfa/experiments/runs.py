@@ -283,8 +283,9 @@ def _run_log(
         stale += out.glob("checkpoint-*.npz")  # of runs from before keyframes
         if resume:
             set_aside(out, spec, manifest)
-        else:
-            stale += [out / RUN_FILE, out / SET_ASIDE]
+        else:  # the log first: of what is left by a kill nothing then looks like a run
+            logs = (SET_ASIDE, RUN_FILE, partial_path(out / RUN_FILE).name)
+            stale = [*(out / name for name in logs), *stale]
         try:
             refuse_special(*stale)
             for path in stale:

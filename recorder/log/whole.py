@@ -113,6 +113,10 @@ def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
         if sync:
             to_disk(path.parent)
     except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+            raise LogWriteError(
+                f"{path} was written by another process meanwhile: choose another name"
+            ) from error
         raise LogWriteError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(OSError):
@@ -139,6 +143,7 @@ def _lives(process: int) -> bool:
 
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        with contextlib.suppress(FileNotFoundError):  # another process removes it, too
+            shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

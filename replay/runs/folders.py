@@ -46,6 +46,11 @@ def run_log(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     if path.is_dir():
+        if any((path / name).is_file() for name in (RUN_JSON, MODULES_FILE)):
+            raise UsageError(
+                f"{path} lost its {RUN_FILE}, as if it was being replaced: run learn there again "
+                "with --force"
+            )
         raise UsageError(f"{path} holds no {RUN_FILE}: name the folder of a run")
     raise UsageError(f"{path} does not exist: name a run's folder or its {RUN_FILE}")
 
