@@ -40,6 +40,7 @@ FORBIDDEN = {
     "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
     "cdmisfa.core.arithmetic": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
+    "cdmisfa.core.untrusted": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.experiments": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.experiments.recompute": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.runs", "replay.palette", "rerun"),

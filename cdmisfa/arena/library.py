@@ -18,9 +18,9 @@ from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.modules import Module
+from cdmisfa.core.untrusted.regular import read_json
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
-from recorder.log.regular import read_json
 from recorder.log.whole import whole
 from replay.storage.arrays import read_arrays
 

@@ -17,7 +17,7 @@ from typing import Any, cast
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.plugins import loaded_versions
-from cdmisfa.core.memory import MAX_LIST
+from cdmisfa.core.untrusted.memory import MAX_LIST
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import Configuration, configure, open_logs, scene_kind_for

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.memory import MAX_LIST
+from cdmisfa.core.untrusted.memory import MAX_LIST
+from cdmisfa.core.untrusted.regular import read_json
 from cdmisfa.paper.reproduce import NAMES, markdown_table
-from recorder.log.regular import read_json
 
 
 def write_page(root: Path, page: Path) -> None:

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.untrusted.memory import parse_json
 from recorder.cameras.video import Steady
-from cdmisfa.core.memory import parse_json
 from recorder.images.messages import Decoder, image_decoder
 from recorder.images.pixels import Bytes, Depth
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.memory import BUDGET, budget
+from cdmisfa.core.untrusted.memory import BUDGET, budget
 
 Bytes = NDArray[np.uint8]
 

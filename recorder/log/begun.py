@@ -22,9 +22,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.memory import MAX_JSON, parse_json
+from cdmisfa.core.untrusted.memory import MAX_JSON, parse_json
+from cdmisfa.core.untrusted.regular import read_regular
 from recorder.log.folder import RECORDING
-from recorder.log.regular import read_regular
 from recorder.log.whole import to_disk, whole
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.memory import BUDGET, budget
+from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.messages import SCHEMAS, Decoder, image_decoder
 from recorder.images.pixels import RECIPE, Depth
 from replay.mcap.records import Bytes

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.memory import parse_json
+from cdmisfa.core.untrusted.memory import parse_json
 from replay.camera_logs.catalogue import channels_of
 from replay.camera_logs.opening import only_foreign
 from replay.inputs.words import places

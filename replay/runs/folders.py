@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.memory import MAX_LIST
-from recorder.log.regular import read_json
+from cdmisfa.core.untrusted.memory import MAX_LIST
+from cdmisfa.core.untrusted.regular import read_json
 from recorder.log.whole import partial_path
 from replay.mcap.reader import LogReader
 

@@ -13,8 +13,8 @@ import numpy as np
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Keyframe
-from cdmisfa.core.memory import parse_json
 from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.core.untrusted.memory import parse_json
 from replay.mcap.reader import LogReader
 from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
 from replay.runs.messages import decode_keyframe, missing

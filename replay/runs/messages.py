@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, one_line
 from cdmisfa.core.learning import Keyframe, LearnerState
-from cdmisfa.core.memory import parse_json
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import (
     CODES,
@@ -41,6 +40,7 @@ from cdmisfa.core.signals import (
     Fields,
     Signal,
 )
+from cdmisfa.core.untrusted.memory import parse_json
 from recorder.log.messages import varint
 from replay.mcap.records import MalformedRecord
 from replay.storage.arrays import contents, stored_arrays

@@ -14,7 +14,7 @@ from typing import Final
 import zstandard
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.log.regular import check_regular, opened_regular, read_regular
+from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
 from replay.camera_logs.stream import explained
 from replay.mcap.records import MAX_CHUNK
 

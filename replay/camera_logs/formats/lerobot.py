@@ -13,8 +13,8 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted.regular import check_regular, read_json
 from recorder.images.pixels import compressed_gray
-from recorder.log.regular import check_regular, read_json
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.stream import ChannelFacts, ImageStream, explained
 from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord

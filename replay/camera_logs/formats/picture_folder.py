@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.untrusted.regular import check_regular, read_regular
 from recorder.images.pixels import compressed_gray
-from recorder.log.regular import check_regular, read_regular
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 

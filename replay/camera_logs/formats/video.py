@@ -16,7 +16,7 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.memory import data_bytes
+from cdmisfa.core.untrusted.memory import data_bytes
 from recorder.images.frames import VIDEO_RECIPE, frame_gray
 from recorder.images.pixels import MAX_PIXELS
 from replay.camera_logs.stream import ImageStream, explained, sorted_times

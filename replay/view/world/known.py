@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from cdmisfa.core.memory import parse_json
+from cdmisfa.core.untrusted.memory import parse_json
 from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from replay.mcap.reader import LogReader

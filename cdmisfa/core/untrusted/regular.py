@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.memory import MAX_JSON, parse_json
+from cdmisfa.core.untrusted.memory import MAX_JSON, parse_json
 
 
 def check_regular(path: Path, limit: int | None = None) -> None:

@@ -1,0 +1,11 @@
+"""Reading what others may have written: which files, how long, and with how much memory."""
+
+from cdmisfa.core.faces import face
+
+__getattr__, __dir__, __all__ = face(
+    __name__,
+    {
+        "cdmisfa.core.untrusted.memory": "budget parse_json",
+        "cdmisfa.core.untrusted.regular": "check_regular read_json read_regular",
+    },
+)
