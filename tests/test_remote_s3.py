@@ -2,81 +2,34 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from conftest import Cdmisfa
-
-pytest.importorskip("s3fs")
-moto_server = pytest.importorskip("moto.server")
+from s3_server import buckets, forget, s3_files, serving_s3
 
 QUICK = ("--max-iterations", "4", "--json")
 
 
 @pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    server = moto_server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    yield f"http://{host}:{port}"
-    server.stop()
-
-
-@pytest.fixture(scope="module")
-def filled(endpoint: str, oscillatory_recording: Path) -> str:
-    """A bucket with the recording below `rec`."""
-    with pytest.MonkeyPatch.context() as patch:
-        _use(patch, endpoint)
-        files = _files()
-        files.mkdir("logs")
-        for file in oscillatory_recording.glob("*.mcap"):
-            files.pipe(f"logs/rec/{file.name}", file.read_bytes())
-        files.pipe("logs/empty.mcap", b"")
-        files.pipe("logs/rec/notes.txt", b"no log")
-        _forget(files)
-    return endpoint
+def filled(oscillatory_recording: Path) -> Iterator[str]:
+    """A server with the recording below `rec` of a bucket."""
+    with serving_s3() as endpoint:
+        with pytest.MonkeyPatch.context() as patch, buckets(endpoint, patch) as files:
+            files.mkdir("logs")
+            for file in oscillatory_recording.glob("*.mcap"):
+                files.pipe(f"logs/rec/{file.name}", file.read_bytes())
+            files.pipe("logs/empty.mcap", b"")
+            files.pipe("logs/rec/notes.txt", b"no log")
+        yield endpoint
 
 
 @pytest.fixture
 def s3(filled: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    _use(monkeypatch, filled)
-    files = _files()
-    yield files
-    _forget(files)
-
-
-def _use(patch: pytest.MonkeyPatch, endpoint: str) -> None:
-    """Keep botocore to this machine, whatever the user has set up."""
-    for name in ("AWS_PROFILE", "AWS_SESSION_TOKEN", "HTTP_PROXY", "http_proxy"):
-        patch.delenv(name, raising=False)
-    for name, value in {
-        "AWS_ENDPOINT_URL": endpoint,
-        "AWS_ACCESS_KEY_ID": "nobody",
-        "AWS_SECRET_ACCESS_KEY": "nothing",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_CONFIG_FILE": "/nonexistent",
-        "AWS_SHARED_CREDENTIALS_FILE": "/nonexistent",
-        "AWS_EC2_METADATA_DISABLED": "true",
-    }.items():
-        patch.setenv(name, value)
-
-
-def _files() -> Any:
-    from replay.storage.servers import _s3
-
-    return _s3()
-
-
-def _forget(files: Any) -> None:
-    """Close the connections now, while their loop runs."""
-    client = getattr(files, "_s3creator", None)
-    if client is not None:
-        end = client.__aexit__(None, None, None)
-        asyncio.run_coroutine_threadsafe(end, files.loop).result(10)
-    type(files).clear_instance_cache()
+    with buckets(filled, monkeypatch) as files:
+        yield files
 
 
 def test_a_prefix_is_a_recording(
@@ -127,5 +80,5 @@ def test_without_credentials_the_remedy_is_named(
     monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
     type(s3).clear_instance_cache()  # a new one looks for credentials again
     done = cdmisfa("info", "s3://logs/rec/x1.mcap")
-    _forget(_files())
+    forget(s3_files())
     assert (done.code, "FSSPEC_S3_ANON" in done.err) == (1, True), done.err

@@ -67,6 +67,7 @@ FORBIDDEN = {
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.mcap.records", "recorder.config", "rerun"),
+    "replay.uploads": ("replay.mcap.records", "replay.runs.log", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.images", "pybullet"),
     "replay.view.layouts": ("replay.viewer.window", "replay.export.figures", "recorder.recording"),
     "replay.view.world": ("replay.viewer.window", "replay.export.figures", "recorder.world.scenes"),

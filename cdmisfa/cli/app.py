@@ -46,6 +46,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "runs",
         "Write a run's signals as a table or arrays, a recording as images, videos or a dataset.",
     ),
+    "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
     "sweep": ("sweep", "Learn from a source many times, over a grid of settings and seeds."),
     "results": (
         "sweep",

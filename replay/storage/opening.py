@@ -45,11 +45,18 @@ def fetched(place: Location) -> Iterator[Path]:
         folder = Path(temporary) / (place if place.folder else place.parent).name
         folder.mkdir()
         for log in log_files(place):
-            _copy(log, folder / log.name)
+            copied(log, folder / log.name)
         yield folder if place.folder else folder / place.name
 
 
-def _copy(log: Location, target: Path) -> None:
+def copied(log: Location, target: Path) -> None:
+    """Copy what a path or a URL names into a file that is not there.
+
+    Raises:
+        UsageError: there is no such object.
+        LogDamagedError: the server sends less than it says, or something else.
+        CdmisfaError: the server does not give it, or there is no room for it.
+    """
     with contextlib.closing(open_store(log)) as source:
         try:
             if source.size > (room := shutil.disk_usage(target.parent).free):

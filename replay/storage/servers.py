@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
@@ -178,27 +178,62 @@ def listed(url: Url) -> list[Url]:
         UsageError: there is none.
         UnreachableError: the server does not list it.
     """
-    files = _importing(_s3)
 
-    seconds = limits().of(_LISTED)
-
-    async def keys() -> list[str]:
-        try:
-            entries = await files._ls(url.address, detail=True, refresh=True)
-        except Exception as error:
-            _ask_again(error)
-            raise
+    async def keys(files: Any) -> list[str]:
+        entries = await files._ls(url.address, detail=True, refresh=True)
         return [str(entry["name"]) for entry in entries]
 
-    try:
-        asked = asyncio.run_coroutine_threadsafe(patiently(keys, seconds), files.loop)
-        names = asked.result(seconds + SPARE_SECONDS)
-    except Exception as error:
-        raise refusal(url, error) from None
+    names = _asked(url, keys, limits().of(_LISTED))
     logs = [Url(f"s3://{n}") for n in sorted(names) if n.endswith((".mcap", ".mcap.partial"))]
     if not logs:
         raise UsageError(f"{url}: no .mcap file below this prefix")
     return logs
+
+
+def s3_place(url: Url) -> tuple[str, str]:
+    """Bucket and key of an s3:// address.
+
+    Raises:
+        UsageError: it names no place in a bucket.
+        CdmisfaError: what reads URLs is not installed.
+    """
+    bucket, key, _ = _importing(_s3).split_path(url.address)
+    if not (bucket and key):
+        raise UsageError(f"{url} names no place in a bucket: write s3://BUCKET/NAME")
+    return str(bucket), str(key).rstrip("/")
+
+
+def ask_s3(url: Url, call: str, seconds: float, **words: Any) -> Any:
+    """The answer to a call of the S3 interface, asked again after what may be a passing fault.
+
+    Args:
+        url: what the call is about, for messages.
+        call: its name: "put_object".
+        seconds: tries and waits together.
+        words: of the call.
+
+    Raises:
+        UsageError: there is no such object or bucket.
+        UnreachableError: the server refuses it, or cannot be reached in time.
+    """
+    return _asked(url, lambda files: files._call_s3(call, **words), seconds)
+
+
+def _asked(url: Url, ask: Callable[[Any], Awaitable[Value]], seconds: float) -> Value:
+    files = _importing(_s3)
+
+    async def once() -> Value:
+        try:
+            return await ask(files)
+        except Exception as error:
+            _ask_again(error)
+            raise
+
+    try:
+        asked = asyncio.run_coroutine_threadsafe(patiently(once, seconds), files.loop)
+        return asked.result(seconds + SPARE_SECONDS)
+    except Exception as error:
+        raise refusal(url, error) from None
 
 
 def _range_of(text: str, start: int, stop: int) -> tuple[int, int]:

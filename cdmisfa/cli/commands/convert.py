@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from cdmisfa.cli import options
+from cdmisfa.cli import options, uploads
 from cdmisfa.cli.cameras import camera_options, live_options, print_plan, say_about, say_changes
 from cdmisfa.cli.commands.record import print_recording, record_streams, recording_stoppable
 from cdmisfa.cli.progress import bar
@@ -17,7 +17,7 @@ from cdmisfa.core.errors import UsageError
 
 @click.command("convert")
 @click.argument("source", nargs=-1, required=True)
-@options.out("Folder of the recording.", required=True)
+@uploads.out("Folder of the recording, or s3://...", required=True)
 @camera_options
 @live_options
 @click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")

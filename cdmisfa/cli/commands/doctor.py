@@ -25,7 +25,7 @@ EXTRAS = {
     "video": (("av",), "videos and cameras: learn, record, convert; export --to mp4"),
     "gym": (("gymnasium",), "gym: streams of simulated tasks"),
     "foxglove": (("foxglove", "websockets"), "foxglove:// streams of robots; play as a robot"),
-    "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs"),
+    "cloud": (("aiohttp", "fsspec", "s3fs"), "logs behind URLs; -o s3://"),
     "ros": (("rosbags",), "ROS bags: learn, convert"),
     "arena": (("ale_py", "av", "gymnasium", "skvideo"), "streams of the arena"),
     "sklearn": (("sklearn",), "the transformer for scikit-learn"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.cli import options
+from cdmisfa.cli import options, uploads
 from cdmisfa.cli.cameras import (
     camera_options,
     live_options,
@@ -37,7 +37,7 @@ TICK = 0.1
 
 @click.command("learn")
 @click.argument("source", nargs=-1)
-@options.out("Folder of the run; without it nothing is written.")
+@uploads.out("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed
 @options.preset
 @options.settings

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cdmisfa.cli import options
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.cli import options, uploads
+from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
     from replay.integrity.info import LogInfo
@@ -117,3 +117,25 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
         click.echo(f"written {out}")
     if not found.complete:
         ctx.exit(LogDamagedError.exit_code)
+
+
+@click.command("upload")
+@options.path_argument("result")
+@click.argument("url")
+@options.server_limits
+@options.as_json
+def upload_command(result: Path, url: str, as_json: bool) -> None:
+    """Upload a result to an S3 bucket, as `-o s3://...` does.
+
+    RESULT is the file or folder of a recording, a run, a sweep or an export, URL is
+    s3://BUCKET/NAME. What is there already with the same size and checksum is not sent again.
+    """
+    from replay.storage.location import Url, location
+
+    to = location(url)
+    if not isinstance(to, Url) or to.scheme != "s3":
+        raise UsageError(f"{url} is no s3:// address: write s3://BUCKET/NAME")
+    files, size = uploads.upload_now(result, to, "the same command")
+    if as_json:
+        document = {"schema": options.SCHEMA, "url": str(to), "files": files, "bytes": size}
+        options.print_json(document)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from cdmisfa.cli import options
+from cdmisfa.cli import options, uploads
 from cdmisfa.cli.cameras import frame_options, live_options, live_streams, say_counts, tell
 from cdmisfa.cli.interrupts import Stop, stoppable
 from cdmisfa.cli.progress import bar
@@ -30,7 +30,7 @@ LIVE = ("cameras", "gym")
 
 @click.command("record")
 @click.argument("source", nargs=-1)
-@options.out("Folder of the recording.")
+@uploads.out("Folder of the recording, or s3://...")
 @click.option(
     "--frames",
     type=click.IntRange(1),

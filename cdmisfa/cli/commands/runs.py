@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from cdmisfa.cli import options
+from cdmisfa.cli import options, uploads
 from cdmisfa.cli.cameras import rate_option
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.experiments.documents import markdown
@@ -111,7 +111,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
     help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
     "file's name ends in.",
 )
-@options.out("The file to write, for a recording the folder.", required=True)
+@uploads.out("The file to write, for a recording the folder, or s3://...", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
 @rate_option
 @options.server_limits

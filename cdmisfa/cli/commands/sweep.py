@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from cdmisfa.cli import options
+from cdmisfa.cli import options, uploads
 from cdmisfa.cli.progress import bar
 
 MOST_SEEDS = 1_000_000
@@ -15,7 +15,11 @@ MOST_SEEDS = 1_000_000
 
 @click.command("sweep")
 @click.argument("source", nargs=-1, required=True)
-@options.out("Folder of the sweep; what is finished in it is not computed again.", required=True)
+@uploads.out(
+    "Folder of the sweep, or s3://...; what is finished in it is not computed again.",
+    required=True,
+    goes_on=True,
+)
 @click.option(
     "--grid",
     multiple=True,
