@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedInbox, bar
+from waiting import wait_for
 
 from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import FrameSource, SeekableSource
@@ -240,13 +241,6 @@ class Cameras:
         return thread.join
 
 
-def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
 def test_real_cameras_are_recorded_and_learned_from(tmp_path: Path) -> None:
     cameras = Cameras()
     source = cameras.source()
@@ -265,7 +259,7 @@ def test_a_camera_that_goes_away_is_connected_to_anew(tmp_path: Path) -> None:
     source = cameras.source()
     join = cameras.show(100, 0)
     cameras.hands[1].give(OSError("unplugged"))
-    until(lambda: cameras.hands[1].opened == 2)
+    wait_for(lambda: cameras.hands[1].opened == 2, seconds=20)
     cameras.hands[1].give(*[flat(7)] * 3)
     source.take_all(40)
     join()
@@ -283,7 +277,7 @@ def test_a_camera_that_hangs_is_connected_to_anew() -> None:
     cameras.hands[1].give(flat(1), flat(2))
     join()
     assert cameras.said[0] == "right: no picture for 0.3 s: connecting to it anew"
-    until(lambda: "right shows pictures again" in cameras.said)
+    wait_for(lambda: "right shows pictures again" in cameras.said, seconds=20)
     cameras.close(source)
 
 
@@ -361,7 +355,7 @@ def test_a_full_queue_is_emptied_and_says_so() -> None:
     cameras = Cameras(1, queue_bytes=10 * flat(0).nbytes)
     source = cameras.source()
     cameras.hands[0].give(*[flat(k) for k in range(25)])
-    until(lambda: source.alignment["left"]["lost"] == 20)
+    wait_for(lambda: source.alignment["left"]["lost"] == 20, seconds=20)
     assert cameras.said == 2 * [
         "left: 10 pictures thrown away: they came faster than they were taken"
     ]

@@ -9,13 +9,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import psutil
 import pytest
 from engine_tasks import die_while_sending, sleep_for, trace
+from waiting import wait_for
 
 from cdmisfa.core.processes import Workers
 
@@ -50,15 +50,8 @@ def begun(folder: Path) -> tuple[subprocess.Popen[str], list[psutil.Process]]:
         found = psutil.Process(process.pid).children()
         return [child for child in found if "spawn_main" in " ".join(child.cmdline())]
 
-    wait_for(lambda: (folder / "3").exists() and len(workers()) == 2)
+    wait_for(lambda: (folder / "3").exists() and len(workers()) == 2, seconds=60)
     return process, workers()
-
-
-def wait_for(ready: Callable[[], bool], seconds: float = 60) -> None:
-    deadline = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_they_end_when_their_parent_is_killed(tmp_path: Path) -> None:
@@ -82,7 +75,7 @@ def test_ctrl_c_of_a_terminal_is_for_their_parent_only(tmp_path: Path) -> None:
 def test_closing_does_not_wait_for_what_they_are_doing() -> None:
     workers = Workers(1)
     future = workers.submit(sleep_for, 600)
-    wait_for(future.running)
+    wait_for(future.running, seconds=60)
     start = time.monotonic()
     workers.close()
     workers.close()

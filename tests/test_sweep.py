@@ -15,7 +15,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -28,6 +27,7 @@ import pytest
 from click.testing import CliRunner
 from engine_tasks import trace
 from pyarrow import parquet
+from waiting import wait_for
 
 from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, results_command, sweep_command
@@ -249,7 +249,7 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:40", "-o"]
     with subprocess.Popen([*words, str(tmp_path)]) as process:
         try:
-            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2)
+            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
         finally:
             process.kill()
     assert process.returncode == -signal.SIGKILL
@@ -264,7 +264,7 @@ def test_the_processes_of_a_killed_sweep_end_with_it(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:4000"]
     with subprocess.Popen([*words, "--jobs", "2", "-o", str(tmp_path)]) as process:
         try:
-            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2)
+            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
             workers = psutil.Process(process.pid).children()
         finally:
             process.kill()
@@ -278,7 +278,7 @@ def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
     words += ["--jobs", jobs, "-o", str(tmp_path)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2)
+            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
             process.terminate()
             complaint = process.communicate(timeout=30)[1]
         finally:
@@ -291,14 +291,6 @@ def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
 
 
 # Engines
-
-
-def wait_for(ready: Callable[[], bool], seconds: float = 200) -> None:
-    """Wait until something has happened."""
-    deadline = time.monotonic() + seconds
-    while not ready():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_a_killed_worker_costs_a_retry(tmp_path: Path) -> None:
