@@ -39,7 +39,7 @@ from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.runs import run
 from cdmisfa.experiments.store import ROWS, read_rows
-from cdmisfa.experiments.sweep import plan, sweep
+from cdmisfa.experiments.sweep import REQUEST, plan, sweep
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 
@@ -261,15 +261,27 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
 
 
 def test_the_processes_of_a_killed_sweep_end_with_it(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:4000"]
+    """In the midst of trials that take hours: who has a result to hand over notices by itself."""
+    words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:2"]
+    words += ["--set", "learner.delta=1e-300", "--max-iterations", "1000000000"]
+    workers: list[psutil.Process] = []
+
+    def busy() -> bool:
+        here = psutil.Process(process.pid).children()
+        workers[:] = [p for p in here if "spawn_main" in " ".join(p.cmdline())]
+        return len(workers) == 2 and (tmp_path / REQUEST).exists()
+
     with subprocess.Popen([*words, "--jobs", "2", "-o", str(tmp_path)]) as process:
         try:
-            wait_for(lambda: len(list(read_rows(tmp_path))) >= 2, seconds=200)
-            workers = psutil.Process(process.pid).children()
+            wait_for(busy, seconds=200)
+            wait_for(lambda: all(sum(w.cpu_times()[:2]) > 2 for w in workers), 200)
         finally:
             process.kill()
-    assert len(workers) >= 2
-    assert psutil.wait_procs(workers, timeout=10)[1] == []
+    left = psutil.wait_procs(workers, timeout=10)[1]
+    for worker in left:
+        worker.kill()
+    assert left == []
+    assert list(read_rows(tmp_path)) == []
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
