@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -16,13 +17,14 @@ from cdmisfa import Run
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.cli import run
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
-from cdmisfa.core.learning import Learner
+from cdmisfa.core.learning import Keyframe, Learner, LearnerState
 from cdmisfa.experiments.recompute.check import check_run, learner_after
 from cdmisfa.experiments.recompute.forks import fork_run
 from cdmisfa.experiments.sources import open_source
 from replay.mcap.reader import LogReader
 from replay.runs.compare import first_difference
 from replay.runs.log import read_header, read_keyframe
+from replay.runs.messages import encode_keyframe
 from replay.runs.modules import load_modules
 
 EASY = ("learner.tau=40", "learner.eta_dot_window=8", "learner.warm_up=3", "learner.delta=1.0")
@@ -151,6 +153,50 @@ def test_a_run_that_lies_is_found_out(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     assert checked.difference.iteration <= 1
     with pytest.raises(NotReproducedError, match="learned again, iteration"):
         learner_after(run, 20)
+
+
+def a_bit(state: LearnerState) -> LearnerState:
+    arrays = {name: array.copy() for name, array in state.arrays.items()}
+    arrays["abstraction.v"].view(np.uint64)[3, 1] ^= 1
+    return dataclasses.replace(state, arrays=arrays)
+
+
+def a_module(state: LearnerState) -> LearnerState:
+    first = dataclasses.replace(state.modules[0], phi=-state.modules[0].phi)
+    return dataclasses.replace(state, modules=(first, *state.modules[1:]))
+
+
+def the_dice(state: LearnerState) -> LearnerState:
+    return dataclasses.replace(state, policy_rng={**state.policy_rng, "uinteger": 7})
+
+
+@pytest.mark.parametrize(
+    ("lie", "where"),
+    [
+        (a_bit, "keyframe abstraction.v[3, 1] is "),
+        (a_module, "keyframe modules.phi[0, 0, 0] is "),
+        (the_dice, "keyframe policy_rng is "),
+    ],
+)
+def test_a_keyframe_that_lies_is_found_out(
+    tmp_path: Path,
+    cdmisfa: Cdmisfa,
+    monkeypatch: pytest.MonkeyPatch,
+    lie: Callable[[LearnerState], LearnerState],
+    where: str,
+) -> None:
+    def kept(keyframe: Keyframe) -> bytes:
+        state = lie(keyframe.state) if keyframe.iteration == 20 else keyframe.state
+        return encode_keyframe(dataclasses.replace(keyframe, state=state))
+
+    monkeypatch.setattr("replay.runs.writer.encode_keyframe", kept)
+    told = (*words("2.0"), *LEARN, "--keyframes", 10, "--max-iterations", 30)
+    assert cdmisfa("learn", "oscillatory", *told, "-o", tmp_path / "run").code == 0
+    checked = cdmisfa("check", tmp_path / "run")
+    assert checked.code == 4
+    assert checked.out.startswith(f"iteration 19: {where}")
+    assert cdmisfa("check", tmp_path / "run", "--to", 15).code == 0
+    assert cdmisfa("check", tmp_path / "run", "--from", 10, "--json").code == 4
 
 
 @pytest.mark.parametrize("k", [131, 10**9])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,24 +128,45 @@ def read_keyframe(path: Path, last: int | None = None) -> Keyframe | None:
     Only the chunks that hold keyframes are read. What is no keyframe of this version is passed
     over.
     """
-    log = run_log(path)
+    newest = _keyframes(run_log(path), lambda k: last is None or k <= last, backwards=True)
+    return next(newest, None)
+
+
+def read_keyframes(path: Path, after: int) -> Iterator[Keyframe]:
+    """The keyframes of a run's log after more than so many iterations, in order.
+
+    Of two after the same iteration, as where a fork begins, the last one is the run's.
+    """
+    before: Keyframe | None = None
+    for keyframe in _keyframes(run_log(path), lambda k: k > after):
+        if before is not None and before.iteration != keyframe.iteration:
+            yield before
+        before = keyframe
+    if before is not None:
+        yield before
+
+
+def _keyframes(
+    log: Path, wanted: Callable[[int], bool], *, backwards: bool = False
+) -> Iterator[Keyframe]:
+    """Keyframes in the order of the file, or from its end on."""
+    step = -1 if backwards else 1
     with LogReader(log) as reader:
         own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
-        for segment in reversed(reader.segments):
+        for segment in reader.segments[::step]:
             counts = segment.channel_counts()
             if counts is not None and not own & counts.keys():
                 continue
             table = reader.table(segment)
             if table is None:
                 continue
-            for row in np.flatnonzero(np.isin(table.channel, list(own)))[::-1].tolist():
-                if last is not None and int(table.headers["sequence"][row]) > last:
+            for row in np.flatnonzero(np.isin(table.channel, list(own)))[::step].tolist():
+                if not wanted(int(table.headers["sequence"][row])):
                     continue
                 with contextlib.suppress(LogDamagedError):
                     keyframe = decode_keyframe(table.payload(row), f"{log} {KEYFRAME_TOPIC}")
-                    if last is None or keyframe.iteration <= last:
-                        return keyframe
-    return None
+                    if wanted(keyframe.iteration):
+                        yield keyframe
 
 
 def record_version(metadata: Mapping[str, str]) -> int:

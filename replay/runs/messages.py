@@ -149,10 +149,7 @@ def decode_matrices(
 
 def encode_keyframe(keyframe: Keyframe) -> bytes:
     """A keyframe as the bytes of a message."""
-    state = keyframe.state
-    arrays = dict(state.arrays)
-    for field in dataclasses.fields(Module):
-        arrays[_MODULES + field.name] = np.array([getattr(m, field.name) for m in state.modules])
+    state, arrays = keyframe.state, arrays_of(keyframe.state)
     facts = {
         "version": KEYFRAME_VERSION,
         "versions": keyframe.versions,
@@ -167,6 +164,15 @@ def encode_keyframe(keyframe: Keyframe) -> bytes:
         values=b"".join(array.tobytes() for array in arrays.values()),
     ).SerializeToString()
     return encoded
+
+
+def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
+    """All arrays of a state by name: its own, and one for each field of its modules."""
+    fields = dataclasses.fields(Module)
+    return dict(state.arrays) | {
+        _MODULES + field.name: np.array([getattr(m, field.name) for m in state.modules])
+        for field in fields
+    }
 
 
 def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:

@@ -117,8 +117,8 @@ def check_command(
 ) -> None:
     """Learn a run again from its source, and compare every signal bit for bit.
 
-    It says the first signal that differs, and exits with 4 if one does. A part begins at
-    the newest keyframe before it.
+    So are the keyframes in its log. It says the first signal or memory that differs, and exits
+    with 4 if one does. A part begins at the newest keyframe before it.
     """
     from cdmisfa.experiments.recompute.check import check_run
 

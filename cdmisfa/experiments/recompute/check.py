@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, NotReproducedError, UsageError
-from cdmisfa.core.learning import Learner
+from cdmisfa.core.learning import Keyframe, Learner
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.recompute.again import Again
 from replay.runs.columns import SignalColumns, columns_of_records
 from replay.runs.compare import Difference, first_of
+from replay.runs.log import read_keyframes
+from replay.runs.messages import arrays_of
 from replay.runs.stretches import read_columns
 
 
@@ -43,7 +48,7 @@ class Checked:
 def check_run(
     run: Path, source: Sequence[str] = (), start: int = 0, stop: int | None = None
 ) -> Checked:
-    """Learn the iterations [start, stop) of a run again, and compare every signal.
+    """Learn the iterations [start, stop) of a run again, and compare every signal and keyframe.
 
     Args:
         run: its folder, or its log.
@@ -57,7 +62,7 @@ def check_run(
     """
     with Again(Path(run), start, source) as again:
         first = again.learner.iteration
-        at, found = _learned_again(again, stop)
+        at, found = _learned_again(again, stop, read_keyframes(again.log, first))
     if found is not None:
         return Checked(first, at, found)
     if at <= start and (at or stop):
@@ -90,16 +95,65 @@ def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tup
         return again.learner, again.t
 
 
-def _learned_again(again: Again, stop: int | None) -> tuple[int, Difference | None]:
-    """Learn up to an iteration, or to the log's end: how far, and the log's first difference."""
-    at = again.learner.iteration
+def _learned_again(
+    again: Again, stop: int | None, keyframes: Iterable[Keyframe] = ()
+) -> tuple[int, Difference | None]:
+    """Learn up to an iteration, or to the log's end: how far, and the log's first difference.
+
+    Args:
+        again: learns.
+        stop: the iteration.
+        keyframes: that are compared, too.
+    """
+    left = iter(keyframes)
+    at, kept = again.learner.iteration, next(left, None)
     for logged in _logged(again, stop):
-        learned = iter(_columns(again, len(logged)))
+        records: list[BlockSignals] = []
+        other: Difference | None = None
+        with contextlib.suppress(LogExhaustedError):
+            for signals in again.steps(len(logged)):
+                records.append(signals)
+                if kept is not None and kept.iteration == again.learner.iteration:
+                    other = other or _moved(kept, again)
+                    kept = next(left, None)
+        learned = columns_of_records(records)
         found = first_of(iter([logged]), learned, again.header.schema, at)
         at += len(logged)
-        if found is not None:
-            return at, found
+        both = [one for one in (found, other) if one is not None]
+        if both:
+            return at, min(both, key=lambda one: one.iteration)
     return at, None
+
+
+def _moved(keyframe: Keyframe, again: Again) -> Difference | None:
+    """Where a keyframe differs from the learner that stands there, in a bit."""
+    last, state = keyframe.iteration - 1, again.learner.state
+    kept, own = arrays_of(keyframe.state), arrays_of(state)
+    if kept.keys() != own.keys():
+        return Difference(last, "keyframe", (), ", ".join(kept), ", ".join(own))
+    for name, array in kept.items():
+        if (found := _first(array, own[name])) is not None:
+            return Difference(last, f"keyframe {name}", *found)
+    plain = {
+        "t": (keyframe.t, again.t),
+        "policy_rng": (dict(keyframe.state.policy_rng), dict(state.policy_rng)),
+    }
+    for name, (one, two) in plain.items():
+        if one != two:
+            return Difference(last, f"keyframe {name}", (), repr(one), repr(two))
+    return None
+
+
+def _first(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], str, str] | None:
+    """Place and values of the first element in which two arrays differ, in a bit."""
+    if (a.dtype, a.shape) != (b.dtype, b.shape):
+        return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
+    if a.tobytes() == b.tobytes():
+        return None
+    pairs = zip(a.reshape(-1), b.reshape(-1), strict=True)
+    i = next(i for i, (x, y) in enumerate(pairs) if x.tobytes() != y.tobytes())
+    place = tuple(int(n) for n in np.unravel_index(i, a.shape))
+    return place, repr(a.reshape(-1)[i].item()), repr(b.reshape(-1)[i].item())
 
 
 def _logged(again: Again, stop: int | None) -> Iterator[SignalColumns]:
@@ -115,12 +169,3 @@ def _logged(again: Again, stop: int | None) -> Iterator[SignalColumns]:
             raise LogDamagedError(f"{again.log}: iteration {at} is missing, see cdmisfa verify")
         yield columns.rows(0, kept)
         at += kept
-
-
-def _columns(again: Again, count: int) -> list[SignalColumns]:
-    """So many iterations learned again, fewer where the source ends."""
-    records: list[BlockSignals] = []
-    with contextlib.suppress(LogExhaustedError):
-        for signals in again.steps(count):
-            records.append(signals)
-    return list(columns_of_records(records))
