@@ -13,6 +13,7 @@ from benchmarks import (
     learn,
     long_recordings,
     modules,
+    moments,
     reader,
     recorder,
     recursive,
@@ -69,6 +70,14 @@ def test_modules(results: Path) -> None:
     modules.main(quick=True)
     rows = json.loads((results / "modules.json").read_text())["tables"][0]["rows"]
     assert [row[0] for row in rows] == [0, 1, 10]
+
+
+def test_moments(tmp_path: Path) -> None:
+    assert moments.learning("oscillatory", tmp_path / "run", 5, 1200)() == 12
+    count, part = moments.share(tmp_path / "run")
+    assert count == 3
+    assert 0 < part < 0.5
+    assert len(moments.moments(tmp_path / "run", 12)) == moments.MOMENTS
 
 
 def test_recursive() -> None:

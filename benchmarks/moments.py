@@ -1,0 +1,146 @@
+"""What keyframes take of a run's time and log, and what going to a moment takes with them."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from benchmarks.report import SAMPLE, save
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.learning import Learner
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments import runs
+from cdmisfa.experiments.recompute.check import learner_after
+from cdmisfa.experiments.resume import Keyframes, command_of
+from cdmisfa.experiments.sources import open_source
+from replay.mcap.reader import LogReader
+from replay.runs.folders import run_log
+from replay.runs.log import KEYFRAME_TOPIC
+
+FRAMES = 60_000
+MOMENTS = 15
+
+SOURCES: Mapping[str, dict[str, Any]] = {str(SAMPLE): {"loop": True}, "oscillatory": {}}
+"""What is learned from, and how it is opened."""
+
+NAMES = {str(SAMPLE): "sample log", "oscillatory": "oscillatory streams"}
+
+CASES = {"the last alone": 0, "as they come": None, "every 100": 100}
+"""Iterations between keyframes."""
+
+
+class Timed(Keyframes):
+    """Keyframes that count the time that they take, with that of what they flush."""
+
+    spent = 0
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        begin = time.process_time_ns()
+        super().block(block, signals, learner)
+        Timed.spent += time.process_time_ns() - begin
+
+    def finish(self) -> None:
+        """See `Sink`."""
+        begin = time.process_time_ns()
+        super().finish()
+        Timed.spent += time.process_time_ns() - begin
+
+
+def learning(word: str, out: Path, keyframes: int | None, frames: int) -> Callable[[], int]:
+    """A call that learns from a source into a log, and gives the iterations."""
+
+    def call() -> int:
+        how = SOURCES[word]
+        source, told = open_source([word], **how)
+        iterations = frames // told.learner.tau
+        runs.run(
+            source,
+            told.learner,
+            out,
+            sections=told.tables(),
+            command=command_of((word,), how, out),
+            max_iterations=iterations,
+            max_modules=iterations,
+            keyframes=keyframes,
+            force=True,
+            rerun=False,
+        )
+        source.close()
+        return iterations
+
+    return call
+
+
+def timed(call: Callable[[], int]) -> tuple[float, float]:
+    """Microseconds of CPU that an iteration takes, and the part of it that keyframes take."""
+    Timed.spent, begin = 0, time.process_time_ns()
+    with mock.patch.object(runs, "Keyframes", Timed):
+        iterations = call()
+    took = time.process_time_ns() - begin
+    return took / 1000 / iterations, Timed.spent / took
+
+
+def share(out: Path) -> tuple[int, float]:
+    """How many keyframes a log has, and its part, as stored, that they are."""
+    log = run_log(out)
+    with LogReader(log) as reader:
+        own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
+        counts = [(s.stored, own & (s.channel_counts() or {}).keys()) for s in reader.segments]
+    found = [stored for stored, kept in counts if kept]
+    return len(found), sum(found) / log.stat().st_size
+
+
+def moments(out: Path, iterations: int) -> list[float]:
+    """Seconds of CPU to go to each of some moments, the least of three times."""
+    chosen = np.random.default_rng(0).integers(0, iterations, MOMENTS).tolist()
+    learner_after(out, iterations - 1)  # loads what is compiled
+    return [min(_seconds(out, at) for _ in range(3)) for at in chosen]
+
+
+def _seconds(out: Path, at: int) -> float:
+    begin = time.process_time()
+    learner_after(out, at)
+    return time.process_time() - begin
+
+
+def main(*, quick: bool = False, full: bool = False) -> None:
+    """Measure, and write results/moments.json."""
+    rows: list[list[Any]] = []
+    frames = FRAMES // 50 if quick else FRAMES
+    with tempfile.TemporaryDirectory() as folder:
+        for word, name in NAMES.items():
+            work = {
+                case: learning(word, Path(folder) / name / case, keyframes, frames)
+                for case, keyframes in CASES.items()
+            }
+            iterations = {case: call() for case, call in work.items()}  # all is compiled now
+            rounds = [
+                {c: timed(call) for c, call in work.items()} for _ in range(1 if quick else 5)
+            ]
+            for case, count in iterations.items():
+                out = Path(folder) / name / case
+                many, part = share(out)
+                took = statistics.median(found[case][0] for found in rounds)
+                spent = statistics.median(found[case][1] for found in rounds)
+                percent = [f"{100 * value:.1f} %" for value in (spent, part)]
+                there = moments(out, count)
+                seconds = f"{statistics.median(there):.3f} ({max(there):.3f})"
+                rows.append([name, case, many, round(took), *percent, seconds])
+    head = ["run", "keyframes", "how many", "us an iteration", "of that", "of run.mcap"]
+    save(
+        "moments",
+        "Any moment of a run",
+        f"Runs of {frames:,} frames of 2.0 with a log, CPU of all threads; what of that keyframes "
+        "take, with what they flush before; and what it takes to go to a moment, which is to open "
+        "log and source, to take the keyframe before it, and to learn on from there: the median, "
+        f"and the most, of {MOMENTS} moments drawn at random, after start-up.",
+        [([*head, "CPU s to a moment"], rows)],
+    )
