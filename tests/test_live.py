@@ -21,6 +21,8 @@ import rerun as rr
 from PIL import Image
 from rerun.chunk import RrdReader
 from run_data import IMAGE, VECTOR, having, read_signals, run_of
+from test_view_world import LIVE as SCENE_SOURCE
+from test_view_world import SCENE, without_models
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
@@ -87,6 +89,23 @@ def test_the_progress_learner_is_shown_by_its_streams(monkeypatch):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
+def test_the_robot_turns_to_what_is_watched(tmp_path, monkeypatch):
+    """As in the view of a finished run, whose first tab a live view has, too."""
+    without_models(monkeypatch)
+    sent = {}
+
+    def keep(self, path, times, columns, **_):
+        sent.setdefault(path, []).append(times)
+
+    monkeypatch.setattr("rerun.RecordingStream.send_columns", keep)
+    with LiveView(SCENE, {**MANIFEST, "source": SCENE_SOURCE}, 40, 1) as view:
+        feed(view, SCENE)
+    assert {"scene/watching", "scene/box", "scene/ball", "scene/cylinder"} <= set(sent)
+    with LiveView(IMAGE, MANIFEST, 40, 1) as view:
+        feed(view, IMAGE)
+    assert {"wall/frame", *(f"wall/{s + 1}_{n}" for s, n in enumerate(IMAGE.streams))} <= set(sent)
+
+
 def test_it_listens_on_this_machine_only():
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
         port = urlsplit(view.address).port

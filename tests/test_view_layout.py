@@ -21,8 +21,10 @@ from replay.runs.outline import read_outline
 from replay.view import lanes
 from replay.view.build import build_view
 from replay.view.layouts.of_run import run_layout
+from replay.view.world.first import First
 
 ITERATIONS, TAU = 420, 40
+NOTHING = First(scene=False, wall=None)
 MIN_MAX = rr.components.AggregationPolicy.MinMax.value
 STEP_AFTER = rr.components.InterpolationMode.StepAfter.value
 
@@ -198,13 +200,13 @@ def test_many_modules_stand_on_pages(tmp_path):
 
     write_run(tmp_path / "run.mcap", VECTOR, 3)
     outline = dataclasses.replace(read_outline(tmp_path), modules=8)
-    layout = run_layout(outline, tab="modules")
+    layout = run_layout(outline, NOTHING, tab="modules")
     tabs = layout.root_container.contents
     (modules,) = [tab for tab in tabs if tab.name == "Modules"]
     assert [page.name for page in modules.contents] == ["1 to 6", "7 to 8", "Events"]
     assert layout.root_container.active_tab == tabs.index(modules)
-    with pytest.raises(UsageError, match=r"no tab 'nowhere': there are Overview, .*Table"):
-        run_layout(outline, tab="nowhere")
+    with pytest.raises(UsageError, match=r"no tab 'nowhere': there are World, Overview, .*Table"):
+        run_layout(outline, NOTHING, tab="nowhere")
 
 
 def test_a_run_is_played_in_a_minute(built):

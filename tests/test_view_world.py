@@ -101,7 +101,7 @@ def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_w
         assert set(edges["LineStrips3D:colors"][i]) == {packed(colour(record.stream))}
         angle = 2 * math.acos(min(neck["Transform3D:quaternion"][i][0][3], 1.0))
         assert math.degrees(angle) == pytest.approx(abs(gaze.yaw), abs=0.1)
-    assert "World" in layout_names(tmp_path / "run.rrd")
+    assert layout_names(tmp_path / "run.rrd").count("World") == 1
 
 
 def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp_path, monkeypatch):
@@ -124,11 +124,11 @@ def test_a_recording_that_is_gone_is_said_and_one_that_is_there_is_read(tmp_path
     }
     write_run(tmp_path / "run.mcap", SCENE, 1)
     header = dataclasses.replace(read_outline(tmp_path).header, manifest=manifest)
-    scenery, unsure = world_of_run(header, tmp_path / "run.mcap", None)
+    scenery, unsure = world_of_run(header, tmp_path)
     assert (scenery, unsure) == (scenery_of(CONFIG), PRESET)
     for broken in ({"kind": "icub", "scene": {"kind": "icub", "eyes": 3}}, {"kind": "icub"}, 7):
         header = dataclasses.replace(header, manifest={"source": broken})
-        assert world_of_run(header, tmp_path / "run.mcap", None)[0] is None
+        assert world_of_run(header, tmp_path)[0] is None
 
 
 def test_the_recording_says_what_stood_where(tmp_path):
@@ -140,7 +140,7 @@ def test_the_recording_says_what_stood_where(tmp_path):
     source = {"kind": "recording", "scene": "icub", "config_sha256": digest}
     write_run(tmp_path / "run.mcap", SCENE, 1, source=source)
     header = read_outline(tmp_path).header
-    assert world_of_run(header, tmp_path / "run.mcap", sample) == (scenery_of(CONFIG), None)
+    assert world_of_run(header, tmp_path, sample) == (scenery_of(CONFIG), None)
 
 
 def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
@@ -231,3 +231,40 @@ def test_a_wall_is_wider_than_high_and_no_picture_hangs_over_another():
         assert len(set(hang)) == count
         for i, (x, y) in enumerate(hang):
             assert all(abs(x - a) >= 128 or abs(y - b) >= 48 for a, b in hang[:i])
+
+
+def test_a_recording_shows_its_world(tmp_path, monkeypatch):
+    without_models(monkeypatch)
+    sample = Path(__file__).parents[1] / "sample_logs" / "icub"
+    build_view(sample, tmp_path / "r.rrd", every=50)
+    rows = rows_of(tmp_path / "r.rrd")
+    with LogReader(sample / "left.mcap") as reader:
+        truth = [entry.data for entry in reader.messages(["/truth"])]
+    assert rows["/scene/ball"]["frame"] == list(range(0, len(truth), 50))
+    known = scalars(rows["/world/truth"])[::50]
+    (x, y), places = (
+        (TRUTH.index(f"object3_{axis}") for axis in "xy"),
+        np.array([p for (p,) in rows["/scene/ball"]["Transform3D:translation"]]),
+    )
+    np.testing.assert_allclose(places[:, :2], known[:, [x, y]] * (1, -1), atol=1e-6)
+    assert {"World", "Views"} <= set(layout_names(tmp_path / "r.rrd"))
+    said = [text for (text,) in rows["/events"]["TextLog:text"]]
+    assert any("icub-models" in text for text in said)
+
+
+def test_views_without_the_robot_s_body_are_small(tmp_path):
+    write_run(tmp_path / "run.mcap", SCENE, 3, source=LIVE)
+    sizes, entities = [], []
+    for body in (True, False):
+        out = tmp_path / f"{body}.rrd"
+        build_view(tmp_path, out, body=body)
+        sizes.append(out.stat().st_size)
+        entities.append({c.entity_path for c in RrdReader(str(out)).stream()})
+    assert sizes[0] - sizes[1] > 7_000_000
+    assert {e.split("/")[2] for e in entities[0] - entities[1]} == {
+        "body",
+        "joints",
+        "neck",
+        "stands",
+    }
+    assert "/scene/box" in entities[1]

@@ -189,7 +189,9 @@ def run(
         if live:
             from replay.viewer.live import LiveView
 
-            shown = LiveView(source.spec, manifest, learner.tau, len(learner.phi))
+            shown = LiveView(
+                source.spec, {**manifest, **begun}, learner.tau, len(learner.phi), run=folder
+            )
             told.append(opened.enter_context(shown))
             if announce is not None:
                 announce(shown.address)

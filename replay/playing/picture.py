@@ -63,7 +63,7 @@ def play_in_rerun(
         broadcast = Broadcast(recording, NAME, port)
         stack.callback(broadcast.close)
         recording.send_recording_name(label(paths[0].resolve().stem))
-        recording.send_blueprint(recording_layout(spec, first + count, False, None))
+        recording.send_blueprint(recording_layout(spec, first + count))
         columns = [frames_column(recording, spec, entity) for entity in view_entities(spec)]
         truth = line_column(recording, spec, "world/truth", spec.truth) if spec.truth else None
         broadcast.hand_over()

@@ -20,7 +20,7 @@ from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules
 from replay.runs.outline import Tally, read_outline
-from replay.runs.stretches import read_stretches
+from replay.runs.stretches import Frames, read_stretches
 from replay.view.labels import label
 from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_STREAMS
@@ -28,7 +28,8 @@ from replay.view.properties import APPLICATION, identity, properties_of, propert
 from replay.view.recording import write_recording, write_unwatched
 from replay.view.run import RunView
 from replay.view.summary import summary_text
-from replay.view.world.first import FirstTab
+from replay.view.world.first import WorldView
+from replay.view.world.learned import write_learned
 
 FLUSH_SECONDS = 60.0
 
@@ -43,6 +44,7 @@ def build_view(
     tab: str | None = None,
     beside: Sequence[Path] = (),
     rate: float | None = None,
+    body: bool = True,
 ) -> None:
     """Write the view of a run, a recording or camera logs as an .rrd file, whole or not at all.
 
@@ -55,6 +57,7 @@ def build_view(
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
         rate: frames a second of camera logs; by default the first stream's.
+        body: show the robot's, where there is one.
 
     Raises:
         UsageError: there is no such run or recording, `every` is below 1, `out` exists and
@@ -71,7 +74,7 @@ def build_view(
             raise UsageError(f"{path}: one run is shown at a time; compare --save shows several")
         log = run_log(path)
         with recording_to(out, _name(log), log, force=force) as recording:
-            _write_run(recording, log, every, all_views, tab)
+            _write_run(recording, log, every, all_views, tab, body=body)
     elif all_views is not None:
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
@@ -133,14 +136,21 @@ def recording_to(
 
 
 def _write_run(
-    recording: rr.RecordingStream, log: Path, every: int, all_views: Path | None, tab: str | None
+    recording: rr.RecordingStream,
+    log: Path,
+    every: int,
+    all_views: Path | None,
+    tab: str | None,
+    *,
+    body: bool,
 ) -> None:
     header, folder = read_header(log), log.parent
     streams = list(range(len(header.spec.streams)))
     if len(streams) > MOST_STREAMS:  # which are watched most is known at the end only
         streams = read_outline(log).streams(MOST_STREAMS)
     tally, view = Tally(header), RunView(recording, header, streams, every)
-    world = FirstTab(recording, header, log, streams, every, all_views)
+    world = WorldView(recording, header, folder, streams, every, all_views, body=body)
+    truth: list[Frames] = []
     for note in world.notes:
         view.event(0, 0, note, "WARN")
     events: list[str] = []
@@ -149,6 +159,7 @@ def _write_run(
             tally.add(columns)
         view.take(stretch)
         world.take(stretch)
+        truth += stretch.truth
         events += [event.text for event in stretch.events]
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
@@ -157,9 +168,10 @@ def _write_run(
     text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, all_views, outline, every)
-    first = world.finish(outline)
+    world.flush()
+    first = world.first(write_learned(recording, log, outline, truth))
     recording.send_blueprint(
-        run_layout(outline, first=first, all_views=all_views is not None, head=head, tab=tab)
+        run_layout(outline, first, all_views=all_views is not None, head=head, tab=tab)
     )
 
 

@@ -21,7 +21,10 @@ from replay.runs.outline import Outline
 from replay.view.columns import FRAME, frames_column, line_column
 from replay.view.heads import gaze, write_gaze, write_heads
 from replay.view.labels import label, part
+from replay.view.layouts.first import tab_of_recording
 from replay.view.layouts.plots import blueprint, lines, time_axis
+from replay.view.world.known import world_of_recording
+from replay.view.world.scene import SceneView
 
 BLOCK = 500
 """Frames that are read at once."""
@@ -49,20 +52,26 @@ def write_recording(
     """
     with contextlib.closing(open_to_look(paths, rate)) as source:
         first, count, spec = source.t, source.frames, source.spec
-        write_views(recording, source, count, every)
-        for warning in source.warnings:
+        ours = isinstance(source, RecordedSource)
+        scenery = world_of_recording(paths[0]) if ours else None
+        scene = None if scenery is None else SceneView(recording, spec, scenery)
+        notes = [*source.warnings]
+        if scene is not None and (missing := scene.stand()) is not None:
+            notes.append(missing)
+        write_views(recording, source, count, every, scene=scene)
+        for note in notes:
             recording.set_time(FRAME, sequence=first)
-            recording.log("events", rr.TextLog(label(warning), level="WARN"))
+            recording.log("events", rr.TextLog(label(note), level="WARN"))
     properties: dict[str, Any] = {
         "frames": count,
         "streams": label(", ".join(spec.streams)),
         "fps": spec.fps,
     }
     recording.send_property("recording", rr.AnyValues(**properties))
-    ours = isinstance(source, RecordedSource)
     poses = {name: pose for p in paths for name, pose in head_poses(p).items()} if ours else {}
     head = write_heads(recording, spec.streams, poses)
-    recording.send_blueprint(recording_layout(spec, first + count, head, tab))
+    layout = recording_layout(spec, first + count, head=head, scene=scene is not None, tab=tab)
+    recording.send_blueprint(layout)
 
 
 def write_views(
@@ -71,6 +80,7 @@ def write_views(
     count: int,
     every: int,
     blocks: Blocks | None = None,
+    scene: SceneView | None = None,
 ) -> None:
     """Write every view of a recording, and what the world knows, from the source's t on.
 
@@ -80,6 +90,7 @@ def write_views(
         count: how many frames.
         every: show images of every this many frames.
         blocks: of a run, for its views; its truth is there already.
+        scene: where what the world knows is shown, too.
     """
     first, spec = source.t, source.spec
     columns = [frames_column(recording, spec, view) for view in view_entities(spec)]
@@ -96,10 +107,14 @@ def write_views(
                 keep = frames % (every if spec.images else 1) == 0
                 iterations = None if blocks is None else blocks.iteration(frames[keep])
                 column.add(frames[keep], iterations, block.frames[keep])
-        if truth is not None:
-            truth.add(frames, None, block.truth)
+                if truth is not None and stream == 0:
+                    truth.add(frames, None, block.truth)
+                if scene is not None and stream == 0:
+                    scene.move(frames[keep], block.truth[keep])
     for column in [*columns, *([truth] if truth is not None else [])]:
         column.flush()
+    if scene is not None:
+        scene.flush()
 
 
 def write_unwatched(
@@ -141,8 +156,23 @@ def view_entities(spec: SourceSpec) -> list[str]:
     return [f"views/{part(spec.streams, s)}" for s in range(len(spec.streams))]
 
 
-def recording_layout(spec: SourceSpec, frames: int, head: bool, tab: str | None) -> rrb.Blueprint:
-    """The tab of a recording's views, the truth and where the head looks."""
+def recording_layout(
+    spec: SourceSpec,
+    frames: int,
+    *,
+    head: bool = False,
+    scene: bool = False,
+    tab: str | None = None,
+) -> rrb.Blueprint:
+    """The tabs of a recording: its world, where there is one, its views, and what is known.
+
+    Args:
+        spec: of its source.
+        frames: where it ends.
+        head: where the head looks is there.
+        scene: so is the world in 3D.
+        tab: name of the one that is open.
+    """
     axis = time_axis(frames)
     shown = [
         rrb.Spatial2DView(origin=f"/{view}", name=label(name))
@@ -157,6 +187,6 @@ def recording_layout(spec: SourceSpec, frames: int, head: bool, tab: str | None)
     looks = [gaze("Where the head looks")] if head else []
     beside = [*known, *looks]
     below = [rrb.Horizontal(*beside, column_shares=[3, 1][: len(beside)])] if beside else []
-    return blueprint(
-        rrb.Vertical(grid, *below, name="Views"), name="Recording", length=frames, tab=tab
-    )
+    world = [tab_of_recording(spec, view_entities(spec))] if scene else []
+    views = rrb.Vertical(grid, *below, name="Views")
+    return blueprint(*world, views, name="Recording", length=frames, tab=tab)

@@ -65,7 +65,7 @@ def ready_view(run: Path) -> Path:
     view, log = run / VIEW_FILE, run_log(run)
     old = not view.is_file() or view.stat().st_mtime < log.stat().st_mtime
     if old or _identity(view) != run_identity(run):  # the copy of a run brings its view along
-        build_view(run, view)
+        build_view(run, view, body=False)
     return view
 
 
@@ -231,9 +231,12 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         LogDamagedError: that run cannot be read.
     """
     from replay.runs.outline import read_outline
-    from replay.view.layouts.of_run import (
-        run_layout,  # takes half a second: only once the table is there
-    )
+
+    # These take half a second: only once the table is there.
+    from replay.view.layouts.of_run import run_layout
+    from replay.view.layouts.panels import MOST_STREAMS
+    from replay.view.world.first import first_of
+    from replay.view.world.known import world_of_run
 
     results = [read_properties(run)["result"] for run in runs]
     most = max(range(len(runs)), key=lambda i: int(results[i]["modules"]))
@@ -244,8 +247,9 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         end=max(outline.end, *(int(result["frames"]) for result in results)),
         lines={name: values[:0] for name, values in outline.lines.items()},
     )
-    file = place / "layout.rbl"
-    run_layout(outline, tab=tab).save(APPLICATION, str(file))
+    streams, file = outline.streams(MOST_STREAMS), place / "layout.rbl"
+    shown = first_of(outline.header, world_of_run(outline.header, runs[most])[0], streams)
+    run_layout(outline, shown, tab=tab).save(APPLICATION, str(file))
     layouts = dataset.blueprint_dataset()
     (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
     dataset.set_default_blueprint_segment_id(segment)
@@ -282,7 +286,7 @@ def add_views(
                 progress(i, len(runs))
         # The rows hold the properties too, perhaps in other types: a table's column has one.
         bare = {
-            _without_properties(view, place / f"view-{start + i:05d}.rrd"): view
+            _as_layer(view, place / f"view-{start + i:05d}.rrd"): view
             for i, view in enumerate(_register(dataset, views, LAYER))
         }
         for copy, reason in _register(dataset, list(bare), LAYER).items():
@@ -299,11 +303,14 @@ def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str
     return {names[name]: reason.splitlines()[-1] for name, _, reason in answers if reason}
 
 
-def _without_properties(view: Path, out: Path) -> Path:
-    """A copy of a view that leaves a run's properties to its row."""
+def _as_layer(view: Path, out: Path) -> Path:
+    """A copy of a view that leaves a run's properties to its row, and the robot's body out."""
+    from replay.view.world.body import BODY  # imports the package, as the layout did
+    from replay.view.world.scene import SCENE
+
     reader = RrdReader(str(view))
     (store,) = (s for s in reader.store_entries() if s.kind == "recording")
-    kept = reader.stream(store).drop_matching(content=["/__properties/**"])
+    kept = reader.stream(store).drop_matching(content=["/__properties/**", f"/{SCENE}/{BODY}/**"])
     kept.write_rrd(str(out), store.application_id, store.recording_id)
     return out
 

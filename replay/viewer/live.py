@@ -28,10 +28,14 @@ from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
+from replay.view.world.first import WorldView
 from replay.viewer.broadcast import Broadcast
 
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
+
+EVERY_FRAMES = 10
+"""Frames between two at which it is said where things are."""
 
 MOST_BLOCKS = 500
 """Most blocks that wait, however quick the learner is."""
@@ -50,6 +54,7 @@ class LiveView(Sink):
         manifest: what the run was started with, as for `RunWriter`.
         tau: frames of a block.
         outputs: outputs of an abstraction.
+        run: its folder, where it has one.
         port: to listen at; by default a free one.
 
     Raises:
@@ -63,6 +68,7 @@ class LiveView(Sink):
         tau: int,
         outputs: int,
         *,
+        run: Path | None = None,
         port: int | None = None,
     ) -> None:
         outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest), tau, outputs)
@@ -71,11 +77,15 @@ class LiveView(Sink):
         self._broadcast = Broadcast(self._recording, NAME, port)
         self.address = self._broadcast.address
         self._recording.send_recording_name("live")
-        self._recording.send_blueprint(run_layout(outline))
-        # No image is left out here: of each block only the first is taken.
-        self._view = RunView(
-            self._recording, outline.header, outline.streams(MOST_STREAMS), every=1, piece=PIECE
+        streams = outline.streams(MOST_STREAMS)
+        self._world = WorldView(
+            self._recording, outline.header, run or Path(), streams, EVERY_FRAMES
         )
+        self._recording.send_blueprint(run_layout(outline, self._world.first()))
+        # No image is left out here: of each block only the first is taken.
+        self._view = RunView(self._recording, outline.header, streams, every=1, piece=PIECE)
+        for note in self._world.notes:
+            self._view.event(0, 0, note, "WARN")
         self._tau = tau
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
@@ -139,6 +149,7 @@ class LiveView(Sink):
 
     def _show(self, stretch: Stretch) -> None:
         self._view.take(stretch)
+        self._world.take(stretch)
         weights = dict(stretch.phi)
         for columns in stretch.signals:
             self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
@@ -148,6 +159,7 @@ class LiveView(Sink):
                     place = f"modules/{int(columns['module'][i])}/weights"
                     self._view.weights(place, t, iteration, weights[t])
         self._view.flush()
+        self._world.flush()
         self._broadcast.hand_over()
 
     def close(self) -> None:

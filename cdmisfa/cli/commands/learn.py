@@ -207,7 +207,7 @@ def learn_command(
                     fsync_every=fsync_every,
                     live=live_view,
                     announce=announce,
-                    command=None if out is None else command_of(source, ctx.params, out),
+                    command=command_of(source, ctx.params, out or Path()),
                 )
         except RunExhaustedError as error:
             show(error.result, as_json=as_json)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun.blueprint as rrb
 
-from replay.view.columns import ITERATION
-from replay.view.layouts.panels import NEAR, Panels
+from cdmisfa.core.blocks import SourceSpec
+from replay.view.labels import label
+from replay.view.layouts.panels import NEAR, Panels, events
 from replay.view.layouts.plots import lines, near, near_axis
 from replay.view.world.first import First
 from replay.view.world.scene import SCENE
@@ -26,16 +29,10 @@ def first_tab(panels: Panels, first: First) -> rrb.Container:
     """
     happened = [
         rrb.TextDocumentView(origin="/summary", name="What came of it"),
-        rrb.TextLogView(
-            origin="/events",
-            name="What happened when",
-            columns=rrb.archetypes.TextLogColumns(
-                timeline_columns=[ITERATION], text_log_columns=["body"]
-            ),
-        ),
+        events("What happened when"),
     ]
     sees = panels.watched("What it sees now")
-    world = [*_scene(first), *_wall(first)]
+    world = [*([scene_view()] if first.scene else []), *_wall(first)]
     left = rrb.Vertical(*world) if world else sees
     beside = [sees, *happened] if world else happened
     right = rrb.Vertical(*beside, row_shares=[2, 3, 2][-len(beside) :])
@@ -47,19 +44,30 @@ def first_tab(panels: Panels, first: First) -> rrb.Container:
     return rrb.Vertical(above, *rows, row_shares=[max(5, height), *(2 for _ in rows)], name=NAME)
 
 
-def _scene(first: First) -> list[rrb.View]:
-    if not first.scene:
-        return []
-    return [
-        rrb.Spatial3DView(
-            origin=f"/{SCENE}",
-            name="The world, and where it looks",
-            line_grid=rrb.LineGrid3D(visible=False),
-            eye_controls=rrb.EyeControls3D(
-                position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
-            ),
-        )
+def tab_of_recording(spec: SourceSpec, views: Sequence[str]) -> rrb.Container:
+    """The first tab of a recording: its world, and what each view shows.
+
+    Args:
+        spec: of its source.
+        views: the entity of each view.
+    """
+    pictures = [
+        rrb.Spatial2DView(origin=f"/{view}", name=label(name))
+        for name, view in zip(spec.streams, views, strict=True)
     ]
+    return rrb.Horizontal(scene_view(), rrb.Vertical(*pictures), column_shares=[5, 2], name=NAME)
+
+
+def scene_view() -> rrb.View:
+    """The world in 3D, seen from in front of the robot."""
+    return rrb.Spatial3DView(
+        origin=f"/{SCENE}",
+        name="The world, and where it looks",
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            position=(-1.5, -0.85, 0.72), look_target=(-0.38, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
+        ),
+    )
 
 
 def _wall(first: First) -> list[rrb.View]:

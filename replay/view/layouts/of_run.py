@@ -14,8 +14,8 @@ from replay.view.world.first import First
 
 def run_layout(
     outline: Outline,
+    first: First,
     *,
-    first: First | None = None,
     all_views: bool = False,
     head: bool = False,
     tab: str | None = None,
@@ -24,7 +24,7 @@ def run_layout(
 
     Args:
         outline: the run in short.
-        first: what the first tab shows; a run that is still being learned has none.
+        first: what the first tab shows.
         all_views: what was not watched is there too.
         head: where the head was turned is there too.
         tab: name of the tab that is open; by default the first.
@@ -35,4 +35,4 @@ def run_layout(
     layout = progress_layout if outline.header.by_progress else paper_layout
     panels = Panels(outline, all_views=all_views, head=head, tab=tab)
     own = layout(panels)
-    return panels.tabs(*([first_tab(panels, first)] if first is not None else []), *own)
+    return panels.tabs(first_tab(panels, first), *own)

@@ -137,13 +137,7 @@ class Panels:
         count = max(self.outline.modules, len(self.outline.saved))
         rows = [self._module(i) for i in range(1, count + 1)]
         truth = self.near("What the world knows", ["/world/truth"]) if self.spec.truth else []
-        learned = rrb.TextLogView(
-            origin="/events",
-            name="Events",
-            columns=rrb.archetypes.TextLogColumns(
-                timeline_columns=[ITERATION], text_log_columns=["body"]
-            ),
-        )
+        learned = events("Events")
         if count <= MOST_MODULES:
             return rrb.Vertical(*rows, *truth, learned, name="Modules")
         pages = [
@@ -269,6 +263,17 @@ class Panels:
                 parts = [f"/{i}" for i in modules] if signal.dims.startswith("M") else [""]
                 found += [f"/signals/{signal.name}{part}" for part in parts]
         return [entity for entity in found if self._is_told(entity)]
+
+
+def events(name: str) -> rrb.View:
+    """What happened, in words, with the iteration."""
+    return rrb.TextLogView(
+        origin="/events",
+        name=name,
+        columns=rrb.archetypes.TextLogColumns(
+            timeline_columns=[ITERATION], text_log_columns=["body"]
+        ),
+    )
 
 
 def _signal(entity: str) -> str:

@@ -5,6 +5,6 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "replay.view.world.first": "FirstTab",
+        "replay.view.world.first": "WorldView",
     },
 )

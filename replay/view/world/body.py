@@ -15,6 +15,9 @@ from cdmisfa.core.errors import CdmisfaError
 NECK = "neck_yaw"
 """The joint that turns the head to the left."""
 
+BODY = "body"
+"""The part of the entities of all that it looks like."""
+
 PACKAGE = "package://iCub/"
 """How the models name their meshes."""
 
@@ -39,7 +42,9 @@ def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:
         try:
             _as_seen(model).write(seen)
             tree = UrdfTree.from_file_path(
-                seen, entity_path_prefix=root, static_transform_entity_path=f"{root}/joints"
+                seen,
+                entity_path_prefix=f"{root}/{BODY}",
+                static_transform_entity_path=f"{root}/joints",
             )
             tree.log_urdf_to_recording(recording)
         except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:

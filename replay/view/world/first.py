@@ -1,4 +1,4 @@
-"""The first tab of a run's view: its world, what it has learned of it, and what happened."""
+"""The world of a run on the first tab of its view: the scene in 3D, or a wall of its streams."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from pathlib import Path
 
 import rerun as rr
 
+from recorder.log.scenery import Scenery
 from replay.runs.log import RunHeader
-from replay.runs.outline import Outline
-from replay.runs.stretches import Frames, Stretch
+from replay.runs.stretches import Stretch
 from replay.view.world.known import world_of_run
-from replay.view.world.learned import Lesson, write_learned
+from replay.view.world.learned import Lesson
 from replay.view.world.scene import SceneView
-from replay.view.world.wall import WallView
-
-Bounds = tuple[tuple[float, float], tuple[float, float]]
+from replay.view.world.wall import Bounds, WallView, bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,46 +29,73 @@ class First:
 
     scene: bool
     wall: Bounds | None
-    lessons: tuple[Lesson, ...]
+    lessons: tuple[Lesson, ...] = ()
 
 
-class FirstTab:
-    """Writes what the first tab shows, which other tabs do not.
+def first_of(
+    header: RunHeader,
+    scenery: Scenery | None,
+    streams: Sequence[int],
+    lessons: Sequence[Lesson] = (),
+) -> First:
+    """What the first tab of a run has to show.
+
+    Args:
+        header: of its log.
+        scenery: what stood where, as far as that is known.
+        streams: those that are shown.
+        lessons: what its modules have learned.
+    """
+    spec = header.spec
+    wall = spec.images and scenery is None
+    return First(
+        scene=scenery is not None,
+        wall=bounds(len(streams), *spec.frame_shape) if wall else None,
+        lessons=tuple(lessons),
+    )
+
+
+class WorldView:
+    """Writes the world of a run.
 
     Args:
         recording: where it goes.
         header: of the run's log.
-        log: the file.
+        run: its folder.
         streams: those that are shown.
         every: where things are is shown at every so many frames, as pictures are.
         learned_from: the recording that the run learned from, where that is known.
+        body: of the robot, too.
+
+    Attributes:
+        notes: what a person should know of it.
     """
 
     def __init__(
         self,
         recording: rr.RecordingStream,
         header: RunHeader,
-        log: Path,
+        run: Path,
         streams: Sequence[int],
         every: int,
-        learned_from: Path | None,
+        learned_from: Path | None = None,
+        *,
+        body: bool = True,
     ) -> None:
-        self._recording, self._log, self._every = recording, log, every
+        self._header, self._streams, self._every = header, streams, every
         self._scene: SceneView | None = None
         self._wall: WallView | None = None
-        self._truth: list[Frames] = []
-        scenery, unsure = world_of_run(header, log, learned_from)
+        self._scenery, unsure = world_of_run(header, run, learned_from)
         self.notes: list[str] = [] if unsure is None else [unsure]
-        if scenery is not None:
-            self._scene = SceneView(recording, header.spec, scenery)
-            missing = self._scene.stand()
+        if self._scenery is not None:
+            self._scene = SceneView(recording, header.spec, self._scenery)
+            missing = self._scene.stand() if body else None
             self.notes += [] if missing is None else [missing]
         elif header.spec.images:
             self._wall = WallView(recording, header, streams)
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
-        self._truth += stretch.truth
         if self._wall is not None:
             self._wall.take(stretch)
         if self._scene is not None:
@@ -80,17 +105,12 @@ class FirstTab:
                 kept = frames % self._every == 0
                 self._scene.move(frames[kept], truth[kept])
 
-    def finish(self, outline: Outline) -> First:
-        """Write what is known at the end, and hand over everything that waits.
-
-        Args:
-            outline: the run in short.
-        """
+    def flush(self) -> None:
+        """Hand over everything that waits."""
         for view in (self._scene, self._wall):
             if view is not None:
                 view.flush()
-        return First(
-            scene=self._scene is not None,
-            wall=self._wall.bounds if self._wall is not None else None,
-            lessons=tuple(write_learned(self._recording, self._log, outline, self._truth)),
-        )
+
+    def first(self, lessons: Sequence[Lesson] = ()) -> First:
+        """What there is to show of it, and what was learned of it."""
+        return first_of(self._header, self._scenery, self._streams, lessons)

@@ -24,13 +24,13 @@ PRESET = (
 
 
 def world_of_run(
-    header: RunHeader, log: Path, recording: Path | None
+    header: RunHeader, run: Path, recording: Path | None = None
 ) -> tuple[Scenery | None, str | None]:
     """What stood where in a run, and what is not sure about it.
 
     Args:
         header: of its log.
-        log: the file.
+        run: its folder.
         recording: which it learned from, where that is known.
 
     Returns:
@@ -41,7 +41,7 @@ def world_of_run(
         return _told(_table(source.get("scene")))
     if source.get("scene") != KIND:
         return None, None
-    for place in _places(header, log, recording):
+    for place in _places(header, run, recording):
         with contextlib.suppress(CdmisfaError, OSError):
             found = world_of_recording(place, sha256=str(source.get("config_sha256")))
             if found is not None:
@@ -79,14 +79,14 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
     return scenery_of(config, NECK if pose is None else pose.position)
 
 
-def _places(header: RunHeader, log: Path, recording: Path | None) -> Iterator[Path]:
+def _places(header: RunHeader, run: Path, recording: Path | None) -> Iterator[Path]:
     """Where the recording may be that a run learned from."""
     if recording is not None:
         yield recording
     named = _table(header.manifest.get("command")).get("source")
     for name in named if isinstance(named, list) else []:
         with contextlib.suppress(OSError, ValueError):
-            if (place := log.parent / str(name)).exists():
+            if (place := run / str(name)).exists():
                 yield place
 
 

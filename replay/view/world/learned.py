@@ -55,7 +55,7 @@ def write_learned(
         recording: where it goes.
         log: of the run.
         outline: the run in short.
-        truth: what the world knew, piece after piece.
+        truth: what the world knew at each frame, piece after piece.
     """
     names, spec = outline.names(), outline.header.spec
     if not truth or not outline.saved:

@@ -16,6 +16,8 @@ from replay.runs.stretches import Stretch
 from replay.view.columns import ImageColumn, time_columns
 from replay.view.labels import label, part
 
+Bounds = tuple[tuple[float, float], tuple[float, float]]
+
 WALL = "wall"
 FRAME = f"{WALL}/frame"
 
@@ -51,14 +53,6 @@ class WallView:
             path = f"{WALL}/{part(self._spec.streams, s)}"
             recording.log(path, rr.Transform3D(translation=[x, y, 0.0]), static=True)
             self._pictures[s] = ImageColumn(recording, self._spec, path)
-
-    @property
-    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ranges of x and y that hold the wall."""
-        height, width = self._spec.frame_shape
-        x, y = (max(place[i] for place in self._places) for i in (0, 1))
-        margin = BETWEEN * height
-        return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
     def take(self, stretch: Stretch) -> None:
         """Take what a log holds of some iterations."""
@@ -135,6 +129,13 @@ class WallView:
         saves = np.flatnonzero(columns["saved"] & (columns["stream"] == s)).tolist()
         learned = [(i, f"{name}: module {int(columns['module'][i])}") for i in saves]
         return learned if self._said[s] else [(0, name), *learned]
+
+
+def bounds(count: int, height: int, width: int) -> Bounds:
+    """Ranges of x and y that hold a wall of so many pictures of a size."""
+    x, y = (max(place[i] for place in places(count, width, height)) for i in (0, 1))
+    margin = BETWEEN * height
+    return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
 
 def places(count: int, width: int, height: int) -> list[tuple[float, float]]:
