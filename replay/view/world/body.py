@@ -16,7 +16,7 @@ NECK = "neck_yaw"
 """The joint that turns the head to the left."""
 
 BODY = "body"
-"""The part of the entities of all that it looks like."""
+"""The entity of all that it looks like, in that of the scene."""
 
 PACKAGE = "package://iCub/"
 """How the models name their meshes."""
@@ -43,7 +43,7 @@ def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:
             _as_seen(model).write(seen)
             tree = UrdfTree.from_file_path(
                 seen,
-                entity_path_prefix=f"{root}/{BODY}",
+                entity_path_prefix=root,
                 static_transform_entity_path=f"{root}/joints",
             )
             tree.log_urdf_to_recording(recording)
@@ -70,8 +70,9 @@ def _model(robot: str) -> Path:
 
 
 def _as_seen(model: Path) -> Any:
-    """The model with its meshes where they are, and without the shapes that collide."""
+    """The model as `BODY`, its meshes where they are, and without the shapes that collide."""
     tree: Any = ElementTree.parse(model)
+    tree.getroot().set("name", BODY)
     share = next(folder for folder in model.parents if (folder / "robots").is_dir())
     for link in tree.iter("link"):
         for shape in link.findall("collision"):
