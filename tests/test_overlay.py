@@ -57,6 +57,22 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
         np.testing.assert_array_equal(found[f"/compare/{name}/R_stay/1_x1"], stay)
     with pytest.raises(UsageError, match="--force"):
         build_overlay(runs, side_by_side(runs), out)
+    with pytest.raises(UsageError, match="no tab 'nowhere'"):
+        build_overlay(runs, side_by_side(runs), out, force=True, tab="nowhere")
+
+
+@pytest.mark.parametrize("name", ["eta_dot", "xi"])
+def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
+    runs, (records, *_) = three
+    build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
+    found = []
+    for chunk in RrdReader(str(tmp_path / "all.rrd")).stream():
+        assert not chunk.entity_path.endswith(f"/{name}")
+        if not chunk.is_static and chunk.entity_path == f"/compare/1_run/log_{name}":
+            found += chunk.to_record_batch().column("Scalars:scalars").flatten().to_pylist()
+    np.testing.assert_allclose(
+        np.power(10, found), [np.ravel(getattr(r, name))[0] for r in records]
+    )
 
 
 def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):

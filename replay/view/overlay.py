@@ -15,15 +15,15 @@ from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.stretches import read_columns
 from replay.view.build import recording_to
-from replay.view.columns import ITERATION, Column, line_column
+from replay.view.columns import ITERATION, Column, line_column, power_of_ten
 from replay.view.labels import label, part
 from replay.view.layouts.panels import MOST_STREAMS
 from replay.view.layouts.plots import blueprint, lines, time_axis
 
 CURVES = {
-    "eta_dot": "Change of slowness η̇: a module is saved when it falls below δ",
+    "eta_dot": "Change of slowness η̇, as powers of ten: a module is saved when it is below δ",
     "eta": "Slowness η [1/frame]",
-    "xi": "Change of weights ξ",
+    "xi": "Change of weights ξ, as powers of ten",
     "reward": "Reward",
     "share": "Share of novel blocks",
     "learning_error": "Learning error of the stream that is watched",
@@ -31,6 +31,9 @@ CURVES = {
     "epsilon": "Exploration ε",
 }
 """Signals that are overlaid where a run tells them, with the titles of their panels."""
+
+POWERS = ("eta_dot", "xi")
+"""Those that are drawn as powers of ten, at `log_<signal>`: they fall through several."""
 
 FIRST_TAB = ("eta_dot", "epsilon")
 """Those of the first tab; of the progress learner the errors of its streams stand there."""
@@ -50,7 +53,12 @@ FIRST = 3
 
 
 def build_overlay(
-    runs: Sequence[Path], rows: Sequence[Row], out: Path, *, force: bool = False
+    runs: Sequence[Path],
+    rows: Sequence[Row],
+    out: Path,
+    *,
+    force: bool = False,
+    tab: str | None = None,
 ) -> None:
     """Write the curves of several runs, one colour a run, into one .rrd file.
 
@@ -61,9 +69,10 @@ def build_overlay(
         rows: what `side_by_side` says of them.
         out: the file.
         force: replace an existing file.
+        tab: name of the tab that is open; by default the first.
 
     Raises:
-        UsageError: `out` exists and `force` is not set.
+        UsageError: `out` exists and `force` is not set, or there is no such tab.
         LogDamagedError: a run cannot be read.
         CdmisfaError: the file cannot be written.
     """
@@ -73,7 +82,7 @@ def build_overlay(
         recording.log("summary", text, static=True)
         for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
             _write(recording, run, row, f"compare/{part(names, i)}", i)
-        recording.send_blueprint(_layout(rows))
+        recording.send_blueprint(_layout(rows, tab))
 
 
 def table_text(rows: Sequence[Row]) -> str:
@@ -157,7 +166,8 @@ def _curves(
     """Entity of every curve in some iterations, in which of them it has values, and these."""
     every = np.ones(len(columns), dtype=bool)
     for name in CURVES:
-        yield name, every, columns[name].astype(np.float64)
+        values = columns[name].astype(np.float64)
+        yield _entity(name), every, power_of_ten(values) if name in POWERS else values
     for s in shown:
         if columns["R"].size:
             yield f"{R_STAY}/{part(names, s)}", every, columns["R"][:, s, 0, s]
@@ -168,7 +178,12 @@ def _curves(
             yield f"{OF_STREAM}/{part(names, s)}", own, error
 
 
-def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
+def _entity(name: str) -> str:
+    """Where a signal's curve is, below its run."""
+    return f"log_{name}" if name in POWERS else name
+
+
+def _layout(rows: Sequence[Row], tab: str | None) -> rrb.Blueprint:
     axis = time_axis(max(row.outline.iterations for row in rows))
     outline, names = rows[0].outline, [row.name for row in rows]
     roots = [f"/compare/{part(names, i)}" for i in range(len(names))]
@@ -189,7 +204,7 @@ def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
         return [panel(f"{title} {stream}", f"{entity}/{place}") for stream, place in shown]
 
     def curves(names: Iterable[str]) -> list[rrb.View]:
-        return [panel(CURVES[name], name) for name in names if name in told]
+        return [panel(CURVES[name], _entity(name)) for name in names if name in told]
 
     first = curves(FIRST_TAB) if "eta_dot" in told else by_stream(ERROR_OF, OF_STREAM, FIRST)
     rewards = by_stream("R for staying on", R_STAY) if "R" in told else []
@@ -206,4 +221,5 @@ def _layout(rows: Sequence[Row]) -> rrb.Blueprint:
         name="Comparison",
         timeline=ITERATION,
         length=max(row.outline.iterations for row in rows),
+        tab=tab,
     )
