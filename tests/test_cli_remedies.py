@@ -62,7 +62,7 @@ def test_export_writes_no_file_named_dash(
     ],
     ids=lambda words: f"{words[0]} {words[-1]}",
 )
-@pytest.mark.parametrize("url", ["s3://bucket/there", "https://there.org/x"])
+@pytest.mark.parametrize("url", ["gs://bucket/there", "https://there.org/x"])
 def test_what_is_written_goes_nowhere_but_to_this_machine(
     cdmisfa: Cdmisfa,
     oscillatory_run: Path,

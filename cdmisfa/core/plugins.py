@@ -6,10 +6,12 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.core.errors import UsageError, one_line
+
+if TYPE_CHECKING:
+    from importlib import metadata
 
 GROUPS: Mapping[str, str] = {
     "cdmisfa.sources": "a source of learn, record and others",
@@ -80,6 +82,8 @@ def plugins(group: str) -> tuple[Plugin, ...]:
 
 @lru_cache(maxsize=16)
 def _plugins(group: str, path: tuple[str, ...]) -> tuple[Plugin, ...]:
+    from importlib import metadata  # takes as long as the rest of --help
+
     found = [
         Plugin(entry.name, entry.value, entry.dist.name, entry.dist.version, entry)
         for entry in metadata.entry_points(group=group)
