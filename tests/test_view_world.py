@@ -248,6 +248,8 @@ def test_a_recording_shows_its_world(tmp_path, monkeypatch):
     )
     np.testing.assert_allclose(places[:, :2], known[:, [x, y]] * (1, -1), atol=1e-6)
     assert {"World", "Views"} <= set(layout_names(tmp_path / "r.rrd"))
+    shown = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "r.rrd")).stream()}
+    assert not [entity for entity in shown if "watching" in entity]  # nothing is
     said = [text for (text,) in rows["/events"]["TextLog:text"]]
     assert any("icub-models" in text for text in said)
 

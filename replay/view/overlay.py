@@ -217,7 +217,7 @@ def _layout(rows: Sequence[Row], tab: str | None) -> rrb.Blueprint:
     return blueprint(
         rrb.Horizontal(table, rrb.Vertical(*first), column_shares=[2, 4], name="Overview"),
         *tabs,
-        rrb.Grid(*curves(CURVES), name="All curves"),
+        rrb.Grid(*curves(CURVES), grid_columns=2, name="All curves"),
         name="Comparison",
         timeline=ITERATION,
         length=max(row.outline.iterations for row in rows),

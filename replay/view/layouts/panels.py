@@ -171,7 +171,8 @@ class Panels:
             pictures = [rrb.Spatial2DView(origin=place, name=name) for name, place in places]
             watched = self.lanes("What it mostly watches", f"/{MOSTLY}/{ATTENDS}")
             grid = rrb.Grid(*pictures, grid_columns=min(len(pictures), 3))
-            turned = self.lines("Where the head is turned", ["/head/yaw"])
+            title = "Where the head is turned [degrees to the left]"
+            turned = self.lines(title, ["/head/yaw"], legend=False)
             looks = rrb.Horizontal(*turned, gaze("Where it looks"), column_shares=[2, 1])
             head = [looks] if self._head else []
             shares = [3, 1, *(2 for _ in head)]

@@ -54,7 +54,7 @@ class SceneView:
 
     def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, scenery: Scenery) -> None:
         self._recording, self._spec, self._scenery = recording, spec, scenery
-        self._watched = -1
+        self._watched, self._turned = -1, False
         self._neck: Any = None
         recording.log(SCENE, rr.ViewCoordinates.BRU, static=True)
         _write_thing(recording, f"{SCENE}/table", scenery.table, at_rest=True)
@@ -69,10 +69,6 @@ class SceneView:
         for s, gaze in enumerate(self._gazes):
             if gaze is not None:
                 _write_pyramid(recording, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
-        own = [gaze for gaze in self._gazes if gaze is not None]
-        if own:  # the eyes are the same in every view
-            thick = rr.LineStrips3D(pyramid(own[0].middle), radii=[THICK])
-            recording.log(f"{WATCHING}/edges", thick, static=True)
 
     def stand(self) -> str | None:
         """Show the robot's body, and return what to say where that cannot be."""
@@ -97,6 +93,10 @@ class SceneView:
             return
         at = np.array([i for i, _ in places])
         gazes = [gaze for _, gaze in places]
+        if not self._turned:  # the eyes are the same in every view
+            self._turned = True
+            thick = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
+            self._recording.log(f"{WATCHING}/edges", thick, static=True)
         times = time_columns(self._spec, columns.frames[at], columns.iterations[at])
         rgbs = [colour(int(s)) for s in streams[at]]
         self._recording.send_columns(WATCHING, times, _poses(gazes))
