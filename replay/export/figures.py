@@ -153,7 +153,6 @@ def streams(history: History) -> Figure | None:
     _share(watched, history)
     error.set_ylabel("learning error e")
     slowness.set_ylabel("slowness, tested\n(dotted: fitted)\n[1/frame]")
-    watched.set_ylim(0, 1.4)
     _mark_saves((error, slowness, watched), history)
     _finish(watched, watched)
     return figure
@@ -202,6 +201,7 @@ def _share(axes: Axes, history: History) -> None:
     for s in history.shown:
         share = np.convolve(history.stream == s, np.ones(window) / window, mode="same")
         axes.plot(np.arange(n), share, color=_shade(history, s), label=names[s])
+    axes.set_ylim(0, 1.4)  # with room for the legend
     axes.set_ylabel(f"share of time\n({window} iterations)")
 
 

@@ -169,7 +169,7 @@ def frames_column(
     """A column of a source's frames: images, or lines of values."""
     if spec.images:
         return ImageColumn(recording, spec, path)
-    names = [f"x{i + 1}" for i in range(int(np.prod(spec.frame_shape)))]
+    names = [f"value {i + 1}" for i in range(int(np.prod(spec.frame_shape)))]
     return line_column(recording, spec, path, names, width=width)
 
 
