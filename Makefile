@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: demo test lint bench fuzz torture clean install
+.PHONY: demo test lint bench pictures fuzz torture clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
@@ -18,6 +18,9 @@ lint: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks
+
+pictures: $(INSTALLED)
+	$(BIN)/python docs/images/draw.py
 
 fuzz: $(INSTALLED)
 	$(BIN)/python tests/fuzz_coverage.py --seconds $(or $(SECONDS),60)

@@ -1,0 +1,118 @@
+"""Draw the pictures of these pages again: runs, views of every tab, figures. `make pictures`.
+
+With names of pictures, only those; runs that are in build/pictures already are not learned again.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+from PIL import Image
+
+from cdmisfa.cli import run
+from replay.runs.compare import side_by_side
+from replay.view.overlay import build_overlay
+
+IMAGES = Path(__file__).parent
+SAMPLE = str(IMAGES.parents[1] / "sample_logs" / "icub")
+BUILD = IMAGES.parents[1] / "build" / "pictures"
+
+COLOURS = 200
+"""Colours of a view's picture: more are hardly seen, and take twice the bytes."""
+
+LEARN = {
+    "icub": (SAMPLE, "--loop"),
+    "progress": (SAMPLE, "--loop", "--algorithm", "progress"),
+    "progress1": (SAMPLE, "--loop", "--algorithm", "progress", "--seed", "1"),
+    "cameras": (
+        *(f"{SAMPLE}/{view}.mcap" for view in ("left", "right", "center")),
+        *("--topic", "/view/left", "--topic", "/view/right", "--topic", "/view/center", "--loop"),
+    ),
+    **{f"seed{seed}": ("oscillatory", "--seed", str(seed)) for seed in range(3)},
+}
+"""Runs, and what `learn` is told to make them."""
+
+COMPARED = {"by 2.0": ("seed0", "seed1", "seed2"), "by progress": ("progress", "progress1")}
+"""Runs that are laid over one another."""
+
+VIEWS = {
+    "view": ("icub", "World", "--at", "25540"),
+    "oscillatory": ("seed0", "Overview"),
+    "abstraction": ("icub", "Abstraction"),
+    "gate": ("icub", "Gate"),
+    "decisions": ("seed0", "Decision"),
+    "modules": ("icub", "Modules"),
+    "all-views": ("icub", "All views", "--all-views", SAMPLE),
+    "table": ("seed0", "Table"),
+    "values": ("seed0", "World", "--at", "module 2"),
+    "wall": ("cameras", "World"),
+    "progress": ("progress", "Overview"),
+    "candidate": ("progress", "Candidate", "--at", "module 2"),
+    "recording": (SAMPLE, "World", "--at", "540"),
+    "recording-views": (SAMPLE, "Views", "--at", "540"),
+    "compare": ("by 2.0", "Overview"),
+    "rewards": ("by 2.0", "Rewards"),
+    "errors": ("by progress", "Streams"),
+    "curves": ("by 2.0", "All curves"),
+}
+"""Pictures of views: the run or recording, the tab, and further options."""
+
+FIGURES = {
+    "decision": ("icub", "decision"),
+    "contact_sheet": ("icub", "contact_sheet"),
+    "streams": ("progress", "streams"),
+}
+"""Pictures that `plot` draws: the run, and the name of the figure."""
+
+
+def must(*words: str) -> None:
+    """Run a command that succeeds."""
+    if code := run(list(words)):
+        raise SystemExit(f"{' '.join(words)} ended with {code}")
+
+
+def learned(name: str) -> Path:
+    """A run, learned where it is not there yet."""
+    folder = BUILD / name
+    if not (folder / "run.json").exists():
+        must("learn", *LEARN[name], "-o", str(folder), "--no-rerun", "--force")
+    return folder
+
+
+def draw_view(name: str) -> None:
+    """Draw one tab of one view."""
+    source, tab, *options = VIEWS[name]
+    if source in COMPARED:
+        shown = BUILD / f"{name}.rrd"
+        runs = [learned(compared) for compared in COMPARED[source]]
+        build_overlay(runs, side_by_side(runs), shown, force=True, tab=tab)
+        tab = ""
+    else:
+        shown = learned(source) if source in LEARN else Path(source)
+    opened = ("--tab", tab) if tab else ()
+    drawn = BUILD / f"{name}.png"
+    must("view", str(shown), "--screenshot", str(drawn), "--force", *opened, *options)
+    with Image.open(drawn) as picture:
+        few = picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        few.save(IMAGES / f"{name}.png", optimize=True)
+
+
+def draw_figure(name: str) -> None:
+    """Draw one figure of one run."""
+    source, figure = FIGURES[name]
+    folder = BUILD / f"{source}-figures"
+    must("plot", str(learned(source)), "-o", str(folder), "--force")
+    shutil.copyfile(folder / f"{figure}.png", IMAGES / f"{name}.png")
+
+
+def main() -> None:
+    """Draw the pictures that are named, by default all."""
+    BUILD.mkdir(parents=True, exist_ok=True)
+    for name in sys.argv[1:] or [*VIEWS, *FIGURES]:
+        draw_figure(name) if name in FIGURES else draw_view(name)
+
+
+if __name__ == "__main__":
+    main()
