@@ -9,6 +9,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import gram, strict
 from cdmisfa.features.incsfa.abstraction import IncSFA
+from cdmisfa.features.incsfa.cells import changing_cells
 from cdmisfa.features.incsfa.state import State, new_state, parameters, rank_floor
 from cdmisfa.features.projection import mean_output, project
 from cdmisfa.features.sfa import batch_sfa, slowness
@@ -69,6 +70,16 @@ def latent_frames(n: int, size: int, seed: int = 0) -> np.ndarray:
     return freeze(0.5 + latents @ mixing + 0.02 * rng.standard_normal((n, size)))
 
 
+def mostly_still_frames(n: int, size: int, cuts) -> np.ndarray:
+    """Frames of which three columns in ten change within a block, elsewhere in each."""
+    frames, start = latent_frames(n, size).copy(), 0
+    for number, length in enumerate(cuts):
+        moving = np.roll(np.arange(size) < 0.3 * size, 37 * number)
+        frames[start : start + length, ~moving] = frames[start, ~moving]
+        start += length
+    return freeze(frames)
+
+
 def learn_in(kernel, config, frames, cuts, gaps=(), seed=3):
     """State and xi after learning from blocks of the lengths `cuts`; `gaps` are block numbers."""
     state = new_state(np.random.default_rng(seed), frames.shape[1], config)
@@ -123,10 +134,11 @@ def test_kernels_follow_the_equations(kernel, size, components, outputs):
 
 @pytest.mark.parametrize("length", [1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 41])
 @pytest.mark.parametrize("gap", [False, True])
-def test_gram_kernel_follows_the_strict_one_whatever_the_blocks_length(length, gap):
+@pytest.mark.parametrize("still", [False, True])
+def test_gram_kernel_follows_the_strict_one_whatever_the_blocks_length(length, gap, still):
     config = config_of(6, 2)
-    frames = latent_frames(5 * length, 260)
     cuts, gaps = [length] * 5, (2, 3) if gap else ()
+    frames = mostly_still_frames(5 * length, 260, cuts) if still else latent_frames(5 * length, 260)
     a, xi_a = learn_in(strict, config, frames, cuts, gaps)
     b, xi_b = learn_in(gram, config, frames, cuts, gaps)
     np.testing.assert_allclose(xi_b, xi_a, rtol=1e-9)
@@ -135,11 +147,48 @@ def test_gram_kernel_follows_the_strict_one_whatever_the_blocks_length(length, g
     np.testing.assert_allclose(b.gram, b.v @ b.v.T, rtol=0, atol=1e-12 * b.gram.max())
 
 
+@pytest.mark.parametrize(("size", "components"), [(320, 7), (517, 8), (264, 3)])
 @pytest.mark.parametrize("pixels", [False, True])
-def test_gram_kernel_is_as_near_to_long_double_as_two_direct_orders_are(pixels):
+def test_columns_that_stand_still_within_a_block_are_learned_like_the_others(
+    size, components, pixels
+):
+    config = config_of(components, 2, mean_window=50)
+    cuts, gaps = [40, 1, 1, 2, 3, 33, 1, 40, 5, 40], (1, 4, 6, 7)
+    frames = mostly_still_frames(sum(cuts), size, cuts)
+    if pixels:
+        frames = freeze(np.round(frames * 255).clip(0, 255).astype(np.uint8))
+    assert len(changing_cells(frames[:40], components)) < 0.5 * (size // 8)
+    state, xi = learn_in(gram, config, frames, cuts, gaps)
+    start = new_state(np.random.default_rng(3), size, config)
+    plain, starts = PlainIncSFA(start, config, np.longdouble), np.cumsum([0, *cuts])
+    values = frames / np.longdouble(255) if pixels else frames
+    expected = [plain.learn(x, t in starts[list(gaps)]) for t, x in enumerate(values)]
+    np.testing.assert_allclose(xi, np.array(expected, float), rtol=1e-8)
+    for name in ("mean", "v", "w", "z_prev", "phi"):
+        x, y = getattr(state, name), getattr(plain, name).astype(float)
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-9 * np.abs(y).max(), err_msg=name)
+    np.testing.assert_allclose(state.gram, state.v @ state.v.T, rtol=0, atol=1e-12)
+
+
+def test_cells_that_change_are_found_or_all_taken_where_most_do():
+    frames = np.zeros((40, 83), np.uint8)
+    frames[7, 17] = frames[39, 64] = frames[3, 82] = 1  # the last is in no whole cell
+    assert changing_cells(frames, 8).tolist() == [2, 8]
+    assert changing_cells(frames[:8], 8).tolist() == [2]
+    assert changing_cells(frames[:1], 4).tolist() == []
+    assert changing_cells(frames[:1], 5).tolist() == list(range(10))  # too few frames to pay off
+    frames[20, 24:56:8] = 1
+    assert changing_cells(frames, 8).tolist() == [2, 3, 4, 5, 6, 8]
+    frames[20, 72] = 1
+    assert changing_cells(frames, 8).tolist() == list(range(10))
+
+
+@pytest.mark.parametrize("still", [False, True])
+@pytest.mark.parametrize("pixels", [False, True])
+def test_gram_kernel_is_as_near_to_long_double_as_two_direct_orders_are(pixels, still):
     """The two: sums over the inputs from the first to the last, and from the last to the first."""
     config, n, size = config_of(8, 2), 2400, 400
-    frames = latent_frames(n, size)
+    frames = mostly_still_frames(n, size, [40] * (n // 40)) if still else latent_frames(n, size)
     if pixels:
         frames = freeze(np.round(frames * 255) / 255)
     start = new_state(np.random.default_rng(3), size, config)

@@ -72,6 +72,8 @@ def of_images() -> dict[str, str]:
         recursive = RecursiveSFA(301, 6, 2)
         for block in frames:
             incremental.update(block)
+            block[1:, 80:] = block[0, 80:]  # most of it stands still
+            incremental.update(block)
             recursive.update(block)
         y = outputs(incremental.phi, np.zeros(2), frames[0])
         sums = {"incremental": incremental.phi, "recursive": recursive.phi, "outputs": y}

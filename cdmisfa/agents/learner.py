@@ -135,6 +135,11 @@ class CuriousLearner:
         return getattr(self.abstraction, "kernel", None)
 
     @property
+    def arithmetic(self) -> int:
+        """Version of how the adaptive abstraction is computed; see `arithmetic_of`."""
+        return int(getattr(self.abstraction, "arithmetic", 1))
+
+    @property
     def over(self) -> str:
         """Whether exploration has ended long ago and still nothing converged; see `Learner`."""
         return "nothing_left" if self.agent.memory["idle"][0] > self.config.patience else ""

@@ -113,6 +113,18 @@ class Learner(Protocol):
         """Its part of a run's result, as JSON values."""
 
 
+ARITHMETIC = "arithmetic"
+"""Key of a run's manifest: `arithmetic_of` its learner; where it is missing, 1."""
+
+
+def arithmetic_of(learner: Learner) -> int:
+    """Version of how a learner computes: with another one all is the same but for the last bits.
+
+    A learner whose arithmetic has changed since its first version says so as `arithmetic`.
+    """
+    return int(getattr(learner, "arithmetic", 1))
+
+
 @runtime_checkable
 class Sink(Protocol):
     """Takes what happens in a run, in order: a log, a view, a hash, a progress bar.

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.config import differences
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
-from cdmisfa.core.learning import Keyframe, Learner, Sink
+from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import versions
 from recorder.log.begun import Begun, found_path, relative_path
@@ -299,6 +299,7 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
     header = read_header(log)
     before = {
         "signals": header.schema,
+        ARITHMETIC: 1,
         **header.manifest,
         "spec": dataclasses.asdict(header.spec),
         COMMAND: None,

@@ -19,7 +19,7 @@ from cdmisfa.core.arithmetic.compiled import needs_compiling
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.learning import ARITHMETIC, Learner, Sink, arithmetic_of
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import machine, versions, write_json
@@ -155,8 +155,13 @@ def run(
     digest = Digest()
     tables = {**(sections or {}), "learner": as_table(config)}
     described = description(source)
-    manifest = {"config": tables, "seed": seed, "source": described}
-    begun = {} if command is None else {COMMAND: dict(command)}
+    manifest: dict[str, Any] = {
+        "config": tables,
+        "seed": seed,
+        "source": described,
+        ARITHMETIC: arithmetic_of(learner),
+    }
+    begun: dict[str, Any] = {} if command is None else {COMMAND: dict(command)}
     ancestry = fork.ancestry if fork is not None else ancestry_of(folder) if resume else None
     if ancestry is not None:
         begun[FORK] = dict(ancestry)
@@ -226,6 +231,7 @@ def run(
             ended=ended,
         )
         if folder is not None and log is not None:
+            begun[ARITHMETIC] = manifest[ARITHMETIC]
             _write_run(folder, result, tables, begun, log, rerun=rerun)
     if exhausted is not None:
         kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {folder}"

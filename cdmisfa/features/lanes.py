@@ -52,11 +52,23 @@ def _lanes_pointer(context: Any, builder: Any, kind: Any, *where: Any) -> Any:
     return builder.bitcast(_pointer(context, builder, kind, *where), _VECTOR.as_pointer())
 
 
+def _spread(builder: Any, number: Any) -> Any:
+    empty, zero = ir.Constant(_VECTOR, ir.Undefined), ir.Constant(_INDEX, 0)
+    one = builder.insert_element(empty, number, zero)
+    return builder.shuffle_vector(
+        one, empty, ir.Constant(ir.VectorType(_INDEX, LANES), [0] * LANES)
+    )
+
+
 @_intrinsic
 def load(typing: Any, array: Any, row: Any, column: Any) -> Any:
-    """Return array[row, column : column + LANES]."""
+    """Return array[row, column : column + LANES]; of bytes, their values."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if signature.args[0].dtype == types.uint8:
+            pointer = _pointer(context, builder, signature.args[0], *args)
+            few = builder.bitcast(pointer, ir.VectorType(ir.IntType(8), LANES).as_pointer())
+            return builder.uitofp(builder.load(few, align=1), _VECTOR)
         return builder.load(_lanes_pointer(context, builder, signature.args[0], *args), align=8)
 
     return _LANES(array, types.intp, types.intp), emit
@@ -82,11 +94,7 @@ def add(typing: Any, x: Any, table: Any, row: Any, column: Any, y: Any) -> Any:
         x, table, row, column, y = args
         builder.fence("acq_rel", "singlethread")  # orders loads, and emits no instruction
         pointer = _pointer(context, builder, signature.args[1], table, row, column)
-        empty, zero = ir.Constant(_VECTOR, ir.Undefined), ir.Constant(_INDEX, 0)
-        one = builder.insert_element(empty, builder.load(pointer), zero)
-        spread = ir.Constant(ir.VectorType(_INDEX, LANES), [0] * LANES)
-        factor = builder.shuffle_vector(one, empty, spread)
-        return builder.fadd(x, builder.fmul(factor, y))
+        return builder.fadd(x, builder.fmul(_spread(builder, builder.load(pointer)), y))
 
     return _LANES(_LANES, table, types.intp, types.intp, _LANES), emit
 
@@ -138,6 +146,26 @@ def plus(typing: Any, x: Any, y: Any) -> Any:
         return builder.fadd(*args)
 
     return _LANES(_LANES, _LANES), emit
+
+
+@_intrinsic
+def minus(typing: Any, x: Any, y: Any) -> Any:
+    """Return x - y."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fsub(*args)
+
+    return _LANES(_LANES, _LANES), emit
+
+
+@_intrinsic
+def spread(typing: Any, x: Any) -> Any:
+    """Return a value of which every number is x."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _spread(builder, args[0])
+
+    return _LANES(types.float64), emit
 
 
 @_intrinsic

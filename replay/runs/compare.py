@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.config import differences
+from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import read_run_json, run_log
@@ -135,14 +136,16 @@ def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def computed_otherwise(first: Path, second: Path) -> tuple[str, ...]:
-    """What may explain a difference of two runs beside what they were told: versions, processors.
+    """What may explain a difference of two runs beside what they were told.
 
-    Nothing where a run.json does not say. Processors explain nothing between runs with
+    The version of their arithmetic, of packages, and the processor; of the last two nothing where
+    a run.json does not say. Processors explain nothing between runs with
     `learner.portable`.
     """
     a, b = (read_run_json(run_log(run).parent) for run in (first, second))
     tables = ["versions"] if _is_portable(a) else ["versions", "platform"]
-    found = []
+    one, two = read_header(first).arithmetic, read_header(second).arithmetic
+    found = [] if one == two else [f"{ARITHMETIC} {one} against {two}"]
     for before, after in ((a.get(table), b.get(table)) for table in tables):
         if isinstance(before, Mapping) and isinstance(after, Mapping):
             found += [

@@ -12,7 +12,7 @@ import numpy as np
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.learning import Keyframe
+from cdmisfa.core.learning import ARITHMETIC, Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.core.untrusted.memory import parse_json
 from replay.mcap.reader import LogReader
@@ -34,7 +34,8 @@ class RunHeader:
     Attributes:
         schema: version of `BlockSignals` it was written with.
         spec: what the learner's source delivered.
-        manifest: what the run was started with: `config` by sections, `seed`, `source`.
+        manifest: what the run was started with: `config` by sections, `seed`, `source`, and with
+            which `arithmetic` its learner computes.
     """
 
     schema: int
@@ -65,6 +66,12 @@ class RunHeader:
         if not isinstance(change, int | float) or not isinstance(agreement, int | float):
             return None
         return float(change), float(change + agreement)
+
+    @property
+    def arithmetic(self) -> int:
+        """With which version of its arithmetic its learner computed; see `arithmetic_of`."""
+        version = self.manifest.get(ARITHMETIC)
+        return version if isinstance(version, int) else 1
 
     @property
     def forked_at(self) -> int:

@@ -126,11 +126,8 @@ def check_command(
     found = checked.difference
     if as_json:
         options.print_json({"schema": options.SCHEMA, "run": str(run), **checked.as_json()})
-    elif found is None:
-        what = f"iterations {checked.start} to {checked.stop - 1}"
-        click.echo(f"{what}: learned again, they are identical, bit for bit")
     else:
-        click.echo(f"{found} when learned again")
+        click.echo(str(checked))
     if found is not None:
         ctx.exit(NotReproducedError.exit_code)
 

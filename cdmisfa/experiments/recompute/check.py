@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, NotReproducedError, UsageError
-from cdmisfa.core.learning import Keyframe, Learner
+from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.recompute.again import Again
 from replay.runs.columns import SignalColumns, columns_of_records
@@ -28,11 +28,14 @@ class Checked:
 
     Attributes:
         difference: the first one, of the log from what was learned again.
+        arithmetic: version of the log's, and of what was learned again; other versions give other
+            last bits.
     """
 
     start: int
     stop: int
     difference: Difference | None
+    arithmetic: tuple[int, int] = (1, 1)
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values."""
@@ -42,7 +45,21 @@ class Checked:
             "to": self.stop,
             "identical": found is None,
             "first_difference": None if found is None else found.as_json(),
+            "arithmetic": list(self.arithmetic),
         }
+
+    def __str__(self) -> str:
+        """What came of it, in words."""
+        if self.difference is None:
+            what = f"iterations {self.start} to {self.stop - 1}"
+            return f"{what}: learned again, they are identical, bit for bit"
+        then, now = self.arithmetic
+        why = f": {_otherwise(then, now)}" if then != now else ""
+        return f"{self.difference} when learned again{why}"
+
+
+def _otherwise(then: int, now: int) -> str:
+    return f"the run was learned with arithmetic {then}, this version computes with {now}"
 
 
 def check_run(
@@ -62,14 +79,15 @@ def check_run(
     """
     with Again(Path(run), start, source) as again:
         first = again.learner.iteration
+        versions = again.header.arithmetic, arithmetic_of(again.learner)
         at, found = _learned_again(again, stop, read_keyframes(again.log, first))
     if found is not None:
-        return Checked(first, at, found)
+        return Checked(first, at, found, versions)
     if at <= start and (at or stop):
         raise UsageError(f"{again.log} holds {at} iterations: choose a part of these")
     if stop is not None and at < stop:
         raise UsageError(f"{again.log} holds {at} iterations: end at one of these")
-    return Checked(first, at, None)
+    return Checked(first, at, None, versions)
 
 
 def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tuple[Learner, int]:
@@ -87,9 +105,10 @@ def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tup
     with Again(Path(run), iterations, source) as again:
         at, found = _learned_again(again, iterations)
         if found is not None:
-            raise NotReproducedError(
-                f"{again.log}: learned again, {found}: name its own source with --source"
-            )
+            then, now = again.header.arithmetic, arithmetic_of(again.learner)
+            remedy = "name its own source with --source"
+            why = remedy if then == now else _otherwise(then, now)
+            raise NotReproducedError(f"{again.log}: learned again, {found}: {why}")
         if at < iterations:
             raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
         return again.learner, again.t

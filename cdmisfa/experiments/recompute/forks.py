@@ -11,7 +11,7 @@ from typing import Any
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.config import as_table, build, differences, parse_settings
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.learning import Keyframe
+from cdmisfa.core.learning import Keyframe, arithmetic_of
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.recompute.again import Era, source_of, told_anew
 from cdmisfa.experiments.recompute.check import learner_after
@@ -59,6 +59,11 @@ def fork_run(
         raise UsageError(f"{out} is the run itself: choose another folder")
     header = read_header(log)
     learner, t = learner_after(log, at, source)
+    if header.arithmetic != arithmetic_of(learner):
+        raise UsageError(
+            f"{log} was learned with arithmetic {header.arithmetic}, this version computes with "
+            f"{arithmetic_of(learner)}: learn it anew, and fork that"
+        )
     manifest = header.manifest
     before, seed_before = manifest["config"]["learner"], int(manifest["seed"])
     seed = seed_before if seed is None else seed

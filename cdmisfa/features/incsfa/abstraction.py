@@ -40,6 +40,7 @@ class IncSFA:
     Attributes:
         state: every array the abstraction consists of.
         kernel: the same with the constants of the rule, for compiled code.
+        arithmetic: version of the order in which that kernel computes.
 
     Example:
         >>> sfa = IncSFA(LearnerConfig(), 5, np.random.default_rng(0))
@@ -51,6 +52,7 @@ class IncSFA:
         self.state = new_state(rng, n_inputs, config)
         kind = Gram if n_inputs >= MANY_INPUTS else Strict
         self.kernel = kind(self.state.phi, self.state.mean, self.state, parameters(config))
+        self.arithmetic = gram.ARITHMETIC if kind is Gram else 1
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
         """Learn from consecutive frames.

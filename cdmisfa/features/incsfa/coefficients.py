@@ -134,39 +134,57 @@ def change_of_features(
     m_before: Float,
     gram_before: Float,
     e_before: Float,
-    energy: float,
+    g: Float,
+    first: int,
+    last: int,
     keep: Float,
     gain: Float,
     take: Float,
     change: Float,
+    delta: Float,
 ) -> float:
-    """Length xi of the change of phi over one frame, without cancellation.
+    """Length xi of the change of phi over a few frames of a group, without cancellation.
 
-    phi' - phi = D v + delta u, with D and delta from the adjoint of the CCIPCA step.
+    phi' - phi = D v + sum_t delta_t u_t, with D and delta from the adjoint of the CCIPCA steps.
 
     Args:
-        m: (J, K) phi's coefficients on the vectors after the step.
-        m_before: (J, K) phi's coefficients on those before it.
-        gram_before: (K, K) inner products before it.
-        e_before: (K,) the frame's inner products with the vectors before it.
-        energy: |u|^2 of the centred frame.
-        keep: (K,) the step's coefficients, as the next two.
-        gain: (K,).
-        take: (K,).
+        m: (J, K) phi's coefficients on the vectors after the steps.
+        m_before: (J, K) phi's coefficients on those before them.
+        gram_before: (K, K) inner products before them.
+        e_before: (m, K) the group's inner products with the vectors before them.
+        g: (m, m) the group's inner products.
+        first: index of the first of the frames.
+        last: index of the last.
+        keep: (m, K) coefficients of the group's steps, as the next two.
+        gain: (m, K).
+        take: (m, K).
         change: (K,) scratch.
+        delta: (m,) scratch.
     """
     J, K = m.shape
     xi = 0.0
     for r in range(J):
-        delta = 0.0
-        for k in range(K - 1, -1, -1):
-            x = m[r, k] - take[k] * delta
-            delta += gain[k] * x
-            change[k] = keep[k] * x - m_before[r, k]
-        xi += delta * delta * energy
+        for k in range(K):
+            change[k] = m[r, k]
+        for t in range(last, first - 1, -1):
+            along = 0.0
+            for k in range(K - 1, -1, -1):
+                x = change[k] - take[t, k] * along
+                along += gain[t, k] * x
+                change[k] = keep[t, k] * x
+            delta[t] = along
+        for k in range(K):
+            change[k] -= m_before[r, k]
+        for s in range(first, last + 1):
+            along = 0.0
+            for k in range(K):
+                along += e_before[s, k] * change[k]
+            xi += 2.0 * delta[s] * along
+            for t in range(first, last + 1):
+                xi += delta[s] * delta[t] * g[s, t]
         for k in range(K):
             along = 0.0
             for q in range(K):
                 along += gram_before[k, q] * change[q]
-            xi += change[k] * (along + 2.0 * delta * e_before[k])
+            xi += change[k] * along
     return float(np.sqrt(max(xi, 0.0)))

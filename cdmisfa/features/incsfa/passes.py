@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arithmetic.compiled import compiled, reordered
 from cdmisfa.core.blocks import PIXEL, UINT8
+from cdmisfa.features.incsfa.cells import Cells, Columns, copy_columns
 from cdmisfa.features.incsfa.state import Float, State, mean_rate
+from cdmisfa.features.incsfa.still import Still, centre_still, measure_still
 from cdmisfa.features.inner_products import ROWS, measure_tile
-from cdmisfa.features.lanes import LANES, add, load, store
+from cdmisfa.features.lanes import LANES, add, load, minus, multiply_add, spread, store, zeros
 
 GROUP = ROWS
 """Frames applied in one pass."""
@@ -36,10 +38,10 @@ def centre_tile(
     frames: NDArray[Any],
     first: int,
     count: int,
+    cells: Cells,
     start: int,
     mean: Float,
-    n: int,
-    window: float,
+    rate: Float,
     u: Float,
 ) -> None:
     """Centre `count` frames in the columns of a tile; see `strict.centre`.
@@ -48,24 +50,64 @@ def centre_tile(
         frames: (n, I) values or pixels.
         first: index of the first of them.
         count: how many, at most GROUP.
+        cells: the cells of all tiles.
         start: first column.
-        mean: (I,) running mean, in place.
-        n: number of frames seen before them.
-        window: frames of the running mean.
-        u: (GROUP, TILE) receives the centred frames; rows beyond `count` become 0.
+        mean: (1, columns) running mean in all tiles, in place.
+        rate: (GROUP,) rates of the mean, 0 beyond `count`.
+        u: (GROUP, TILE) receives the centred frames, and 0 in rows beyond `count` and columns
+            beyond the last.
     """
-    width = min(TILE, mean.shape[0] - start)
     scale = PIXEL if frames.dtype == UINT8 else 1.0
-    m = mean[start : start + width]
-    for s in range(count):
-        rate = mean_rate(n + s + 1, window)
-        offset = 0.0 if n + s == 0 else 1.0
-        row, us = frames[first + s, start : start + width], u[s, :width]
-        for i in range(width):
-            x = row[i] * scale
-            m[i] += rate * (x - m[i])
-            us[i] = x - offset * m[i]
-    u[count:] = 0.0
+    width = min(TILE, mean.shape[1] - start)
+    whole = width - width % LANES
+    last = first + count - 1
+    t1, t2, t3 = min(first + 1, last), min(first + 2, last), min(first + 3, last)
+    pixel, none = spread(scale), zeros()
+    r0, r1, r2, r3 = spread(rate[0]), spread(rate[1]), spread(rate[2]), spread(rate[3])
+    for i in range(0, whole, LANES):
+        at, m = cells[(start + i) // LANES] * LANES, load(mean, 0, start + i)
+        x = multiply_add(none, pixel, load(frames, first, at))
+        m = multiply_add(m, r0, minus(x, m))
+        store(u, 0, i, minus(x, m))
+        x = multiply_add(none, pixel, load(frames, t1, at))
+        m = multiply_add(m, r1, minus(x, m))
+        store(u, 1, i, minus(x, m))
+        x = multiply_add(none, pixel, load(frames, t2, at))
+        m = multiply_add(m, r2, minus(x, m))
+        store(u, 2, i, minus(x, m))
+        x = multiply_add(none, pixel, load(frames, t3, at))
+        m = multiply_add(m, r3, minus(x, m))
+        store(u, 3, i, minus(x, m))
+        store(mean, 0, start + i, m)
+    beyond = frames.shape[1] - width
+    for i in range(whole, width):
+        for s in range(count):
+            y = frames[first + s, beyond + i] * scale
+            mean[0, start + i] += rate[s] * (y - mean[0, start + i])
+            u[s, i] = y - mean[0, start + i]
+    for s in range(GROUP):
+        for i in range(0 if s >= count else width, TILE):
+            u[s, i] = 0.0
+
+
+@compiled
+def first_frame(frames: NDArray[Any], cells: Cells, start: int, width: int, u: Float) -> None:
+    """Take back that the very first frame was centred in a tile.
+
+    Args:
+        frames: (n, I) values or pixels.
+        cells: the cells of all tiles.
+        start: first column.
+        width: columns.
+        u: (GROUP, TILE) receives the frame.
+    """
+    scale = PIXEL if frames.dtype == UINT8 else 1.0
+    whole = width - width % LANES
+    for i in range(width):
+        at = frames.shape[1] - width + i
+        if i < whole:
+            at = cells[(start + i) // LANES] * LANES + i % LANES
+        u[0, i] = frames[0, at] * scale
 
 
 @reordered
@@ -209,6 +251,7 @@ class Work(NamedTuple):
         shrink: (K,) product of what the steps keep of each vector.
         edge: (K, TILE) columns of the last tile where it is no multiple of LANES wide.
         rows: (J, TILE) scratch.
+        rate: (GROUP,) rates of the mean in the next group.
     """
 
     u: Float
@@ -218,25 +261,29 @@ class Work(NamedTuple):
     shrink: Float
     edge: Float
     rows: Float
+    rate: Float
 
 
 @compiled
 def new_work(size: int, components: int, outputs: int) -> Work:
     """Scratch for I = `size` inputs, K = `components` and J = `outputs`."""
     return Work(
-        np.zeros(((size + TILE - 1) // TILE, GROUP, TILE)),
+        np.empty(((size + TILE - 1) // TILE, GROUP, TILE)),
         np.zeros((GROUP, GROUP)),
         np.zeros((components, GROUP)),
         np.zeros((components, 2 * GROUP)),
         np.ones(components),
         np.zeros((components, TILE)),
         np.zeros((outputs, TILE)),
+        np.empty(GROUP),
     )
 
 
 @compiled
 def run_pass(
     state: State,
+    columns: Columns,
+    still: Still,
     work: Work,
     applied: int,
     settle: bool,
@@ -249,7 +296,9 @@ def run_pass(
     """Apply a group to the vectors, and centre and measure the next one.
 
     Args:
-        state: mean, v and phi are brought up to date.
+        state: phi is brought up to date, where it is computed.
+        columns: mean and v are brought up to date.
+        still: the other columns.
         work: the group; receives the next one.
         applied: how many frames it has.
         settle: multiply `shrink` in.
@@ -262,29 +311,44 @@ def run_pass(
     Returns:
         Square of the change of phi.
     """
-    size = state.mean.shape[0]
+    begin = int(np.int64(0))  # a plain 0 has what is called compiled for it alone
+    size = columns.mean.shape[1]
     square = 0.0
     work.g[:] = 0.0
     work.e[:] = 0.0
-    for q in range(work.u.shape[0]):
-        start, u = q * TILE, work.u[q]
-        width = min(TILE, size - start)
-        v, column, padded = state.v, start, width
-        if width % LANES > 0:
-            v, column, padded = work.edge, 0, width + LANES - width % LANES
-            v[:, :width] = state.v[:, start:]
+    for s in range(GROUP):
+        work.rate[s] = mean_rate(state.counts[0] + s + 1, window) if s < count else 0.0
+    for q in range(-1, (size + TILE - 1) // TILE):
+        start, width = q * TILE, min(TILE, size - q * TILE)
+        v, column, padded = columns.v, start, width
+        if q < 0:
+            v, column, padded, u = still.table, begin, still.table.shape[1], still.r
+            if padded == 0:
+                continue
+        else:
+            u = work.u[q]
+            if width % LANES > 0:
+                v, column, padded = work.edge, begin, width + LANES - width % LANES
+                copy_columns(columns.v, start, v, begin, width)
         if applied > 0:
             apply_tile(v, column, padded, u, work.steps)
         if settle:
             scale_tile(v, column, padded, work.shrink)
-            if len(m) > 0:
-                features_tile(v, column, padded, m, work.rows)
-                square += replace_tile(work.rows, start, state.phi)
+        if q < 0:
+            if count > 0:
+                centre_still(still, count, state.counts[0], window)
+                measure_still(still, work.g, work.e)
+            continue
+        if len(m) > 0:
+            features_tile(v, column, padded, m, work.rows)
+            square += replace_tile(work.rows, start, state.phi)
         if width < padded:
-            state.v[:, start:] = v[:, :width]
+            copy_columns(v, begin, columns.v, start, width)
         if count > 0:
-            centre_tile(frames, first, count, start, state.mean, state.counts[0], window, u)
-            measure_tile(u, 0, width, GROUP, u, 0, work.g)
+            centre_tile(frames, first, count, columns.cells, start, columns.mean, work.rate, u)
+            if state.counts[0] == 0:
+                first_frame(frames, columns.cells, start, width, u)
+            measure_tile(u, begin, width, len(work.g), u, 0, work.g)
             measure_tile(v, column, padded, len(work.e), u, 0, work.e)
     if settle:
         work.shrink[:] = 1.0
