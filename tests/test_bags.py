@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+import sqlite3
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -118,6 +121,15 @@ def test_a_torn_bag_is_one_line(make: Callable[[Path], Path], tmp_path: Path) ->
     path.write_bytes(raw[: len(raw) // 2])
     with pytest.raises(LogDamagedError, match=r"cameras\.(bag|db3): rosbags cannot read it"):
         ForeignSource(path, TOPICS).take(0, COUNT)
+
+
+@pytest.mark.parametrize("value", [5, "text"])
+def test_a_message_that_is_no_bytes_is_damage(tmp_path: Path, value: object) -> None:
+    path = ros2_database(tmp_path)
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE messages SET data = ?", (value,))
+    with pytest.raises(LogDamagedError, match=re.escape(f"{path}: a message on /cam_left has")):
+        open_images(path, "/cam_left")
 
 
 def test_without_rosbags_the_extra_is_named(

@@ -80,6 +80,8 @@ class BagImages(ImageStream):
                 raise LogDamagedError(
                     f"{self.path}: its messages are not in the order of time; convert it to MCAP"
                 )
+            if not isinstance(data, bytes):  # SQLite keeps anything in any column
+                raise LogDamagedError(f"{self.path}: a message on {self.topic} has no bytes")
             before = stamp
             yield stamp, data
 
