@@ -34,6 +34,8 @@ from replay.viewer.broadcast import Broadcast
 EVERY_SECONDS = 1.5
 """Time between two pieces."""
 
+SUMMARY = "It is being learned. What came of it stands in the view of the finished run."
+
 EVERY_FRAMES = 10
 """Frames between two at which it is said where things are."""
 
@@ -77,6 +79,7 @@ class LiveView(Sink):
         self._broadcast = Broadcast(self._recording, NAME, port)
         self.address = self._broadcast.address
         self._recording.send_recording_name("live")
+        self._recording.log("summary", rr.TextDocument(SUMMARY), static=True)
         streams = outline.streams(MOST_STREAMS)
         self._world = WorldView(
             self._recording, outline.header, run or Path(), streams, EVERY_FRAMES
