@@ -110,6 +110,14 @@ def test_scaling() -> None:
     assert peak > 10
 
 
+def test_a_kernel_faster_than_the_machine_is_a_contradiction() -> None:
+    case = {"K": 64, "inputs": 6144, "ours": "gram", "us_per_frame": {"gram": 60.0}}
+    assert kernels.contradictions({"FMA GFMA/s": 23.7}, [case]) == []
+    case["us_per_frame"] = {"gram": 40.0}
+    found = ["29.5 GFMA/s at K = 64, 6144 inputs"]
+    assert kernels.contradictions({"FMA GFMA/s": 23.7}, [case]) == found
+
+
 def test_kernels() -> None:
     frames = kernels.image_frames(12)
     config = kernels.LearnerConfig(components=4, outputs=1, nu=0.01, tau=4)
