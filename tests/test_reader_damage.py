@@ -169,7 +169,7 @@ def test_reading_goes_on_behind_a_broken_length(tmp_path: Path) -> None:
     path.write_bytes(raw)
     with pytest.raises(LogDamagedError, match=f"byte {bad.offset}"):
         read_all(path)
-    assert len(read_all(path, salvage=True)) == MESSAGES - (bad.end - bad.start + 1)
+    assert len(read_all(path, salvage=True)) == MESSAGES
 
 
 def one_chunk(made: bytes) -> bytes:

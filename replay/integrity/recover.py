@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,14 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.logfile import LogFile
 from recorder.log.whole import PARTIAL, make_folder
 from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
+from replay.mcap.chunks import UNUSED
+from replay.mcap.mending import mended
 from replay.mcap.reader import LogReader
 from replay.mcap.segments import Problem
 from replay.mcap.tables import MessageTable
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
-from replay.storage.opening import fetched
+from replay.storage.opening import fetched, open_store
 
 
 @dataclass(slots=True)
@@ -49,12 +53,14 @@ class Recovery:
     Attributes:
         out: the log or folder that was written.
         lost: what could not be saved.
+        mended: what was damaged and is made again from what else the log says: nothing is lost.
         unverified: messages saved of a cut chunk, whose checksum cannot be checked.
     """
 
     out: str
     channels: tuple[ChannelRecovery, ...]
     lost: tuple[Problem, ...]
+    mended: tuple[Problem, ...]
     unverified: int
 
     @property
@@ -83,7 +89,8 @@ def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) ->
     place, dst = location(src), Path(dst)
     with fetched(place) as copy:
         found = _recover(copy, dst, force)
-    return replace(found, lost=tuple(moved(lost, copy, place) for lost in found.lost))
+    lost, right = ([moved(p, copy, place) for p in those] for those in (found.lost, found.mended))
+    return replace(found, lost=tuple(lost), mended=tuple(right))
 
 
 def _recover(src: Path, dst: Path, force: bool) -> Recovery:
@@ -106,12 +113,13 @@ def _recover(src: Path, dst: Path, force: bool) -> Recovery:
         out=str(dst),
         channels=tuple(c for one in found for c in one.channels),
         lost=tuple(p for one in found for p in one.lost),
+        mended=tuple(p for one in found for p in one.mended),
         unverified=sum(one.unverified for one in found),
     )
 
 
 def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
-    with LogReader(src, salvage=True) as reader:
+    with _opened(src) as (reader, right):
         found = reader.channels or reader.metadata or reader.attachments
         if alone and reader.missing and not found:
             raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")
@@ -130,16 +138,33 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             )
             for number, tally in sorted(tallies.items())
         ]
-        return Recovery(str(dst), tuple(channels), _lost(reader), unverified)
+        return Recovery(str(dst), tuple(channels), _lost(reader), right, unverified)
+
+
+@contextlib.contextmanager
+def _opened(src: Path) -> Iterator[tuple[LogReader, tuple[Problem, ...]]]:
+    """A log, where it is damaged with what can be made right of it, and what that was."""
+    with LogReader(src, salvage=True) as reader:
+        if not reader.problems:
+            yield reader, ()
+            return
+    store = mended(open_store(src))
+    with LogReader(src, salvage=True, store=store) as reader:
+        yield reader, tuple(Problem(f"{src}: {p.where}", p.what) for p in store.mended)
 
 
 def _lost(reader: LogReader) -> tuple[Problem, ...]:
-    """What is wrong with a log, but for its summary where every message is there."""
-    found = problems_of(reader)
-    if not reader.data_complete:
-        return found
-    index = {str(reader.path), *(f"{reader.path}: {part}" for part in ("summary", "footer"))}
-    return tuple(problem for problem in found if problem.where not in index)
+    """What is wrong with a log, but for what only says where the messages are that are there."""
+    found = [problem for problem in problems_of(reader) if not problem.what.endswith(UNUSED)]
+    data = f"{reader.path}: data section"
+    if reader.data_complete:
+        index = {str(reader.path), *(f"{reader.path}: {part}" for part in ("summary", "footer"))}
+        found = [problem for problem in found if problem.where not in index]
+        proven = all(segment.crc for segment in reader.segments if segment.size)
+        if proven and {problem.where for problem in found} == {data}:
+            what = "damaged between the chunks: every message is there, metadata may be wrong"
+            found = [Problem(data, f"its CRC does not match: {what}")]
+    return tuple(found)
 
 
 def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:

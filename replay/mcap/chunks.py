@@ -28,6 +28,8 @@ from replay.storage.checksum import crc32
 from replay.storage.once import OnePass
 from replay.storage.store import Store
 
+UNUSED: Final = "(the index is not used)"
+"""How it ends what is said of an index that contradicts its chunk, which costs no message."""
 CACHE_BYTES: Final = 32 * 1024 * 1024
 """Decoded chunks that are kept, unless told otherwise; one always is."""
 
@@ -168,7 +170,7 @@ class Chunks:
             return indexed_table(raw, self.index(segment))
         except MalformedRecord as error:
             found = walked_table(raw)
-            self._note(segment.name, f"{error} (the index is not used)")
+            self._note(segment.name, f"{error} {UNUSED}")
             return found
 
 

@@ -22,6 +22,7 @@ from replay.mcap.tables import MessageTable, in_order, within
 from replay.mcap.walk import LogStructure
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import open_store
+from replay.storage.store import Store
 
 Check = Literal["chunks", "data", "pass"]
 
@@ -60,6 +61,7 @@ class LogReader:
         salvage: bool = False,
         cache_bytes: int | None = None,
         check: Check | None = None,
+        store: Store | None = None,
     ) -> None:
         """Open a file or URL.
 
@@ -70,6 +72,7 @@ class LogReader:
             check: "chunks" believes a summary that accounts for every message; "data" looks at
                 every record of a file and at the checksum over its data, "pass" leaves the latter
                 to `one_pass`. By default "chunks", with `salvage` "data"; of a URL "chunks".
+            store: what has its bytes, closed with the reader; by default it is opened.
 
         Raises:
             UsageError: it cannot be opened.
@@ -79,16 +82,16 @@ class LogReader:
         self.salvage = salvage
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
-        self._defined = 0
-        self._searched = False
-        self._file = open_store(self.path)
+        self._defined, self._searched = 0, False
+        self._file = store or open_store(self.path)
         try:
             remote = isinstance(self.path, Url)
             check = check or ("data" if salvage else "chunks")
             by_index = remote or check == "chunks"
-            self._structure = LogStructure(self._file, self._refuse, by_index=by_index)
-            self._data = DataSection(self._file, self._structure, self._refuse_data)
-            known, unproven = self._structure.definitions, self._data.check_unproven
+            found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
+            self._structure = found
+            self._data = DataSection(self._file, found, self._refuse_data)
+            known, unproven = found.definitions, self._data.check_unproven
             self._chunks = Chunks(self._file, known, self._note, cache_bytes, unproven)
             self._settle()
             if not self.by_index and check != "pass":
@@ -175,9 +178,8 @@ class LogReader:
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects."""
-        if self._structure.data_crc:
-            return 0
-        return sum(1 for s in self.segments if s.crc == 0 and s.size)
+        alone = [] if self._structure.data_crc else self.segments
+        return sum(1 for s in alone if s.crc == 0 and s.size)
 
     # Messages
 
@@ -340,16 +342,14 @@ class LogReader:
 
     def _note(self, where: str, what: str) -> None:
         problem = Problem(where, what)
-        if problem not in self.problems:
-            self.problems.append(problem)
+        self.problems += [problem] if problem not in self.problems else []
 
     def _settle(self) -> None:
         """Take over what the walk found, with the times of a chunk whose header states none yet."""
         structure = self._structure
         self.by_index, self.complete = structure.by_index, structure.complete
         self.profile, self.library = structure.profile, structure.library
-        self.data_complete = structure.data_crc is not None
-        self.metadata = structure.metadata
+        self.data_complete, self.metadata = structure.data_crc is not None, structure.metadata
         self.statistics = structure.summary.statistics if structure.summary else None
         tail = structure.tail
         if tail is not None and tail in self.segments:

@@ -6,6 +6,7 @@ not every byte is read; every chunk is compared with it when it is read.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import struct
 from dataclasses import dataclass, field
@@ -48,6 +49,7 @@ class Summary:
         begin: place in the file where the data ends.
         file: the log, with its summary in memory unless that is large.
         read: it is there, and was read to its end.
+        broken: it is damaged.
         chunks: places that it names for chunks, in order.
         indexes: place and bytes of each of its chunk, attachment and metadata indexes.
     """
@@ -55,6 +57,7 @@ class Summary:
     begin: int
     file: Store
     read: bool = False
+    broken: bool = False
     statistics: Statistics | None = None
     chunks: list[int] = field(default_factory=list)
     indexes: dict[int, list[tuple[int, int]]] = field(
@@ -85,12 +88,14 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
         file = Excerpt(file, begin, file.size)
     summary = Summary(begin, file)
     if crc and file.crc(begin, footer_at + FOOTER_BYTES - 4) != crc:
+        summary.broken = True
         refuse("summary", "its CRC does not match: damaged")
         return summary
     try:
         _take_records(file, summary, footer_at, definitions)
         summary.read = start == begin
     except MalformedRecord as error:
+        summary.broken = True
         refuse("summary", str(error))
     summary.chunks.sort()
     return summary
@@ -164,6 +169,16 @@ def stated_segments(summary: Summary, known: set[int]) -> list[Segment] | None:
         and all(c.keys() <= known for c in counts)
     )
     return segments if accounted else None
+
+
+def stated_chunks(summary: Summary) -> list[Segment]:
+    """The chunks of which a summary says everything but their CRC, in file order."""
+    segments = []
+    for content, length in summary.indexes[Opcode.CHUNK_INDEX] if summary.read else ():
+        with contextlib.suppress(MalformedRecord):
+            segment = _segment(_index(summary.file, content, length))
+            segments += [segment] if segment else []
+    return sorted(segments, key=lambda segment: segment.offset)
 
 
 def stated_spans(summary: Summary, opcode: int) -> list[tuple[int, int]]:

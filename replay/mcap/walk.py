@@ -8,7 +8,6 @@ summary claims is compared with what was found.
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +23,7 @@ from replay.mcap.records import (
     Fields,
     MalformedRecord,
 )
+from replay.mcap.resync import leave_chunks, next_chunk, own_end, stands
 from replay.mcap.segments import Attachment, Definitions, IndexPart, Metadata, Refuse, Segment
 from replay.mcap.summary import (
     Summary,
@@ -43,6 +43,8 @@ _INDEX: Final = struct.Struct("<HI")
 DATA_END_BYTES: Final = RECORD_HEADER.size + 4
 _OPEN_LENGTH: Final = 2**64 - 1
 _BEFORE_DATA: Final = 1024 * 1024
+_PRIVATE: Final = 0x80
+"""The first opcode that writers may give records of their own."""
 
 
 class LogStructure:
@@ -52,6 +54,7 @@ class LogStructure:
         file: the log.
         refuse: told of every damage.
         by_index: believe a summary that accounts for every message, and read no chunk.
+        resync: where a record is damaged, look for the next chunk that is none.
 
     Attributes:
         by_index: the summary was believed.
@@ -63,8 +66,12 @@ class LogStructure:
         data_end: place where the data section ends.
     """
 
-    def __init__(self, file: Store, refuse: Refuse, *, by_index: bool = False) -> None:
+    def __init__(
+        self, file: Store, refuse: Refuse, *, by_index: bool = False, resync: bool = False
+    ) -> None:
         self._file = file
+        self._resync = resync
+        self._sure = len(MAGIC)
         self.by_index = False
         self._refuse = refuse
         self.definitions = Definitions(refuse)
@@ -82,6 +89,7 @@ class LogStructure:
         self._limit: int | None = None
         self._attachment_spans: list[tuple[int, int]] = []
         self._metadata_bytes = 0
+        self._inside = 0
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
         self._at = len(MAGIC)
@@ -151,11 +159,11 @@ class LogStructure:
             limit = self._file.size if self._limit is None else self._limit
             where = f"byte {self._at}"
             try:
-                if not self._step(limit):
+                if not self._step(limit) and not self._resume_after_cut():
                     break
             except MalformedRecord as error:
                 self._refuse(where, str(error))
-                if not self._resume_after(self._at):
+                if not self._resume_after():
                     self.missing = f"everything from byte {self._at} on is unreadable"
                     break
         self._close_loose()
@@ -179,6 +187,10 @@ class LogStructure:
             if self._limit is None and not any(map(any, rest)):
                 return self._cut(f"from byte {self._at} on there are only zeros", limit)
             raise MalformedRecord("no record (opcode 0)")
+        own = own_end(self._file, opcode, content) if self._resync else None
+        if own is not None and own < end and stands(self._file, own, limit):
+            self._refuse(f"byte {self._at}", "a record's length is not that of what it holds")
+            end, length = own, own - content
         if end > limit:
             if opcode == Opcode.CHUNK and self._limit is None:
                 self._cut_chunk(content, length, limit)
@@ -189,7 +201,11 @@ class LogStructure:
             )
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
+        if self._resync and self.summary:
+            leave_chunks(self.summary.chunks, opcode, self._at, end)
         self._take(opcode, content, length)
+        if end in (own, self._inside):
+            self._sure = end
         self._at = end
         return True
 
@@ -221,11 +237,15 @@ class LogStructure:
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
             crc = Fields(self._file.peek(content, min(length, 4)), "the data end").integer(4)
+            if self._resync and self._limit is None and length != 4:
+                raise MalformedRecord("a data end of another length than its own")
             if self._limit is not None and content + length != self._limit:
                 raise MalformedRecord("the data section does not end where the summary starts")
             self.data_crc = crc
         elif opcode <= max(Opcode):
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
+        elif self._resync and opcode < _PRIVATE:
+            raise MalformedRecord(f"no record of the format (opcode {opcode})")
 
     def _chunk(self, content: int, length: int) -> Segment:
         head = self._file.peek(content, min(length, _CHUNK_HEADER))
@@ -289,6 +309,7 @@ class LogStructure:
             raise MalformedRecord(f"metadata takes more than {MAX_DEFINITION} bytes")
         fields = Fields(content, "metadata")
         self.metadata.append(Metadata(fields.text(), fields.texts()))
+        self._inside = self._at + RECORD_HEADER.size + fields.at
 
     def _attachment(self, content: int, length: int) -> None:
         fields = Fields(self._file.read(content, min(length, _BEFORE_DATA)), "an attachment")
@@ -297,6 +318,7 @@ class LogStructure:
         if fields.at + size + 4 > length:
             raise MalformedRecord("an attachment lies about its length")
         data = content + fields.at
+        self._inside = data + size + 4
         crc = int.from_bytes(self._file.read(data + size, 4), "little")
         found = Attachment(name, media_type, log_time, create_time, data, size, crc)
         if crc and self._file.crc(content, data + size) != crc:
@@ -316,20 +338,38 @@ class LogStructure:
         self.missing = what
         return False
 
-    def _resume_after(self, at: int) -> bool:
-        """Continue at the next chunk that the summary names."""
+    def _resume_after(self) -> bool:
+        """Continue at the next chunk that the summary names, else at the next that is found."""
         self._close_loose()
         self._last_chunk = None
-        chunks = self.summary.chunks if self.summary else []
-        place = bisect_right(chunks, at)
-        if place == len(chunks):
+        found = None
+        if self.summary and self.summary.chunks:
+            found = next((c for c in self.summary.chunks if c > self._at), None)
+        elif self._resync:
+            stop = self._file.size if self._limit is None else self._limit
+            found = next_chunk(self._file, self._sure + (self._sure == self._at), stop)
+        if found is None:
             return False
-        self._at = chunks[place]
+        self.segments = [s for s in self.segments if s.offset < found]
+        self.attachments = [a for a in self.attachments if a.offset < found]
+        self._at = found
+        return True
+
+    def _resume_after_cut(self) -> bool:
+        """Continue where it was a length that made the file look cut."""
+        what = self.missing
+        torn = self.tail is None and self._at < self._file.size
+        if not (self._resync and torn and self._resume_after()):
+            return False
+        self.missing = ""
+        self._refuse(f"byte {self._sure}", what)
         return True
 
     def _read_end(self) -> None:
         self.summary = read_summary(self._file, self.definitions, self._refuse)
-        self._limit = self.summary.begin if self.summary else None
+        # What is wrong in a footer may be the place that it says the data to end at.
+        lies = self._resync and self.summary is not None and self.summary.broken
+        self._limit = self.summary.begin if self.summary and not lies else None
 
     def _compare_with_summary(self) -> None:
         assert self.summary is not None

@@ -114,6 +114,10 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
             ("topic", "kept", "lost"),
             [(c.topic, c.kept, "unknown" if c.lost is None else c.lost) for c in found.channels],
         )
+        if found.lost:
+            options.print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
+        for mended in found.mended:
+            click.echo(f"{mended.where}: {mended.what}", err=True)
         click.echo(f"written {out}")
     if not found.complete:
         ctx.exit(LogDamagedError.exit_code)

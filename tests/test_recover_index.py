@@ -1,0 +1,134 @@
+"""Flips outside the chunks' own data cost no message, and `recover` says so."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+
+import pytest
+from conftest import Cdmisfa
+from mcap.writer import CompressionType, Writer
+
+from replay.integrity.recover import recover_log
+from replay.mcap.reader import LogReader
+from replay.mcap.segments import Segment
+
+MESSAGES = 60
+CRC = range(33, 37)
+"""Where a chunk states its CRC, from its first byte on."""
+
+
+def log(compression: CompressionType = CompressionType.ZSTD) -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=compression, chunk_size=700, enable_data_crcs=True)
+    writer.start(profile="p", library="l")
+    schema = writer.register_schema("name", "encoding", b"data")
+    channels = [writer.register_channel(topic, "raw", schema) for topic in ("/a", "/b", "/c")]
+    writer.add_metadata("meta", {"key": "value"})
+    for i in range(MESSAGES):
+        writer.add_message(channels[i % 3], i, bytes([i]) * (30 + i % 7), i, i)
+    writer.finish()
+    return stream.getvalue()
+
+
+LOGS = {name: log(CompressionType[name]) for name in ("ZSTD", "LZ4", "NONE")}
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    with LogReader(path) as reader:
+        return [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
+
+
+def chunks(raw: bytes, path: Path) -> list[Segment]:
+    path.write_bytes(raw)
+    with LogReader(path) as reader:
+        assert len(reader.segments) > 4
+        return reader.segments
+
+
+def flipped(raw: bytes, *bits: int) -> bytes:
+    changed = bytearray(raw)
+    for bit in bits:
+        changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def head(chunk: Segment) -> Iterator[int]:
+    """The bytes of a chunk before its records, without its CRC, which nothing else states."""
+    offsets = range(chunk.data_offset - chunk.offset)
+    return (chunk.offset + at for at in offsets if at not in CRC)
+
+
+def between(segments: list[Segment]) -> list[int]:
+    """The bytes of all message indexes and heads of chunks."""
+    indexes = (at for c in segments for at in range(c.data_offset + c.stored, c.stop))
+    return [*indexes, *(at for c in segments for at in head(c))]
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_what_stands_twice_is_made_again(tmp_path: Path, kind: str) -> None:
+    raw, path, out = LOGS[kind], tmp_path / "log.mcap", tmp_path / "out.mcap"
+    places, true = between(chunks(raw, path)), messages(path)
+    rng = Random(kind)
+    for number in range(40):
+        bits = [8 * rng.choice(places) + rng.randrange(8) for _ in range(1 + number % 3)]
+        path.write_bytes(flipped(raw, *bits))
+        found = recover_log(path, out, force=True)
+        assert (messages(out), found.lost) == (true, ()), bits
+        assert found.mended or len(set(bits)) < len(bits), bits
+        assert [channel.lost for channel in found.channels] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_no_message_is_lost_where_the_summary_is_damaged_too(tmp_path: Path, kind: str) -> None:
+    raw, path, out = LOGS[kind], tmp_path / "log.mcap", tmp_path / "out.mcap"
+    segments, true = chunks(raw, path), messages(path)
+    with LogReader(path) as reader:
+        end = reader._structure.data_end + 13
+    indexes = [at for c in segments for at in range(c.data_offset + c.stored, c.stop)]
+    rng = Random(kind)
+    for number in range(40):
+        bits = [8 * rng.choice(indexes) + rng.randrange(8) for _ in range(number % 2)]
+        broken = flipped(raw, *bits, 8 * rng.randrange(end, len(raw)) + rng.randrange(8))
+        path.write_bytes((broken, raw[: rng.randrange(end, len(raw))])[number % 5 == 4])
+        found = recover_log(path, out, force=True)
+        assert (messages(out), found.lost) == (true, ()), bits
+
+
+def test_a_length_is_not_taken_for_the_end_of_a_log_that_was_cut(tmp_path: Path) -> None:
+    raw, path, out = LOGS["ZSTD"], tmp_path / "log.mcap", tmp_path / "out.mcap"
+    segments, true = chunks(raw, path), messages(path)
+    cut = raw[: segments[-1].stop]
+    for chunk in segments[:-1]:
+        for part in chunk.indexes:
+            for bit in range(1, 64, 16):
+                path.write_bytes(flipped(cut, 8 * (part.offset - 14) + bit))
+                found = recover_log(path, out, force=True)
+                assert messages(out) == true, bit
+                assert found.lost, "nothing proves what stands between the chunks"
+
+
+def test_a_damaged_chunk_costs_itself_whatever_else_is_damaged(tmp_path: Path) -> None:
+    raw, path, out = LOGS["LZ4"], tmp_path / "log.mcap", tmp_path / "out.mcap"
+    segments, true = chunks(raw, path), messages(path)
+    places, rng = between(segments), Random(1)
+    for chunk in segments:
+        bits = [8 * rng.choice(places) + rng.randrange(8) for _ in range(4)]
+        path.write_bytes(flipped(raw, *bits, 8 * (chunk.data_offset + chunk.stored // 2)))
+        found = recover_log(path, out, force=True)
+        assert messages(out) == [m for m in true if not chunk.start <= m[1] <= chunk.end]
+        assert any(chunk.name in problem.where for problem in found.lost)
+        assert sum(c.lost or 0 for c in found.channels) == MESSAGES - len(messages(out))
+
+
+def test_the_command_says_what_was_lost(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    raw, path, out = LOGS["ZSTD"], tmp_path / "log.mcap", tmp_path / "out.mcap"
+    index = chunks(raw, path)[1].indexes[0].offset
+    path.write_bytes(flipped(raw, 8 * index))
+    done = cdmisfa("recover", path, "-o", out)
+    assert (done.code, "made again from its messages" in done.err) == (0, True), done
+    path.write_bytes(raw.replace(b"value", b"valve", 1))
+    done = cdmisfa("recover", path, "-o", out, "--force")
+    assert (done.code, "every message is there, metadata may be wrong" in done.out) == (3, True)
