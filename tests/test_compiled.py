@@ -11,7 +11,8 @@ from types import SimpleNamespace
 import numba
 import pytest
 
-from cdmisfa.core.arithmetic.compiled import MARKS, compiled, needs_compiling
+from cdmisfa.cli.progress import Bar, compiling_said
+from cdmisfa.core.arithmetic.compiled import MARKS, before_compiling, compiled
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -28,9 +29,33 @@ def test_without_a_folder_for_results_it_compiles_all_the_same(
     def double(x: float) -> float:
         return 2.0 * x
 
-    assert needs_compiling(double)
-    assert double(1.5) == 3.0
-    assert not needs_compiling(double)
+    told: list[bool] = []
+    with before_compiling(lambda: told.append(True)):
+        assert double(1.5) == 3.0
+        assert double(2.5) == 5.0
+    assert told == [True]
+    with before_compiling(lambda: told.append(False)):
+        assert double(3.5) == 7.0
+    assert told == [True]
+
+
+def test_compiling_is_told_only_where_nothing_is_on_disk(tmp_path: Path) -> None:
+    script = (
+        "from cdmisfa.core.arithmetic.compiled import before_compiling\n"
+        "from cdmisfa.agents.exploration import decay\n"
+        "with before_compiling(lambda: print('compiling')):\n"
+        "    decay(1.0, .9, .5, .5)\n"
+        "    decay(1.0, .9, .5, .5)\n"
+    )
+
+    def said() -> str:
+        here = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+        return subprocess.run(
+            [sys.executable, "-c", script], env=here, check=True, capture_output=True, text=True
+        ).stdout
+
+    assert said() == "compiling\n"
+    assert said() == ""
 
 
 def test_what_was_kept_before_a_class_moved_is_made_again(tmp_path: Path) -> None:
@@ -68,3 +93,11 @@ def test_what_was_kept_before_a_class_moved_is_made_again(tmp_path: Path) -> Non
 )
 def test_a_file_counts_by_each_way_to_compile_alone(source: bytes) -> None:
     assert any(mark in source for mark in MARKS)
+
+
+def test_the_wait_for_compiling_is_said_without_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with compiling_said(Bar()):
+        numba.njit(lambda x: x + 1)(1)
+    assert capsys.readouterr().err.startswith("compiling for this machine")

@@ -26,10 +26,8 @@ from test_view_world import SCENE, without_models
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments import runs
 from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
-from replay.recordings import kernels as scan
 from replay.view.bindings import viewer_client, viewer_program
 from replay.viewer import display, headless, live
 from replay.viewer.live import LiveView
@@ -245,17 +243,6 @@ def test_a_resumed_run_shows_what_went_before(tmp_path, monkeypatch):
     expected = [s.epsilon for s in read_signals(folder)]
     assert len(expected) == 50
     np.testing.assert_array_equal(np.concatenate(sent), expected)
-
-
-def test_the_wait_for_compiling_the_reader_is_said(monkeypatch, capsys):
-    cold = [scan.scan]
-    monkeypatch.setattr(runs, "needs_compiling", lambda function: function in cold)
-    monkeypatch.setattr(runs.sys.stderr, "isatty", lambda: True, raising=False)
-    runs._say_if_compiling()
-    assert "compiling" in capsys.readouterr().err
-    cold.clear()
-    runs._say_if_compiling()
-    assert capsys.readouterr().err == ""
 
 
 def test_rerun_switched_off_is_said(monkeypatch):

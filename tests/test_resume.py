@@ -416,23 +416,6 @@ def test_differences_name_the_key() -> None:
     ]
 
 
-def test_compiling_is_announced_only_when_it_will_happen(tmp_path: Path) -> None:
-    script = (
-        "from cdmisfa.core.arithmetic.compiled import needs_compiling as n;"
-        "from cdmisfa.agents.exploration import decay;"
-        "print(n(decay)); decay(1.0, .9, .5, .5); print(n(decay))"
-    )
-
-    def ask() -> str:
-        here = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-        return subprocess.run(
-            [sys.executable, "-c", script], env=here, check=True, capture_output=True, text=True
-        ).stdout
-
-    assert ask().split() == ["True", "False"]
-    assert ask().split() == ["False", "False"]
-
-
 class TestWithoutItsSource:
     """`cdmisfa learn --resume -o RUN` takes the source, and how it was opened, from the run."""
 

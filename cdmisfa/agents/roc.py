@@ -77,13 +77,15 @@ def cluster(
             if counts[s, c] < FORGOTTEN:
                 counts[s, c] = 0.0
     winner, error = nearest(centres[label], counts[label], y)
-    if winner >= 0 and error <= radius:
-        counts[label, winner] += 1.0
-        centres[label, winner] += (y - centres[label, winner]) / counts[label, winner]
-    else:
-        weakest = np.argmin(counts[label])
-        counts[label, weakest] = 1.0
-        centres[label, weakest] = y
+    near = winner >= 0 and error <= radius
+    place = winner if near else np.argmin(counts[label])
+    counts[label, place] = counts[label, place] + 1.0 if near else 1.0
+    n, outputs = y.shape
+    for t in range(n):  # whole arrays would be tested for their shapes, in seconds of compiling
+        for j in range(outputs):
+            centre = centres[label, place, t, j]
+            moved = centre + (y[t, j] - centre) / counts[label, place]
+            centres[label, place, t, j] = moved if near else y[t, j]
     return error
 
 

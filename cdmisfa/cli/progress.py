@@ -21,6 +21,16 @@ class Bar:
 
 
 @contextmanager
+def compiling_said(shown: Bar) -> Iterator[None]:
+    """Say so where the body waits for code to be compiled, also where there is no terminal."""
+    from cdmisfa.core.arithmetic.compiled import before_compiling
+
+    line = "compiling for this machine, which is kept: once, up to half a minute"
+    with before_compiling(lambda: shown.say(line)):
+        yield
+
+
+@contextmanager
 def bar(title: str, unit: str) -> Iterator[Bar]:
     """Show progress while the body runs, if anyone is looking; the unit is what is counted."""
     if not sys.stderr.isatty():

@@ -7,15 +7,12 @@ RUN/run.rrd the view. The loop itself is in `loop`.
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.arithmetic.compiled import needs_compiling
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -35,7 +32,6 @@ from cdmisfa.experiments.resume import (
     set_aside,
     take_over,
 )
-from cdmisfa.features.incsfa import strict
 from recorder.log.folder import folder_here, held, logs_in, refuse_existing
 from recorder.log.whole import make_folder, partial_path, refuse_special
 
@@ -206,7 +202,6 @@ def run(
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):
             shown.earlier(log.path.parent)
-        _say_if_compiling()
         try:
             ended = learn(
                 source,
@@ -313,17 +308,6 @@ def _run_log(
 def _no_folder(out: Path, error: OSError) -> UsageError:
     reason = error.strerror or error
     return UsageError(f"{out} cannot be a run's folder ({reason}): choose another")
-
-
-def _say_if_compiling() -> None:
-    """Explain the wait to whoever is looking, when numba has nothing on disk yet."""
-    if not sys.stderr.isatty():
-        return
-    functions: list[Callable[..., Any]] = [think, strict.update]
-    if scan := sys.modules.get("replay.recordings.kernels"):  # of a source that reads recordings
-        functions += [scan.scan, scan.gather]
-    if any(needs_compiling(function) for function in functions):
-        print("compiling the learner, this first time only (some 10 to 30 s)", file=sys.stderr)
 
 
 def _write_run(

@@ -21,7 +21,7 @@ from cdmisfa.cli.cameras import (
     say_changes,
 )
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.progress import Bar, bar
+from cdmisfa.cli.progress import Bar, bar, compiling_said
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 
@@ -186,7 +186,7 @@ def learn_command(
             say_about(frames)
             stack.callback(say_changes, frames)
         try:
-            with bar("learning", "blocks") as shown, stoppable() as stop:
+            with bar("learning", "blocks") as shown, compiling_said(shown), stoppable() as stop:
                 if hasattr(frames, "stop"):
                     frames.stop = stop  # waiting for frames ends with a signal, too
                 reporter = Reporter(shown, max_iterations)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 from numba.extending import overload
 
 from cdmisfa.core.arithmetic.choice import Either
@@ -64,6 +65,7 @@ def in_compiled_code(function: Callable[..., Any]) -> Callable[[Function], Funct
 
 def _compile(function: Function, **options: Any) -> Function:
     options["error_model"] = "numpy"  # no test at every division whether an error is to be raised
+    options["no_cfunc_wrapper"] = True  # for callers in C, of which there are none
     strict = {name: value for name, value in options.items() if name != "fastmath"}
     return cast(
         Function,
@@ -127,18 +129,23 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
-def needs_compiling(function: Callable[..., Any]) -> bool:
-    """Whether the first call of a compiled function will compile it, which takes seconds.
+class _OnFirst(event.Listener):
+    """Calls a function when the first of some events begins."""
 
-    It will not where this process has done so, or left its result on disk since the
-    source changed.
-    """
-    dispatcher: Any = function
-    if dispatcher.signatures:
-        return False
-    if dispatcher.stats.cache_path is None:  # nothing can be kept here
-        return True
-    source = Path(inspect.getfile(dispatcher.py_func))
-    index = f"{source.stem}.{dispatcher.py_func.__qualname__}-*.nbi"
-    kept = Path(dispatcher.stats.cache_path).glob(index)
-    return all(file.stat().st_mtime < source.stat().st_mtime for file in kept)
+    def __init__(self, tell: Callable[[], None]) -> None:
+        self._tell: Callable[[], None] | None = tell
+
+    def on_start(self, event: Any) -> None:
+        if self._tell is not None:
+            tell, self._tell = self._tell, None
+            tell()
+
+    def on_end(self, event: Any) -> None:
+        """Nothing."""
+
+
+@contextmanager
+def before_compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Call a function once, as soon as something is compiled that is not on disk yet."""
+    with event.install_listener("numba:compile", _OnFirst(tell)):
+        yield
