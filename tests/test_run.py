@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -248,3 +250,16 @@ def test_the_folder_is_held_until_the_view_is_built(
     monkeypatch.setattr("replay.view.build.build_view", build)
     run(tmp_path / "run", rerun=True)
     assert seen == [tmp_path / "run" / "run.rrd"]
+
+
+def test_without_a_view_rerun_is_not_imported(tmp_path):
+    words = ["learn", "oscillatory", "-o", str(tmp_path / "run"), "--max-iterations", "1"]
+    script = (
+        "import sys\nfrom cdmisfa.cli import run\n"
+        f"assert run({[*words, '--no-rerun']}) == 0\n"
+        "print([name for name in ('rerun', 'matplotlib', 'pybullet') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
