@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import mcap_files as files
 import numpy as np
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
@@ -126,13 +127,25 @@ def progressive(folder: Path) -> Path:
     return folder / "pictures"
 
 
-def log(schema: str, encoding: str, payloads: Iterable[bytes], chunk: int = 1) -> Writing:
+def messages_of_a_chunk(folder: Path) -> Path:
+    """An MCAP log of 1,100,000 empty messages in one chunk."""
+    schema = struct.pack("<H", 1) + files.text("foxglove.RawImage") + files.text("protobuf")
+    channel = struct.pack("<HH", 1, 1) + files.text("/cam") + files.text("protobuf")
+    body = files.record(files.SCHEMA, schema + bytes(4))
+    body += files.record(files.CHANNEL, channel + files.texts({}))
+    body += files.record(files.MESSAGE, files.message(1, 0, 5, 5, b"")) * 1_100_000
+    log = files.MAGIC + files.header() + files.chunk(body, 5, 5, compression="zstd")
+    (folder / "a.mcap").write_bytes(files.finish(log))
+    return folder / "a.mcap"
+
+
+def log(schema: str, encoding: str, payloads: Iterable[bytes]) -> Writing:
     """An MCAP log of messages, a chunk each or more."""
 
     def write(folder: Path) -> Path:
         with (folder / "a.mcap").open("wb") as file:
             writer = Writer(
-                file, chunk_size=chunk, compression=CompressionType.ZSTD, index_types=IndexType.NONE
+                file, chunk_size=1, compression=CompressionType.ZSTD, index_types=IndexType.NONE
             )
             writer.start()
             kind = writer.register_schema(schema, "protobuf", b"")
@@ -199,7 +212,7 @@ def says_huge(folder: Path) -> Path:
     return path
 
 
-def table_of_pictures(folder: Path) -> Path:
+def table_of_pictures(folder: Path, pixels: int = 300 << 20) -> Path:
     """A LeRobot dataset whose picture is 300 MiB of zeros."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -211,8 +224,9 @@ def table_of_pictures(folder: Path) -> Path:
     episode = {"episode_index": 0, "length": 1, "dataset_from_index": 0}
     places = {"data/chunk_index": 0, "data/file_index": 0}
     pq.write_table(pa.Table.from_pylist([{**episode, **places}]), folder / EPISODES)
-    pictures = [{"index": 0, "cam": {"bytes": bytes(300 << 20), "path": ""}}]
-    pq.write_table(pa.Table.from_pylist(pictures), folder / "data.parquet", compression="zstd")
+    pictures = [{"index": 0, "cam": {"bytes": bytes(pixels), "path": ""}}]
+    plain = {"compression": "zstd", "use_dictionary": False, "write_statistics": False}
+    pq.write_table(pa.Table.from_pylist(pictures), folder / "data.parquet", **plain)
     return folder
 
 
@@ -221,7 +235,7 @@ def table_of_episodes(folder: Path) -> Path:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path = table_of_pictures(folder)
+    path = table_of_pictures(folder, 1)
     columns = pq.read_schema(path / EPISODES).names
     part = pa.table({name: pa.array(np.zeros(10**7, np.int64)) for name in columns})
     with pq.ParquetWriter(path / EPISODES, part.schema, compression="zstd") as file:
@@ -244,9 +258,7 @@ CAMERAS: dict[str, Writing] = {
     "JSON image": log("foxglove.RawImage", "json", [b"[" + b"[]," * 8_000_000 + b"[]]"]),
     "protobuf image": log("foxglove.RawImage", "protobuf", [bytes(140_000_000)]),
     "CDR image": log("sensor_msgs/msg/Image", "cdr", [bytes(140_000_000)]),
-    "messages of a chunk": log(
-        "foxglove.RawImage", "protobuf", (b"" for _ in range(1_100_000)), 130_000_000
-    ),
+    "messages of a chunk": messages_of_a_chunk,
 }
 """By what they are bombs of; each is written to a folder."""
 

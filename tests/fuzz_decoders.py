@@ -22,6 +22,7 @@ from pathlib import Path
 from random import Random
 from resource import RUSAGE_SELF, getrusage
 
+import fuzz_datasets
 import fuzz_mutations
 import numpy as np
 from camera_files import HEIGHT, WIDTH, pictures
@@ -246,12 +247,7 @@ def _video(suffix: str) -> Callable[[Path], None]:
 def _cameras(path: Path) -> None:
     """The first image of each topic, and the last."""
     for topic in ("/cam_left", "/cam_right") if path.suffix in (".bag", ".db3") else (None,):
-        images = open_images(path, topic)
-        try:
-            for row in (0, images.count - 1):
-                images.image(row)
-        finally:
-            images.close()
+        fuzz_datasets.first_and_last(path, topic)
 
 
 def _presets() -> Iterator[bytes]:
@@ -332,6 +328,15 @@ DECODERS: Mapping[str, Decoder] = {
     "picture": Decoder(lambda p: open_images(p.parent, None).image(0), _packed, "0.png"),
     "bag": Decoder(_cameras, _written(".bag", _bag), "a.bag", needs="rosbags"),
     "db3": Decoder(_cameras, _written(".db3", _database), "a.db3", needs="rosbags"),
+    "metadata.yaml": Decoder(
+        fuzz_datasets.read_bag, fuzz_datasets.metadata, "metadata.yaml", text=True, needs="rosbags"
+    ),
+    "parquet": Decoder(
+        fuzz_datasets.read_dataset, fuzz_datasets.frames, fuzz_datasets.FRAMES, needs="pyarrow"
+    ),
+    "parquet of episodes": Decoder(
+        fuzz_datasets.read_dataset, fuzz_datasets.episodes, "episodes.parquet", needs="pyarrow"
+    ),
     "mkv": Decoder(_cameras, _written(".mkv", _video(".mkv")), "a.mkv", needs="av"),
     "mp4": Decoder(_cameras, _written(".mp4", _video(".mp4")), "a.mp4", needs="av"),
     "lerobot": Decoder(

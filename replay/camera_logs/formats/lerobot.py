@@ -50,13 +50,14 @@ class LeRobotImages(ImageStream):
         keys = [f"{place}chunk_index", f"{place}file_index"]
         start = f"{place}from_timestamp" if self._video else "dataset_from_index"
         rows = _episodes(path, ["episode_index", "length", *keys, start])
-        self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
-        scale = self._fps if self._video else 1
-        self._first = [round(float(row[start]) * scale) for row in rows]
-        lengths = np.array([int(row["length"]) for row in rows], np.int64)
-        self._starts = np.concatenate([[0], np.cumsum(lengths)])
-        ticks = np.arange(self._starts[-1]) + np.repeat(np.arange(len(rows)) * PAUSE, lengths)
-        self.times = np.round(ticks * (NANOSECONDS / self._fps)).astype(np.uint64)
+        with explained(path, "LeRobot's layout"):
+            self._files = [(int(row[keys[0]]), int(row[keys[1]])) for row in rows]
+            scale = self._fps if self._video else 1
+            self._first = [round(float(row[start]) * scale) for row in rows]
+            lengths = np.array([int(row["length"]) for row in rows], np.int64)
+            self._starts = np.concatenate([[0], np.cumsum(lengths)])
+            ticks = np.arange(self._starts[-1]) + np.repeat(np.arange(len(rows)) * PAUSE, lengths)
+            self.times = np.round(ticks * (NANOSECONDS / self._fps)).astype(np.uint64)
         if not len(self.times):
             raise UsageError(f"{path}: there is no frame in it")
         self._open: tuple[Path, Any] | None = None
@@ -101,10 +102,9 @@ class LeRobotImages(ImageStream):
             return pq.read_table(file, columns=["index", self.topic], use_threads=False)
 
     def _picture(self, table: Any, index: int) -> Bytes:
-        row = index - int(table["index"][0].as_py())
-        if not 0 <= row < table.num_rows:
-            raise MalformedRecord(f"its table has no frame {index}")
-        value = table[self.topic][row].as_py()
+        with explained(self.path, "LeRobot's layout", held=table.nbytes):
+            row = index - int(table["index"][0].as_py())
+            value = table[self.topic][row].as_py() if 0 <= row < table.num_rows else None
         data = value.get("bytes") if isinstance(value, Mapping) else None
         if not isinstance(data, bytes):
             raise MalformedRecord("its table holds no picture there")
@@ -173,4 +173,5 @@ def _episodes(path: Path, columns: list[str]) -> list[dict[str, Any]]:
         check_regular(file)
         with explained(file, "PyArrow"):
             rows += pq.ParquetFile(file).read(columns=columns, use_threads=False).to_pylist()
-    return sorted(rows, key=lambda row: int(row["episode_index"]))
+    with explained(path, "LeRobot's layout"):
+        return sorted(rows, key=lambda row: int(row["episode_index"]))
