@@ -73,3 +73,16 @@ TestHistories.settings = settings(
     derandomize=True,
     suppress_health_check=list(HealthCheck),
 )
+
+
+def test_a_whole_run_stays_as_it_is_where_it_cannot_be_gone_back_to(tmp_path: Path) -> None:
+    world = ("unseeded", 1)
+    history = History(tmp_path)
+    history.record(world, MOST, None, force=False)
+    history.learn(18, how="new", follow=True)
+    before = {path.name: path.read_bytes() for path in history.run.iterdir()}
+    history.record(world, MOST - 80, None, force=True)
+    history.learn(19, how="resume", follow=True)
+    assert history.errors == 1
+    assert {path.name: path.read_bytes() for path in history.run.iterdir()} == before
+    history.verify()

@@ -7,9 +7,10 @@ run that was stopped anywhere is resumed from the newest keyframe that can be re
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -189,48 +190,56 @@ def take_over(
     log.sync()
 
 
-def bring_back(
-    log: RunWriter, learner: Learner, source: Any, digest: SignalsHash, forked_at: int
-) -> None:
-    """Bring log, learner, source and digest to where the run's newest keyframe stands.
+def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> None:
+    """Bring learner and source to where the newest keyframe of a log stands; writes nothing.
 
     Args:
-        log: of the run that is resumed.
+        log: of the run that is to be resumed.
         learner: of its configuration.
         source: what it learns from.
-        digest: of the signals.
         forked_at: the iteration from which on a fork is itself; 0 where it is none.
     """
     from replay.runs.log import read_keyframe
+    from replay.runs.stretches import read_columns
 
-    folder = log.path.parent
-    before = folder / SET_ASIDE
+    keyframe = read_keyframe(log)
+    if forked_at and (keyframe is None or keyframe.iteration < forked_at):
+        raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
+    if keyframe is None:
+        return
+    restore(learner, keyframe)
+    if keyframe.taken is not None:
+        records = (signals for columns in read_columns(log) for signals in columns.records())
+        for signals in itertools.islice(records, keyframe.iteration):
+            source.take(signals.stream, learner.tau)
+        if source.taken != keyframe.taken:
+            raise LogDamagedError(
+                f"{log.parent}: what it learned from is not there any more: begin anew with "
+                "--force, or choose another folder"
+            )
+    source.seek(keyframe.t)
+
+
+def bring_back(log: RunWriter, digest: SignalsHash) -> None:
+    """Write what a run that is resumed keeps: all until its newest keyframe."""
+    from replay.runs.log import read_keyframe
+
+    before = log.path.parent / SET_ASIDE
     if not before.exists():
         return
     keyframe = read_keyframe(before)
-    if forked_at and (keyframe is None or keyframe.iteration < forked_at):
-        raise UsageError(f"{folder} was cut before its fork: fork again with --force")
     if keyframe is not None:
-        restore(learner, keyframe)
         for signals in log.take_over(before, keyframe.iteration):
             digest.add(signals)
-            if keyframe.taken is not None:
-                source.take(signals.stream, learner.tau)
-        if keyframe.taken is not None and source.taken != keyframe.taken:
-            raise LogDamagedError(
-                f"{folder}: what it learned from is not there any more: begin anew with --force, "
-                "or choose another folder"
-            )
-        source.seek(keyframe.t)
         last = max(keyframe.iteration - 1, 0)
-        log.event(source.t, last, f"resumed at iteration {keyframe.iteration}")
+        log.event(keyframe.t, last, f"resumed at iteration {keyframe.iteration}")
         changed = [
             f"{name} is {now}, was {keyframe.versions.get(name)}"
             for name, now in versions().items()
             if keyframe.versions.get(name) != now
         ]
         if changed:
-            log.event(source.t, last, "; ".join(changed), "WARNING")
+            log.event(keyframe.t, last, "; ".join(changed), "WARNING")
     log.sync()
     try:
         before.unlink()
@@ -251,10 +260,13 @@ def log_to_resume(run: Path) -> Path:
     )
 
 
-def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
+def set_aside(
+    run: Path, spec: SourceSpec, manifest: Mapping[str, Any], going_back: Callable[[Path], None]
+) -> None:
     """Move the log of a run that is to be resumed out of the way, after checking that it may.
 
-    A log that said nothing before the run was stopped stays.
+    A log that said nothing before the run was stopped stays. Where learner or source cannot go
+    back to where the log stands, all stays as it is.
 
     Raises:
         UsageError: there is no run, or it was made with another configuration or source.
@@ -265,6 +277,7 @@ def set_aside(run: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
     if found == partial_path(run / RUN_FILE) and not _has_header(found):
         return
     refuse_difference(run, found, spec, manifest)
+    going_back(found)
     try:
         os.replace(found, run / SET_ASIDE)
     except OSError as error:

@@ -29,6 +29,7 @@ from cdmisfa.experiments.resume import (
     Keyframes,
     ancestry_of,
     bring_back,
+    go_back,
     set_aside,
     take_over,
 )
@@ -168,6 +169,10 @@ def run(
             f"{described['kind']} cannot go back to where the run was "
             "stopped: resume from its recording, or begin another run"
         )
+
+    def going_back(found: Path) -> None:
+        go_back(found, learner, source, 0 if ancestry is None else ancestry["at"])
+
     with contextlib.ExitStack() as opened:
         log = shown = None
         if folder is not None:
@@ -177,7 +182,7 @@ def run(
                     source.spec,
                     {**manifest, **begun},
                     force=force,
-                    resume=resume,
+                    resume=going_back if resume else None,
                     fsync_every=fsync_every,
                 )
             )
@@ -197,7 +202,7 @@ def run(
             if announce is not None:
                 announce(shown.address)
         if log is not None and resume:
-            bring_back(log, learner, source, digest, 0 if ancestry is None else ancestry["at"])
+            bring_back(log, digest)
         elif log is not None and fork is not None:
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):
@@ -262,17 +267,19 @@ def _run_log(
     manifest: Mapping[str, Any],
     *,
     force: bool,
-    resume: bool,
+    resume: Callable[[Path], None] | None,
     fsync_every: float | None,
 ) -> Iterator[RunWriter]:
     """The run's log, to be finished inside, and its folder held.
+
+    One that is resumed is gone back with first, before anything of the folder is changed.
 
     On failure a log that is not finished is left as a readable prefix.
     """
     from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
     from replay.runs.writer import RunWriter
 
-    if not resume:
+    if resume is None:
         refuse_existing(out, force=force)
         try:
             make_folder(out)
@@ -284,8 +291,8 @@ def _run_log(
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [out / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE)]
         stale += out.glob("checkpoint-*.npz")  # of runs from before keyframes
-        if resume:
-            set_aside(out, spec, manifest)
+        if resume is not None:
+            set_aside(out, spec, manifest, resume)
         else:  # the log first: of what is left by a kill nothing then looks like a run
             logs = (SET_ASIDE, RUN_FILE, partial_path(out / RUN_FILE).name)
             stale = [*(out / name for name in logs), *stale]
@@ -296,7 +303,11 @@ def _run_log(
         except OSError as error:
             raise _no_folder(out, error) from error
         log = RunWriter(
-            out / RUN_FILE, spec, manifest, force=force or resume, fsync_every=fsync_every
+            out / RUN_FILE,
+            spec,
+            manifest,
+            force=force or resume is not None,
+            fsync_every=fsync_every,
         )
         try:
             yield log
