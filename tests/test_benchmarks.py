@@ -19,6 +19,7 @@ from benchmarks import (
     recursive,
     report,
     scaling,
+    startup,
 )
 from cdmisfa.core.errors import CdmisfaError
 
@@ -64,6 +65,15 @@ def test_the_page_refuses_a_run_that_contradicts_itself(results: Path) -> None:
     report.save("learn", "Learning", "", [], contradictions=learn.contradictions(wrong))
     with pytest.raises(CdmisfaError, match=r"learn\.json contradicts itself .*fixed -95 ms"):
         report.write_page()
+
+
+def test_startup(tmp_path: Path) -> None:
+    help_, numba = (
+        startup.cpu_ms(startup.WARM[name], tmp_path, tmp_path / "kept")
+        for name in ("cdmisfa --help", "import of numba")
+    )
+    assert 0 < help_ < numba
+    assert set(startup.COLD) <= set(startup.WARM)
 
 
 def test_modules(results: Path) -> None:

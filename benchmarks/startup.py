@@ -1,0 +1,69 @@
+"""What a command takes beyond its work: starting, and compiling the first time."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks.report import SAMPLE, middle, ratio, save
+
+LEARN = ("-m", "cdmisfa", "learn", "--max-iterations", "1", "--force", "--json", "-o")
+VIEWS = (str(SAMPLE / "left.mcap"), str(SAMPLE / "right.mcap"), "--algorithm", "2.0")
+VIEWS += ("--preset", "icub")
+WARM = {
+    "import of numba": ("-c", "import numba"),
+    "import of numba and rerun": ("-c", "import numba, rerun"),
+    "cdmisfa --help": ("-m", "cdmisfa", "--help"),
+    "learn oscillatory --no-rerun": (*LEARN, "RUN", "oscillatory", "--no-rerun"),
+    "learn oscillatory": (*LEARN, "RUN", "oscillatory"),
+    "learn of two views --no-rerun": (*LEARN, "RUN", *VIEWS, "--no-rerun"),
+}
+COLD = ("learn oscillatory --no-rerun", "learn of two views --no-rerun")
+
+
+def cpu_ms(words: tuple[str, ...], folder: Path, kept: Path) -> float:
+    """CPU milliseconds of a Python process with these words, its compiled code in `kept`."""
+    command = [str(folder / "run") if word == "RUN" else word for word in words]
+    # What is kept of imports must be there, too, wherever the environment has it.
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(kept)}
+    environment["PYTHONPYCACHEPREFIX"] = str(folder / "imports")
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, *command], env=environment, check=True, capture_output=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return 1e3 * (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+
+
+def main(*, quick: bool = False, full: bool = False) -> None:
+    """Measure, and write results/startup.json."""
+    rounds = 2 if quick else 7
+    times: dict[str, list[float]] = {name: [] for name in WARM}
+    cold: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as path:
+        folder = Path(path)
+        cpu_ms(WARM["learn oscillatory"], folder, folder / "imports only")
+        for number, name in enumerate(COLD):
+            cold[name] = cpu_ms(WARM[name], folder, folder / f"cold {number}")
+        for turn in range(rounds + 1):
+            for name, words in WARM.items():
+                spent = cpu_ms(words, folder, folder / "kept")
+                if turn:
+                    times[name].append(spent)
+    least = times["import of numba"]
+    save(
+        "startup",
+        "Starting",
+        "CPU time of whole processes; `learn` learns one iteration. What they import is compiled "
+        "to byte code before. Cold is a first run, with nothing of numba's on disk: measured once.",
+        [
+            (
+                ("warm: process", "CPU ms", "times the import of numba"),
+                [(n, middle(t), f"{ratio(t, least):.2f}x") for n, t in times.items()],
+            ),
+            (("cold: process", "CPU s"), [(n, round(t / 1e3, 1)) for n, t in cold.items()]),
+        ],
+    )
