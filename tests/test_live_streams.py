@@ -141,10 +141,14 @@ def test_pictures_of_ffmpeg_are_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_
     words = [TEST, TEST.replace("testsrc", "testsrc2")]
     rec = str(tmp_path / "rec")
     options = ["--size", "32x24", "--set", "learner.tau=15", "--max-iterations", "3", "--json"]
-    run = cdmisfa("learn", *words, "--record", rec, *options)
+    run = cdmisfa("learn", *words, "--record", rec, "-o", str(tmp_path / "run"), *options)
     assert "lavfi_testsrc: " in run.err
     again = cdmisfa("learn", rec, *options).json
     assert again["signals_sha256"] == run.json["signals_sha256"]
+    gone = cdmisfa("check", str(tmp_path / "run"))
+    assert gone.code == 2
+    assert f"{TEST} was live: name what learn --record wrote of it" in gone.err
+    assert cdmisfa("check", str(tmp_path / "run"), "--source", rec).code == 0
 
 
 def test_a_video_plays_at_its_own_pace_and_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
@@ -181,7 +185,10 @@ def test_frames_keep_the_ratio_of_the_sides(word: str, shape: tuple[int, int]) -
 
 
 class Motion(http.server.BaseHTTPRequestHandler):
-    """A web camera: MJPEG without end, but each connection breaks after 20 pictures."""
+    """A web camera: MJPEG without end, but each connection breaks after 20 pictures.
+
+    It shows 25 a second, at `/slow.mjpg` 10.
+    """
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -193,7 +200,7 @@ class Motion(http.server.BaseHTTPRequestHandler):
                 Image.fromarray(np.full((48, 64), 5 * k, np.uint8)).save(data, "JPEG")
                 head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {data.tell()}\r\n"
                 self.wfile.write(head.encode() + b"\r\n" + data.getvalue() + b"\r\n")
-                time.sleep(0.04)
+                time.sleep(0.1 if self.path == "/slow.mjpg" else 0.04)
 
     def log_message(self, *args: Any) -> None:
         pass
@@ -217,6 +224,16 @@ def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
     assert said[0] == "stream is gone: Input/output error: connecting to it anew"
     assert len(blocks) >= 2
     assert source.alignment["stream"]["missing"] > 0  # type: ignore[attr-defined]
+
+
+def test_pictures_of_a_web_camera_were_taken_when_they_come(web_camera: str) -> None:
+    # MJPEG tells no times, and those that FFmpeg makes up are those of 25 pictures a second.
+    word = web_camera.replace("stream", "slow")
+    with contextlib.closing(open_live([word], LiveOptions(size=(48, 64)))) as source:
+        assert 5 < source.spec.fps < 11
+        source.take(0, 12)
+        counts = source.alignment["slow"]  # type: ignore[attr-defined]
+    assert (counts["missing"], counts["late"], counts["disordered"]) == (0, 0, 0)
 
 
 def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:

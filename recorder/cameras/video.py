@@ -22,6 +22,9 @@ JUMP: Final = 1.0
 LATE: Final = 60
 """Frames in a row that come later than that before they are taken to begin anew."""
 
+_TIMELESS: Final = 0x80
+"""FFmpeg's flag of formats that hold no times (AVFMT_NOTIMESTAMPS): it makes some up, at 25 Hz."""
+
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
 
@@ -30,7 +33,8 @@ class VideoCamera:
     """A device, a network stream or a file that PyAV opens.
 
     Its pictures come no earlier than their presentation times say, so that a file plays at its
-    own pace.
+    own pace. A network stream of a format without times, as MJPEG of a web camera, states no rate,
+    and its pictures were taken when they come.
 
     Args:
         word: as the user named it.
@@ -76,21 +80,22 @@ class VideoCamera:
             if not 0 < context.width * context.height <= MAX_PIXELS:
                 raise CdmisfaError(f"{self.name}: images of {context.width}x{context.height}")
             context.thread_count = 1  # of several cameras, each has a thread
-            stated = video.average_rate or video.guessed_rate
+            timed = not (self._remote and container.format.flags & _TIMELESS)
+            stated = timed and (video.average_rate or video.guessed_rate)
             self.rate = float(stated) if stated else None
             try:
-                yield from self._paced(container.decode(video))
+                yield from self._paced(container.decode(video), timed=timed)
             except (OSError, ValueError) as error:
                 raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
 
-    def _paced(self, frames: Iterator[Any]) -> Iterator[tuple[int, Bytes]]:
+    def _paced(self, frames: Iterator[Any], *, timed: bool) -> Iterator[tuple[int, Bytes]]:
         steady = Steady()
         for frame in frames:
-            now = time.monotonic()
-            early = steady.early(now, frame.time)
+            presented = frame.time if timed else None
+            early = steady.early(time.monotonic(), presented)
             if early > 0 and not self._remote:
                 time.sleep(early)
-            yield steady.age(time.monotonic(), frame.time), frame_gray(frame)
+            yield steady.age(time.monotonic(), presented), frame_gray(frame)
 
     def describe(self) -> Mapping[str, Any]:
         """The word, without what may be a password."""
