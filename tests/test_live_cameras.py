@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Cdmisfa
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedInbox, bar
 from waiting import wait_for
 
@@ -201,6 +202,23 @@ def test_what_is_learned_live_is_learned_again_from_the_recording(
     assert [int(last[name]["missing"]) for name in sorted(last)] == [
         counts[name]["missing"] for name in sorted(counts)
     ]
+
+
+def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(
+    tmp_path: Path, cdmisfa: Cdmisfa
+) -> None:
+    script = [*steady(0, 0, 100), *steady(0, 5, 30)]  # a gap, and less than a block behind it
+    with (
+        RecordedWhileWatched(opened(script), tmp_path / "rec") as live,
+        pytest.raises(RunExhaustedError),
+    ):
+        run(live, ProgressConfig(tau=40, components=3), tmp_path / "run", rerun=False)
+    assert live.t > 100
+    checked = cdmisfa("check", tmp_path / "run", "--source", tmp_path / "rec")
+    assert (checked.code, checked.out) == (
+        0,
+        "iterations 0 to 1: learned again, they are identical, bit for bit\n",
+    )
 
 
 def shown(path: Path) -> dict[str, list[tuple[int, int]]]:

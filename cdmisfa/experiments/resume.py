@@ -21,6 +21,7 @@ from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import versions
+from recorder.cameras.words import is_live
 from recorder.log.begun import Begun, found_path, relative_path
 from recorder.log.whole import partial_path
 from recorder.world.scenes import SCENES
@@ -77,7 +78,8 @@ def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> 
     preset = kept.get("preset")
     if preset is not None and preset.endswith(".toml"):
         kept["preset"] = relative_path(preset, run)
-    return Begun(tuple(source), kept).as_json(run, SCENES)
+    names = [word for word in source if word in SCENES or is_live(word)]
+    return Begun(tuple(source), kept).as_json(run, names)
 
 
 def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -139,9 +141,11 @@ class Keyframes(Sink):
         self._every = EVERY if every is None else every
         self._share = SHARE if every is None else 0
         self._due = 0
+        self._t: int | None = None
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
+        self._t = self._source.t
         if not self._every or learner.iteration % self._every:
             return
         self._log.flush()
@@ -163,7 +167,9 @@ class Keyframes(Sink):
 
     def _keyframe(self) -> Keyframe:
         learner, taken = self._learner, getattr(self._source, "taken", None)
-        return Keyframe(learner.iteration, self._source.t, learner.state, versions(), taken)
+        # Cameras have moved on, where they ended or were stopped within the next block.
+        t = self._source.t if self._t is None else self._t
+        return Keyframe(learner.iteration, t, learner.state, versions(), taken)
 
 
 def restore(learner: Learner, keyframe: Keyframe) -> None:

@@ -15,6 +15,7 @@ from cdmisfa.core.learning import Learner, LearnerState
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.resume import FORK, read_command, restore
 from cdmisfa.experiments.sources import open_logs, open_source
+from recorder.cameras.words import is_live
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import run_log
@@ -175,6 +176,8 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
     settings = list(begun.get("settings", ()))
     settings += [f"learner.{key}={begun[key]}" for key in LEARNERS_OWN if begun.get(key)]
     words = tuple(words) or named
+    if is_live(words[0]):
+        raise UsageError(f"{words[0]} was live: name what learn --record wrote of it")
     kept = () if not as_begun and _is_recording(words) else CAMERAS
     cameras = CameraOptions(**{name: begun[name] for name in kept if name in begun})
     if words[0] not in SCENES:
