@@ -351,11 +351,29 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
         thread.join()
 
 
+def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
+    cdmisfa: Cdmisfa, tmp_path: Path, robot: Robot
+) -> None:
+    rec = str(tmp_path / "rec")
+    options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
+    words = [f"{robot.address}/words", "--field", "k"]
+    run = cdmisfa("learn", *words, "--record", rec, *options).json
+    assert run["source"]["fields"] == ["k"]
+    assert cdmisfa("learn", rec, *options).json["signals_sha256"] == run["signals_sha256"]
+    with contextlib.closing(RecordedSource(rec)) as source:
+        assert (source.spec.frame_shape, source.spec.dtype) == ((1,), "float64")
+        assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
+    with pytest.raises(UsageError, match="there is no z, it has k"):
+        open_live([f"{robot.address}/words"], LiveOptions(fields=("z",)))
+    with pytest.raises(UsageError, match="shows images: --field is for messages"):
+        open_live([TEST], LiveOptions(fields=("k",)))
+
+
 @pytest.mark.parametrize(
     ("topic", "why"),
     [
         ("/cam/front", "has no topic /cam/front: it has images on /cam/left, /cam/right"),
-        ("", "has not one topic of images: it has images on /cam/left, /cam/right"),
+        ("", "has not one such topic: it has images on /cam/left, /cam/right"),
         ("/words", "/words holds .*, which is no image"),
     ],
 )
@@ -380,7 +398,7 @@ def test_a_topic_that_is_no_image_is_refused(
         (["learn", TEST, "--resume", "-o", "run"], "learn from a recording of them"),
         (
             ["learn", TEST, "--topic", "/x"],
-            "of live streams only --size, --fit, --range and --rate",
+            "of live streams only --size, --fit, --range, --field and --rate",
         ),
         (["learn", "oscillatory", "--record", "x"], "--record is for live streams"),
         (["record", TEST, "-o", "x", "--resume"], "leave out --resume"),
@@ -388,11 +406,11 @@ def test_a_topic_that_is_no_image_is_refused(
         (["record", "icub", "oscillatory", "-o", "x"], "record one scene at a time"),
         (
             ["record", "icub", "--fit", "pad", "-o", "x"],
-            "--fit, --rate and --range are for cameras",
+            "--fit, --rate, --range and --field are for cameras",
         ),
         (
             ["record", "icub", "--size", "32x24", "-o", "x"],
-            "--size, --fit, --rate and --range are for cameras",
+            "--size, --fit, --rate, --range and --field are for cameras",
         ),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,6 +36,7 @@ FORMATS = (
     "video",
     *PICTURES,
     "lerobot",
+    "table",
     "url",
     "several",
     "glob",
@@ -43,6 +45,7 @@ BAGS = ("ros2 mcap folder", "bag", "db3", "db3 folder")
 COMMANDS = ("info", "verify", "view", "export", "learn", "convert", "record", "play")
 REFUSED = {
     ("export", "run"): "name the recording",
+    ("export", "table"): "holds no images",
     ("learn", "run"): "is a run, not a recording",
     ("play", "run"): "is a run, not a recording",
     ("convert", "run"): "is a run, not a recording",
@@ -100,6 +103,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
     write_cameras(base / "part-1.mcap", {"/left": (COUNT, STEP_MS)})
     write_cameras(base / "part-2.mcap", {"/right": (COUNT, STEP_MS)})
     write_pictures(base / "png", COUNT)
+    rows = (f"{i},{i % 7}" for i in range(COUNT))
+    (base / "t.csv").write_text("\n".join(["a,b", *rows]))
     for i, image in enumerate(pictures(COUNT)):
         Image.fromarray(image).save(base / "jpeg" / f"{i}.jpg")
     made = ("a.mcap", "rec", "run", "lerobot/")
@@ -141,15 +146,32 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
             "png folder": [base / "png"],
             "jpeg folder": [base / "jpeg"],
             "lerobot": [base / "lerobot"],
+            "table": [base / "t.csv"],
             "url": [web.url("/a.mcap")],
             "several": [base / "part-1.mcap", base / "part-2.mcap"],
             "glob": [base / "part-*.mcap"],
         }
 
 
+def write_numbers(table: Path, log: Path) -> None:
+    """A table with the columns stamp, a and b, and a log of joints in JSON."""
+    rows = (f"{i / 50},{np.sin(i / 9)},{i % 7}" for i in range(200))
+    table.write_text("\n".join(["stamp,a,b", *rows]))
+    joints = ({"position": [i, i % 5, 1], "velocity": [0.5, i % 3]} for i in range(200))
+    with log.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        kind = writer.register_schema("joints", "jsonschema", b"{}")
+        channel = writer.register_channel("/joint_states", "json", kind)
+        for i, joint in enumerate(joints):
+            time = (START_MS + i * STEP_MS) * 1_000_000
+            writer.add_message(channel, time, json.dumps(joint).encode(), time)
+        writer.finish()
+
+
 def command_line(command: str, kind: str, words: list[object], out: Path) -> list[object]:
     """The command, with what every kind of log needs."""
-    rate = ["--rate", "50"] if kind in PICTURES else []
+    rate = ["--rate", "50"] if kind in (*PICTURES, "table") else []
     topics = ["--topic", "/cam_*"] if kind in BAGS else []
     return {
         "info": ["info", *words, "--json"],
@@ -209,12 +231,13 @@ def test_the_commands_of_the_page_work(
     write_cameras(Path("part-2.mcap"), {"/right": (COUNT, STEP_MS)})
     write_pictures(Path("pictures"), COUNT)
     write_video(Path("film.mp4"))
+    write_numbers(Path("data.csv"), Path("joints.mcap"))
     page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text("utf-8")
     lines = [
         line for block in page.split("```sh")[1:] for line in block.split("```")[0].split("\n")
     ]
     commands = [shlex.split(line)[1:] for line in lines if line]
-    assert len(commands) == 6
+    assert len(commands) == 10
     for words in commands:
         done = cdmisfa(*words)
         assert done.code == 0, (words, done.err)

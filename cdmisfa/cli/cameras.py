@@ -86,21 +86,46 @@ range_option = click.option(
     "depth",
     callback=_near_and_far,
     metavar="NEAR:FAR",
-    help="Show distances of depth cameras, in metres, from black to white.",
+    help="Show distances of depth cameras, in metres, from black to white; keep numbers within.",
 )
 
-frame_options = options.together(size_option, fit_option, rate_option, range_option)
+topic_option = click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="A topic of images in a log, one stream each, or a pattern of topics, such as "
+    "'/cam*'; repeatable.",
+)
+
+field_option = click.option(
+    "--field",
+    "fields",
+    multiple=True,
+    metavar="FIELD",
+    help="Take numbers instead of images: a field of a topic's messages, such as "
+    "pose.position.x or ranges[0:100], or a column of a table; several are one vector.",
+)
+
+number_options = options.together(
+    field_option,
+    click.option(
+        "--time",
+        metavar="COLUMN",
+        help="The column of a table's times: dates, or seconds; stamp:ns counts in ns, us or ms.",
+    ),
+)
+"""Which numbers of logs and tables are taken."""
+
+look_options = options.together(topic_option, number_options, rate_option)
+"""What of camera logs is shown or exported."""
+
+frame_options = options.together(size_option, fit_option, rate_option, range_option, field_option)
 """How images of cameras, live or stored, become frames."""
 
 camera_options = options.together(
-    click.option(
-        "--topic",
-        "topics",
-        multiple=True,
-        metavar="TOPIC",
-        help="A topic of images in a log, one stream each, or a pattern of topics, such as "
-        "'/cam*'; repeatable.",
-    ),
+    topic_option,
+    number_options,
     size_option,
     fit_option,
     click.option(
@@ -196,10 +221,11 @@ def say_about(source: FrameSource) -> None:
     for name, shape in getattr(source, "shapes", {}).items():
         if "," in shape:  # not the image itself
             click.echo(f"{name}: {shape}", err=True)
+    what = "images" if source.spec.images else "messages"
     for name, counts in getattr(source, "alignment", {}).items():
         click.echo(
-            f"{name}: {counts['messages']} images, "
-            f"{counts['repeated']} frames repeated, {counts['dropped']} images dropped",
+            f"{name}: {counts['messages']} {what}, "
+            f"{counts['repeated']} frames repeated, {counts['dropped']} {what} dropped",
             err=True,
         )
 
@@ -226,7 +252,8 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
         plan = {"frames": source.frames, "rate": source.spec.fps, "size": size, "streams": rows}
         options.print_json({"schema": options.SCHEMA, **plan, "warnings": source.warnings})
         return
-    head = ("stream", "images", "rate", "size", "missing", "gaps", "repeated", "dropped")
+    what = "images" if source.spec.images else "messages"
+    head = ("stream", what, "rate", "size", "missing", "gaps", "repeated", "dropped")
     cells = [
         (row["stream"], row["images"], "-" if row["rate"] is None else f"{row['rate']:.6g}",
          row["shape"], row["missing"], len(row["gaps"]), row["repeated"], row["dropped"])

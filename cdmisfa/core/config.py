@@ -314,7 +314,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
         choices = ", ".join(str(a) for a in arguments)
         raise UsageError(f"{key} is {shown(value)}: choose one of {choices}")
     if origin is types.UnionType or origin is typing.Union:
-        if value is None or value in ("auto", "none"):
+        if value is None or value == "auto" or (value == "none" and str not in arguments):
             return None
         return convert(value, next(a for a in arguments if a is not types.NoneType), key)
     if origin is tuple:

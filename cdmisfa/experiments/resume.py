@@ -25,6 +25,7 @@ from recorder.cameras.words import is_live
 from recorder.log.begun import Begun, found_path, relative_path
 from recorder.log.whole import partial_path
 from recorder.world.scenes import SCENES
+from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter
@@ -44,15 +45,7 @@ OPTIONS = (
     "loop",
     "salvage",
     "follow",
-    "topics",
-    "size",
-    "align",
-    "rate",
-    "fit",
-    "gaps",
-    "start",
-    "stop",
-    "depth",
+    *(field.name for field in dataclasses.fields(CameraOptions)),
     "max_iterations",
     "max_modules",
     "keyframes",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
-from recorder.images.pixels import Bytes
+from recorder.images.pixels import Shown
 
 
 class Picture(NamedTuple):
@@ -13,11 +13,11 @@ class Picture(NamedTuple):
 
     Attributes:
         time_ns: when it was taken or came, by the clock that all cameras share.
-        image: gray, (height, width) uint8.
+        image: gray, (height, width) uint8; or numbers, (I,) float64.
     """
 
     time_ns: int
-    image: Bytes
+    image: Shown
 
 
 class Camera(Protocol):
@@ -36,7 +36,7 @@ class Camera(Protocol):
     def rate(self) -> float | None:
         """See above."""
 
-    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+    def pictures(self) -> Iterator[tuple[int, Shown]]:
         """Open it and give its images as they come, until it ends.
 
         Yields:

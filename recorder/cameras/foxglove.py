@@ -1,11 +1,13 @@
-"""Images of a running robot, through the Foxglove WebSocket protocol.
+"""Images and numbers of a running robot, through the Foxglove WebSocket protocol.
 
-A client of what a camera needs of it: the server says which channels there are, one of images is
-subscribed to, and its messages come. foxglove_bridge serves a ROS 2 robot so.
+A client of what a camera needs of it: the server says which channels there are, one is subscribed
+to, and its messages come. foxglove_bridge serves a ROS 2 robot so.
 """
 
 from __future__ import annotations
 
+import base64
+import contextlib
 import json
 import struct
 import time
@@ -17,8 +19,9 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.cameras.video import Steady
-from recorder.images.messages import Decoder, image_decoder
-from recorder.images.pixels import Bytes, Depth
+from recorder.images.decoding import Taken, decoder_of
+from recorder.images.pixels import Shown
+from recorder.images.reading import IMAGES, MessageKind, Reading
 
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Names of the protocol, the newer first."""
@@ -30,13 +33,13 @@ _HEADER: Final = struct.Struct("<BIQ")
 
 
 class FoxgloveCamera:
-    """A topic of images of a server.
+    """A topic of images, or of messages with fields, of a server.
 
     Args:
         word: foxglove://HOST:PORT/TOPIC; without a topic the only one of images.
         name: of the stream.
         timeout: seconds in which the server must answer and name the topic.
-        depth: how distances are shown; see `gray`.
+        reading: what is taken of messages.
 
     Raises:
         UsageError: the word is no such address, or websockets is missing.
@@ -45,8 +48,8 @@ class FoxgloveCamera:
     finite = False
     rate: float | None = None
 
-    def __init__(self, word: str, name: str, *, timeout: float, depth: Depth | None = None) -> None:
-        self.name, self._depth = name, depth
+    def __init__(self, word: str, name: str, *, timeout: float, reading: Reading = IMAGES) -> None:
+        self.name, self._reading = name, reading
         place = urlsplit(word)
         if not place.netloc:
             raise UsageError(f"{word} names no server: write foxglove://HOST:8765/TOPIC")
@@ -62,7 +65,7 @@ class FoxgloveCamera:
             ) from None
         self._client = client
 
-    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+    def pictures(self) -> Iterator[tuple[int, Shown]]:
         """See `Camera`."""
         try:
             connection = self._client.connect(
@@ -94,7 +97,7 @@ class FoxgloveCamera:
         """The server and the topic."""
         return {"camera": f"{self._where}{self._topic}"}
 
-    def _find(self, connection: Any) -> tuple[int, Decoder]:
+    def _find(self, connection: Any) -> tuple[int, Taken]:
         """The channel of the topic, waited for, and how its messages are decoded."""
         channels: dict[str, Mapping[str, Any]] = {}
         end = time.monotonic() + self._timeout
@@ -111,14 +114,22 @@ class FoxgloveCamera:
                 return int(channels[found]["id"]), images[found]
             if found in channels:
                 kind = channels[found].get("schemaName")
-                raise CdmisfaError(f"{self._where}{found} holds {kind}, which is no image")
+                lacks = "has no fields" if self._reading.fields else "is no image"
+                raise CdmisfaError(f"{self._where}{found} holds {kind}, which {lacks}")
+        wanted = "messages with fields" if self._reading.fields else "images"
         known = ", ".join(sorted(t for t, c in channels.items() if self._decoder(c))) or "nothing"
-        what = f"has no topic {self._topic}" if self._topic else "has not one topic of images"
-        raise CdmisfaError(f"{self._where} {what}: it has images on {known}")
+        what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
+        raise CdmisfaError(f"{self._where} {what}: it has {wanted} on {known}")
 
-    def _decoder(self, channel: Mapping[str, Any]) -> Decoder | None:
-        schema, encoding = str(channel.get("schemaName")), str(channel.get("encoding"))
-        return image_decoder(schema, encoding, self._depth)
+    def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
+        schema, language = channel.get("schema"), str(channel.get("schemaEncoding", ""))
+        definition = schema.encode() if isinstance(schema, str) else b""
+        encoding = str(channel.get("encoding"))
+        if encoding == "protobuf":  # its definition is no text
+            with contextlib.suppress(ValueError):
+                definition = base64.b64decode(definition, validate=True)
+        kind = MessageKind(str(channel.get("schemaName")), encoding, definition, language)
+        return decoder_of(kind, self._reading)
 
     @staticmethod
     def _is_gone(message: str, number: int) -> bool:

@@ -8,16 +8,20 @@ from typing import Any
 
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.camera import Camera
-from recorder.images.framing import Fit, Framing, Size, default_size, size_of
-from recorder.images.pixels import Bytes
+from recorder.images.framing import Fit, Framing, Size, Vector, framings, size_of
+from recorder.images.pixels import Shown
 
 
 @dataclass
 class _Frames:
-    """What cameras share: the size of their frames, once it is known, and how images get it."""
+    """What cameras share: the size of their frames, once it is known, and how images get it.
+
+    Of numbers the size is how many there are.
+    """
 
     size: Size | None
     fit: Fit
+    numbers: Vector | None = None
 
 
 def framed(
@@ -50,7 +54,7 @@ class FramedCamera:
     ) -> None:
         self.name, self.finite = camera.name, camera.finite
         self._camera, self._frames, self._say, self._gives = camera, frames, say, gives
-        self._framing: Framing | None = None
+        self._framing: Framing | Vector | None = None
         self._changed = False
 
     @property
@@ -58,14 +62,14 @@ class FramedCamera:
         """See `Camera`."""
         return self._camera.rate
 
-    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+    def pictures(self) -> Iterator[tuple[int, Shown]]:
         """See `Camera`.
 
         Raises:
             UsageError: an image is smaller than a frame.
         """
         for age, image in self._camera.pictures():
-            framing = self._framing = self._framing or self._begun(size_of(image))
+            framing = self._framing = self._framing or self._begun(image)
             if framing is None:
                 continue
             if not self._changed and (change := framing.change(image)):
@@ -81,14 +85,17 @@ class FramedCamera:
         """See `Camera`."""
         return self._camera.describe()
 
-    def _begun(self, first: Size) -> Framing | None:
+    def _begun(self, first: Shown) -> Framing | Vector | None:
         """How its images become frames; None as long as the size of frames is not known."""
         frames = self._frames
-        if frames.size is None and self._gives:
-            frames.size = default_size(first)
-        if frames.size is None:
+        if first.ndim > 1 and frames.size is None and not self._gives:
             return None
-        framing = Framing(first, frames.size, frames.fit)
-        if first != frames.size:
-            self._say(f"{self.name}: {framing}")
+        framing = framings([first], frames.size, frames.fit)[0]
+        if isinstance(framing, Framing):
+            frames.size = framing.size
+            if size_of(first) != framing.size:
+                self._say(f"{self.name}: {framing}")
+        else:
+            frames.numbers = frames.numbers or framing
+            frames.numbers.frame(first)
         return framing

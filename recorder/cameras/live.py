@@ -20,7 +20,7 @@ from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.camera import Picture
 from recorder.cameras.grid import Grid
-from recorder.images.pixels import Bytes
+from recorder.images.pixels import Shown
 
 HOLD: Final = 0.25
 """Seconds for which a picture stands for those that are missing."""
@@ -98,7 +98,7 @@ class LiveSource(ForwardSource):
     ) -> None:
         self.stop = stop
         self._inbox = inbox
-        self._ahead: deque[list[Bytes | None]] = deque()
+        self._ahead: deque[list[Shown | None]] = deque()
         self._ends: int | None = None
         self._why = ""
         try:
@@ -111,7 +111,9 @@ class LiveSource(ForwardSource):
             step = NANOSECONDS / fps
             start = max(pictures[0].time_ns for pictures in first) + round(step / 2)
             size = first[0][0].image.shape
-            self._spec = SourceSpec(tuple(names), size, "uint8", (), fps, start)
+            self._spec = SourceSpec(
+                tuple(names), size, str(first[0][0].image.dtype), (), fps, start
+            )
         except BaseException:
             inbox.close()
             raise
@@ -167,7 +169,7 @@ class LiveSource(ForwardSource):
         """Let go of the cameras."""
         self._inbox.close()
 
-    def _next(self) -> list[Bytes | None]:
+    def _next(self) -> list[Shown | None]:
         """What every stream shows at the next tick, waited for."""
         grid, inbox = self._grid, self._inbox
         streams = range(len(self._spec.streams))
@@ -234,10 +236,10 @@ class LiveSource(ForwardSource):
         return float(f"{NANOSECONDS / float(np.median(steps)):.3g}")
 
 
-def _stretches(stream: int, t: int, column: Sequence[Bytes | None]) -> list[Block]:
+def _stretches(stream: int, t: int, column: Sequence[Shown | None]) -> list[Block]:
     """The unbroken stretches of what a stream shows from tick t on."""
     blocks: list[Block] = []
-    run: list[Bytes] = []
+    run: list[Shown] = []
     for at, image in enumerate([*column, None]):
         if image is not None:
             run.append(image)

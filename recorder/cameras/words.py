@@ -15,9 +15,11 @@ from recorder.cameras.camera import Camera
 from recorder.cameras.framed import framed
 from recorder.cameras.live import HOLD, LiveSource
 from recorder.cameras.readers import STALL, OnLoss, Readers
+from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.frames import VIDEO_RECIPE
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import RECIPE, Depth
+from recorder.images.reading import Reading
 
 _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp")
 
@@ -34,19 +36,19 @@ class CameraKind:
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
             cannot open is a UsageError.
-        distances: whether `open` takes `depth`, too: how distances are shown, see `gray`.
+        reads: whether `open` takes `reading`, too: what is taken of what it shows.
         recipe: how what it shows becomes gray and small, for the record.
     """
 
     open: Callable[..., Camera]
-    distances: bool = False
+    reads: bool = False
     recipe: str = RECIPE
 
 
-def _foxglove(word: str, name: str, *, depth: Depth | None) -> Camera:
+def _foxglove(word: str, name: str, *, reading: Reading) -> Camera:
     from recorder.cameras.foxglove import FoxgloveCamera
 
-    return FoxgloveCamera(word, name, timeout=_TIMEOUT, depth=depth)
+    return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=reading)
 
 
 def _video(word: str, name: str) -> Camera:
@@ -58,7 +60,7 @@ def _video(word: str, name: str) -> Camera:
 CAMERAS: Registry[CameraKind] = Registry(
     "kind of camera",
     {
-        "foxglove": CameraKind(_foxglove, distances=True),
+        "foxglove": CameraKind(_foxglove, reads=True),
         **{kind: CameraKind(_video, recipe=VIDEO_RECIPE) for kind in _VIDEO},
     },
     group="cdmisfa.sources",
@@ -73,7 +75,9 @@ class LiveOptions:
     Attributes:
         size: (height, width) of a frame, or None for one from the first stream's images.
         fit: how images of another aspect ratio become frames: see `fitted`.
-        depth: distances in metres that are shown black and white; None for none.
+        depth: distances in metres that are shown black and white, and the range that numbers
+            are kept in; None for none.
+        fields: the numbers that are taken of messages instead of images; see `Field`.
         rate: frames a second; None for the first stream's.
         hold: seconds for which a picture stands for those that are missing.
         on_loss: what is done about a camera that stalls or goes away.
@@ -84,6 +88,7 @@ class LiveOptions:
     size: Size | None = None
     fit: Fit = "crop"
     depth: Depth | None = None
+    fields: tuple[str, ...] = ()
     rate: float | None = None
     hold: float = HOLD
     on_loss: OnLoss = "reconnect"
@@ -126,6 +131,8 @@ def open_live(
             raise UsageError(
                 "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
             )
+        if options.fields:
+            raise UsageError(f"{words[0]} shows images: --field is for messages, of foxglove://")
         tasks = [word.removeprefix("gym:") for word in words]
         return GymSource(
             tasks,
@@ -136,8 +143,12 @@ def open_live(
             seed=options.seed,
         )
     kinds = [CAMERAS[word.partition(":")[0].lower()] for word in words]
+    reading = Reading(options.depth, options.fields)
+    for kind, word in zip(kinds, words, strict=True):
+        if options.fields and not kind.reads:
+            raise UsageError(f"{word} shows images: --field is for messages, of foxglove://")
     opened = [
-        kind.open(word, name, depth=options.depth) if kind.distances else kind.open(word, name)
+        kind.open(word, name, reading=reading) if kind.reads else kind.open(word, name)
         for kind, word, name in zip(kinds, words, names, strict=True)
     ]
     cameras = framed(opened, options.size, options.fit, say=say)
@@ -147,6 +158,8 @@ def open_live(
         "recipe": "; ".join(dict.fromkeys(kind.recipe for kind in kinds)),
         "fit": options.fit,
     }
+    if options.fields:
+        about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
     return LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)

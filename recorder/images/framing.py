@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from recorder.images.pixels import Bytes, shrink
+from cdmisfa.core.errors import UsageError
+from recorder.images.pixels import Bytes, Shown, shrink
 
 Fit = Literal["crop", "pad", "stretch"]
 """How an image of another ratio of the sides becomes a frame: see `fitted`."""
@@ -50,6 +52,11 @@ class Framing:
         return f"images change from {before} to {now}; each is made a frame of {frame}"
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a frame."""
+        return self.size
+
+    @property
     def lossy(self) -> str:
         """What a frame lacks of an image, or has besides it; see `cut_or_added`."""
         return cut_or_added(self.first, self.size, self.fit)
@@ -60,7 +67,72 @@ class Framing:
         return ", ".join(filter(None, [_in_words(self.first), self.lossy, shown]))
 
 
-def size_of(image: Bytes) -> Size:
+@dataclass(frozen=True, slots=True)
+class Vector:
+    """How the numbers of one stream become frames: as they are.
+
+    Attributes:
+        count: how many there are in each message.
+    """
+
+    count: int
+    lossy = ""
+
+    def frame(self, numbers: Shown) -> Shown:
+        """The numbers of a message, (count,) float64.
+
+        Raises:
+            UsageError: it holds others.
+        """
+        if numbers.shape != self.shape:
+            least = min(self.count, len(numbers))
+            raise UsageError(
+                f"a message holds {len(numbers)} numbers, and the first {self.count}: choose a "
+                f"part of the field, as --field position[0:{least}]"
+            )
+        return numbers
+
+    def change(self, numbers: Shown) -> str:
+        """Nothing: see `frame`."""
+        return ""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a frame."""
+        return (self.count,)
+
+    def __str__(self) -> str:
+        """What a frame is, in words."""
+        return "a number" if self.count == 1 else f"{self.count} numbers"
+
+
+def framings(firsts: Sequence[Shown], size: Size | None, fit: Fit) -> list[Framing] | list[Vector]:
+    """How what streams show becomes frames, all of one shape.
+
+    Args:
+        firsts: what each stream shows first.
+        size: (height, width) of a frame; None for the `default_size` of the first image.
+        fit: see `fitted`.
+
+    Raises:
+        UsageError: some show images and some numbers, or not as many.
+    """
+    if all(first.ndim > 1 for first in firsts):
+        size = size or default_size(size_of(firsts[0]))
+        return [Framing(size_of(first), size, fit) for first in firsts]
+    counts = [len(first) for first in firsts if first.ndim == 1]
+    if len(counts) < len(firsts) or len(set(counts)) > 1:
+        raise UsageError(
+            "streams that are learned from together show frames of one shape, and these show "
+            + " and ".join(dict.fromkeys(_shown_in_words(first) for first in firsts))
+            + ": take as many numbers of each, as with --field position[0:6], or each apart"
+        )
+    if size is not None or fit != "crop":
+        raise UsageError("numbers are taken as they are: --size and --fit are for images")
+    return [Vector(count) for count in counts]
+
+
+def size_of(image: Shown) -> Size:
     """The size of an image, (height, width)."""
     return image.shape[0], image.shape[1]
 
@@ -108,6 +180,10 @@ def cut_or_added(image: Size, size: Size, fit: Fit) -> str:
     if (height, width) == size:
         return ""
     return f"padded from {width}x{height}" if fit == "pad" else "stretched"
+
+
+def _shown_in_words(shown: Shown) -> str:
+    return "images" if shown.ndim > 1 else str(Vector(len(shown)))
 
 
 def _in_words(size: Size) -> str:

@@ -16,6 +16,9 @@ from cdmisfa.core.untrusted.memory import BUDGET, budget
 
 Bytes = NDArray[np.uint8]
 
+Shown = NDArray[Any]
+"""What one message shows: a gray image, (height, width) uint8, or numbers, (I,) float64."""
+
 MAX_PIXELS: Final = 36_000_000
 """Largest image that is decoded, more than one of 7680x4320."""
 

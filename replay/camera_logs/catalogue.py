@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
+from recorder.images.reading import IMAGES, Reading
 from replay.camera_logs.formats.bag import bag_channels, bag_topics
 from replay.camera_logs.formats.lerobot import dataset_cameras, dataset_channels, is_dataset
 from replay.camera_logs.formats.mcap_log import mcap_topics
 from replay.camera_logs.formats.picture_folder import FolderImages
+from replay.camera_logs.formats.table import is_table, table_channels
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.opening import is_bag, is_picture_folder, is_split, is_video
 from replay.camera_logs.stream import ChannelFacts
@@ -20,8 +22,8 @@ ALL = ("*",)
 """Topics that mean every one with images."""
 
 
-def image_topics(path: Location) -> list[str]:
-    """The topics with images in a camera log.
+def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
+    """The topics of a camera log with images, or with the messages that are wanted.
 
     Raises:
         LogDamagedError: it cannot be read.
@@ -31,15 +33,15 @@ def image_topics(path: Location) -> list[str]:
         if is_dataset(path):
             return dataset_cameras(path)
         if is_bag(path):
-            return bag_topics(path)
+            return bag_topics(path, reading)
         if is_split(path):
-            parts = sorted(path.glob("*.mcap"))
-            return list(dict.fromkeys(topic for part in parts for topic in mcap_topics(part)))
+            parts = [mcap_topics(part, reading) for part in sorted(path.glob("*.mcap"))]
+            return list(dict.fromkeys(topic for part in parts for topic in part))
         if is_picture_folder(path):
             return [path.resolve().name]
-        if is_video(path):
+        if is_video(path) or is_table(path):
             return [path.stem]
-    return mcap_topics(path)
+    return mcap_topics(path, reading)
 
 
 def channels_of(path: Path) -> list[ChannelFacts]:
@@ -53,6 +55,8 @@ def channels_of(path: Path) -> list[ChannelFacts]:
         return dataset_channels(path)
     if is_bag(path):
         return bag_channels(path)
+    if is_table(path):
+        return table_channels(path)
     images = FolderImages(path, None) if path.is_dir() else VideoImages(path, None)
     try:
         ends = [int(t) for t in images.times[[0, -1]]] if len(images.times) else [None, None]
@@ -63,7 +67,7 @@ def channels_of(path: Path) -> list[ChannelFacts]:
 
 
 def named_streams(
-    files: Sequence[Location], topics: Sequence[str]
+    files: Sequence[Location], topics: Sequence[str], reading: Reading = IMAGES
 ) -> list[tuple[Location, str | None]]:
     """The log and the topic of each stream that is meant.
 
@@ -80,14 +84,14 @@ def named_streams(
         return [(file, topic) for topic in topics for file in files]
     if not patterns and len(topics) == len(files):
         return list(zip(files, topics, strict=True))
-    known = [(file, image_topics(file)) for file in files]
+    known = [(file, image_topics(file, reading)) for file in files]
     found: list[tuple[Location, str | None]] = []
     for topic in topics:
         fits = [(file, name) for file, names in known for name in names if _fits(name, topic)]
         if not fits:
             there = ", ".join(sorted({name for _, names in known for name in names})) or "none"
             where = files[0] if len(files) == 1 else f"none of the {len(files)} logs"
-            raise UsageError(f"{where}: no topic {topic}; images are on: {there}")
+            raise UsageError(f"{where}: no topic {topic}; there are: {there}")
         found += [pair for pair in fits if pair not in found]
     return found
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import UsageError
+from recorder.images.pixels import Shown
 from replay.camera_logs.alignment import Times, even_times
 from replay.camera_logs.stream import ImageStream
-from replay.mcap.records import Bytes
 from replay.storage.location import Location
 
 
@@ -20,7 +20,7 @@ class JoinedImages(ImageStream):
 
     def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
         self.path = path
-        self.recipe = parts[0].recipe
+        self.recipe, self.fields = parts[0].recipe, parts[0].fields
         self.topic = parts[0].topic
         self.warnings = [
             f"{path}: {self.topic} is joined from {len(parts)} logs, by time",
@@ -33,7 +33,7 @@ class JoinedImages(ImageStream):
         self._part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
         self._row_in = np.concatenate([np.arange(part.count) for part in parts])[order]
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> Shown:
         return self.parts[int(self._part_of[row])].image(int(self._row_in[row]))
 
     def where(self, row: int) -> str:
@@ -49,7 +49,7 @@ class Excerpt(ImageStream):
 
     def __init__(self, images: ImageStream, start: int, stop: int) -> None:
         self.path, self.topic = images.path, images.topic
-        self.recipe, self.warnings = images.recipe, images.warnings
+        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
         self.parts = getattr(images, "parts", [images])
         self.times = images.times[start:stop]
         self._images, self._start, self._length = images, start, stop - start
@@ -58,7 +58,7 @@ class Excerpt(ImageStream):
     def count(self) -> int:
         return self._length
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> Shown:
         return self._images.image(self._start + row)
 
     def where(self, row: int) -> str:

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.pixels import Depth
+from recorder.images.reading import IMAGES, Reading
 from replay.camera_logs.formats.bag import BAGS, BagImages
 from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
 from replay.camera_logs.formats.mcap_log import McapImages
 from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
+from replay.camera_logs.formats.table import TableNumbers, is_table
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages
 from replay.camera_logs.stream import ImageStream
@@ -23,32 +24,36 @@ from replay.storage.location import Location, Url, location
 
 
 def open_images(
-    path: Location, topic: str | None, *, salvage: bool = False, depth: Depth | None = None
+    path: Location, topic: str | None, *, salvage: bool = False, reading: Reading = IMAGES
 ) -> ImageStream:
-    """Open the images on a topic of a log, or in a folder.
+    """Open the images on a topic of a log, or in a folder, or numbers.
 
     Args:
-        path: an MCAP log or its URL, a ROS bag, a video or a folder of pictures.
+        path: an MCAP log or its URL, a ROS bag, a video, a table or a folder of pictures.
         topic: may be left out where there is one topic of images.
         salvage: leave out what is damaged.
-        depth: how distances are shown; see `gray`.
+        reading: what is taken of messages and tables.
 
     Raises:
-        UsageError: no such topic, or no images on it.
+        UsageError: no such topic, or not what is wanted on it.
         LogDamagedError: the log is damaged.
     """
     if isinstance(path, Path):
+        if is_table(path):
+            return TableNumbers(path, topic, reading)
+        if is_bag(path):
+            return BagImages(path, topic, reading=reading)
+        if is_split(path):
+            return _open_parts(path, topic, salvage=salvage, reading=reading)
+        if reading.fields and (path.is_dir() or is_video(path)):
+            raise UsageError(f"{path} holds images: --field is for messages and tables")
         if is_dataset(path):
             return LeRobotImages(path, topic)
-        if is_bag(path):
-            return BagImages(path, topic, depth=depth)
-        if is_split(path):
-            return _open_parts(path, topic, salvage=salvage, depth=depth)
         if path.is_dir():
             return FolderImages(path, topic)
         if is_video(path):
             return VideoImages(path, topic)
-    return McapImages(path, topic, salvage=salvage, depth=depth)
+    return McapImages(path, topic, salvage=salvage, reading=reading)
 
 
 def image_logs(paths: Sequence[str | Location]) -> list[Location]:
@@ -66,6 +71,8 @@ def only_foreign(path: Location) -> bool:
     """Whether a path can be no recording of ours, by its kind."""
     if isinstance(path, Url):
         return False
+    if is_table(path):
+        return True
     return is_video(path) or is_dataset(path) or is_bag(path) or is_picture_folder(path)
 
 
@@ -86,23 +93,21 @@ def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any
     return {"file": path.name, "sha256": whole.hexdigest()}
 
 
-def _open_parts(
-    path: Path, topic: str | None, *, salvage: bool, depth: Depth | None
-) -> ImageStream:
+def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
     """Open the images on a topic of a log in parts; a part may lack a topic that is named."""
     parts: list[ImageStream] = []
     refusal: UsageError | None = None
     try:
         for file in sorted(path.glob("*.mcap"), key=by_number):
             try:
-                parts.append(McapImages(file, topic, salvage=salvage, depth=depth))
+                parts.append(McapImages(file, topic, salvage=salvage, reading=reading))
             except UsageError as error:
                 refusal = refusal or error
         if refusal is not None and (topic is None or not parts):
             raise refusal
         topics = {part.topic for part in parts}
         if len(topics) > 1:
-            raise UsageError(f"{path}: name one --topic; it has images on: {sorted(topics)}")
+            raise UsageError(f"{path}: name one --topic; it has several: {sorted(topics)}")
     except BaseException:
         for part in parts:
             part.close()

@@ -27,7 +27,11 @@ class CameraOptions:
             reaches across, "hold" for the last image before.
         start: seconds after the first image of all, before which images are left out.
         stop: seconds after it from which on they are left out; None for never.
-        depth: distances in metres that are shown black and white; None for none.
+        depth: distances in metres that are shown black and white, and the range that numbers
+            are kept in; None for none.
+        fields: the numbers that are taken of messages or of a table instead of images, one after
+            the other; see `Field`.
+        time: the column of a table's times; see `TableNumbers`.
     """
 
     topics: tuple[str, ...] = ()
@@ -39,3 +43,5 @@ class CameraOptions:
     start: float = 0.0
     stop: float | None = None
     depth: Depth | None = None
+    fields: tuple[str, ...] = ()
+    time: str | None = None

@@ -12,8 +12,9 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.framing import Fit, Framing, Size, default_size, size_of
-from recorder.images.pixels import Depth, MalformedImage
+from recorder.images.framing import Fit, Size, framings
+from recorder.images.pixels import Depth, MalformedImage, Shown
+from recorder.images.reading import Reading
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -29,12 +30,13 @@ from replay.camera_logs.alignment import (
     with_gaps,
 )
 from replay.camera_logs.catalogue import named_streams
+from replay.camera_logs.formats.table import TableNumbers
 from replay.camera_logs.joined import excerpts, join_parts, known_times
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
 from replay.camera_logs.options import Align, Gaps
 from replay.camera_logs.stream import ImageStream
-from replay.mcap.records import Bytes, MalformedRecord
+from replay.mcap.records import MalformedRecord
 from replay.storage.location import Location, Url
 from replay.stored import Span, StoredSource, outside
 
@@ -44,11 +46,11 @@ class UnequalError(UsageError):
 
 
 class ForeignSource(StoredSource):
-    """Cameras in MCAP logs, ROS bags, videos and folders of pictures, gray and small, on one clock.
+    """What others logged, on one clock: images of cameras, gray and small, or numbers.
 
     Args:
-        paths: one log, or one log, video or folder of pictures a stream. Logs that follow one
-            another in time are parts of one stream, unless they are aligned by index.
+        paths: one log, or one log, video, table or folder of pictures a stream. Logs that follow
+            one another in time are parts of one stream, unless they are aligned by index.
         topics: the topics, a stream each, or patterns; see `named_streams`.
         size: (height, width) of a frame; by default `default_size` of the first image.
         fit: how images of another aspect ratio become frames: see `fitted`.
@@ -60,6 +62,8 @@ class ForeignSource(StoredSource):
         start: seconds after the first image of all, before which images are left out.
         stop: seconds after it from which on they are left out.
         depth: distances in metres that are shown black and white.
+        fields: the numbers that are taken instead of images, one after the other.
+        time: the column of a table's times.
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged.
@@ -88,6 +92,8 @@ class ForeignSource(StoredSource):
         start: float = 0.0,
         stop: float | None = None,
         depth: Depth | None = None,
+        fields: Sequence[str] = (),
+        time: str | None = None,
         rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
@@ -109,15 +115,16 @@ class ForeignSource(StoredSource):
         self._files = image_logs(named)
         self._loop = loop
         self._hashes: list[dict[str, Any]] | None = None
-        self._fit, self._depth = fit, depth
+        self._fit, self._reading = fit, Reading(depth, tuple(fields), time)
         self._asked_size = size
         self._goal = goal
         self._streams: list[ImageStream] = []
         self.changes: dict[int, str] = {}
-        self._shown: dict[int, tuple[int, Bytes]] = {}
+        self._shown: dict[int, tuple[int, Shown]] = {}
+        reading = self._reading
         try:
-            for path, topic in named_streams(self._files, topics):
-                self._streams.append(open_images(path, topic, salvage=salvage, depth=depth))
+            for path, topic in named_streams(self._files, topics, reading):
+                self._streams.append(open_images(path, topic, salvage=salvage, reading=reading))
             if align != "index":
                 self._streams = join_parts(self._streams)
             self._align_by = align
@@ -128,8 +135,8 @@ class ForeignSource(StoredSource):
                 self._times = known_times(self._streams, self._fps)
             start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
-            size = size or default_size(size_of(firsts[0]))
-            self._framings = [Framing(size_of(image), size, fit) for image in firsts]
+            self._framings = framings(firsts, size, fit)
+            shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
         except BaseException:
@@ -137,7 +144,7 @@ class ForeignSource(StoredSource):
             raise
         self._count = len(self._rows[0])
         names, length = stream_names(self._streams), None if loop else self._count
-        self._spec = SourceSpec(names, size, "uint8", (), self._fps, start_ns, length)
+        self._spec = SourceSpec(names, shape, dtype, (), self._fps, start_ns, length)
         self.alignment = dict(
             zip(names, map(counts, self._times, self._rows, self._gaps), strict=True)
         )
@@ -199,8 +206,13 @@ class ForeignSource(StoredSource):
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if any(framing.lossy for framing in self._framings):
             chosen["fit"] = self._fit
-        if self._depth is not None:
-            chosen["range_metres"] = list(self._depth)
+        if self._reading.depth is not None:
+            key = "range_metres" if self._spec.images else "range"
+            chosen[key] = list(self._reading.depth)
+        if not self._spec.images:
+            chosen["fields"] = [list(s.fields) for s in self._streams]
+        if self._reading.time is not None:
+            chosen["time"] = self._reading.time
         return chosen
 
     def close(self) -> None:
@@ -209,7 +221,7 @@ class ForeignSource(StoredSource):
 
     def _block(self, stream: int, t: int, n: int) -> Block:
         """The frames of a stream; an image smaller than a frame is a UsageError."""
-        frames = np.empty((n, *self._spec.frame_shape), np.uint8)
+        frames = np.empty((n, *self._spec.frame_shape), self._spec.dtype)
         rows = self._rows[stream]
         for i in range(n):
             frames[i] = self._frame(stream, int(rows[(t + i) % self._count]))
@@ -218,7 +230,7 @@ class ForeignSource(StoredSource):
     def _name(self) -> str:
         return str(self._files[0])
 
-    def _frame(self, stream: int, row: int) -> Bytes:
+    def _frame(self, stream: int, row: int) -> Shown:
         """A stream's image as a frame; decoded once where it is repeated."""
         shown = self._shown.get(stream)
         if shown is not None and shown[0] == row:
@@ -234,7 +246,7 @@ class ForeignSource(StoredSource):
         self._shown[stream] = (row, frame)
         return frame
 
-    def _image(self, stream: int, row: int) -> Bytes:
+    def _image(self, stream: int, row: int) -> Shown:
         """A stream's image as it is."""
         images = self._streams[stream]
         try:
@@ -296,6 +308,10 @@ class ForeignSource(StoredSource):
             words += ["--size", f"{self._asked_size[1]}x{self._asked_size[0]}"]
         if self._fit != "crop":
             words += ["--fit", self._fit]
+        for field in self._reading.fields:
+            words += ["--field", field]
+        if self._reading.time is not None:
+            words += ["--time", self._reading.time]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
 
@@ -304,7 +320,9 @@ def _rate(streams: Sequence[ImageStream]) -> float:
     """Images a second of the first stream that has times."""
     timed = next((s for s in streams if len(s.times)), None)
     if timed is None:
-        raise UsageError(f"{streams[0].path}: pictures tell no rate; set one with --rate")
+        named = ", or name the column of its times with --time"
+        remedy = named if isinstance(streams[0], TableNumbers) else ""
+        raise UsageError(f"{streams[0].path} tells no rate: set one with --rate{remedy}")
     step = step_of(timed.times)
     if not step > 0:
         raise UsageError(f"{timed.path}: {timed.topic} tells no rate; set one with --rate")

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
-from recorder.images.messages import SCHEMAS, Decoder, image_decoder
-from recorder.images.pixels import RECIPE, Depth
-from replay.mcap.records import Bytes
+from recorder.images.decoding import Taken, decoder_of
+from recorder.images.messages import SCHEMAS
+from recorder.images.pixels import RECIPE, Shown
+from recorder.images.reading import MessageKind, Reading
 from replay.storage.location import Location
 
 LAST_NS: Final = 2**62
@@ -48,7 +49,7 @@ class ChannelFacts:
 
 
 class ImageStream(ABC):
-    """The images of one camera, in the order of time.
+    """The images of one camera, or the numbers of one topic, in the order of time.
 
     Attributes:
         path: the log or the folder they are in.
@@ -57,6 +58,7 @@ class ImageStream(ABC):
             in which case they are `count` images at any even rate.
         encoding: how its images are stored, where they are no messages of a log.
         recipe: how an image becomes a frame, for the record.
+        fields: the numbers that are taken instead of images, in their order.
         warnings: what the user should know: what was cut or left out.
     """
 
@@ -65,6 +67,7 @@ class ImageStream(ABC):
     times: NDArray[np.uint64]
     encoding: str = ""
     recipe: str = RECIPE
+    fields: Sequence[str] = ()
     warnings: Sequence[str] = ()
 
     @property
@@ -73,8 +76,8 @@ class ImageStream(ABC):
         return len(self.times)
 
     @abstractmethod
-    def image(self, row: int) -> Bytes:
-        """Decode an image, gray and of its own size, (height, width) uint8.
+    def image(self, row: int) -> Shown:
+        """Decode an image, gray and of its own size, (height, width) uint8; or numbers.
 
         Raises:
             MalformedRecord: it is no image that is read.
@@ -96,39 +99,42 @@ class ImageStream(ABC):
 def choose_images(
     path: Location,
     topic: str | None,
-    channels: Iterable[tuple[str, str, str, Found]],
-    depth: Depth | None = None,
-) -> tuple[Found, Decoder]:
-    """Find the one channel of images that is meant, and the decoder of its messages.
+    channels: Iterable[tuple[str, MessageKind, Found]],
+    reading: Reading,
+) -> tuple[Found, Taken]:
+    """Find the one channel that is meant, of images or of fields, and its messages' decoder.
 
     Args:
         path: the log, for the error.
         topic: as the user named it, or None.
-        channels: topic, schema, encoding, and what stands for the channel.
-        depth: how distances are shown; see `gray`.
+        channels: topic, kind of the messages, and what stands for the channel.
+        reading: what is taken of them.
 
     Raises:
         UsageError: there is none, or not one.
     """
-    readable: list[tuple[str, Found, Decoder]] = []
+    readable: list[tuple[str, Found, Taken]] = []
     others: dict[str, str] = {}
-    for name, schema, encoding, channel in channels:
-        decoder = image_decoder(schema, encoding, depth)
+    for name, kind, channel in channels:
+        decoder = decoder_of(kind, reading)
         if decoder is None:
-            others[name] = f"{schema} in {encoding or 'no encoding'}"
+            others[name] = f"{kind.schema} in {kind.encoding or 'no encoding'}"
         else:
             readable.append((name, channel, decoder))
     found = [(channel, decoder) for name, channel, decoder in readable if topic in (None, name)]
     if len(found) == 1:
         return found[0]
     known = ", ".join(sorted({name for name, _, _ in readable})) or "none"
+    what = "messages with fields" if reading.fields else "images"
     if topic is None:
-        raise UsageError(f"{path}: name one --topic; it has images on: {known}")
+        raise UsageError(f"{path}: name one --topic; it has {what} on: {known}")
     if len(found) > 1:
         raise UsageError(f"{path}: {len(found)} channels share the topic {topic}")
+    if topic in others and reading.fields:
+        raise UsageError(f"{path}: {topic} holds {others[topic]}, whose fields are not known")
     if topic in others:
         raise UsageError(f"{path}: {topic} holds {others[topic]}, images are {', '.join(SCHEMAS)}")
-    raise UsageError(f"{path}: no topic {topic}; it has images on: {known}")
+    raise UsageError(f"{path}: no topic {topic}; it has {what} on: {known}")
 
 
 def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) -> NDArray[np.uint64]:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.log.whole import refuse_special, whole
+from replay.camera_logs.options import CameraOptions
 from replay.export.images import write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
@@ -69,7 +70,7 @@ def export(
     *,
     force: bool = False,
     lossless: bool = False,
-    rate: float | None = None,
+    cameras: CameraOptions | None = None,
 ) -> int:
     """Write a run's signals, or a recording's frames, in another form.
 
@@ -79,7 +80,7 @@ def export(
         form: one of `FORMS`; see `export_signals`.
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
-        rate: frames a second of camera logs; by default the first stream's.
+        cameras: which streams of camera logs; by default all of images.
 
     Returns:
         The number of iterations, or of images or frames, written.
@@ -101,7 +102,7 @@ def export(
     refuse_special(out)
     paths = [path] if isinstance(path, Path) else list(path)
     if described.of == "recording":
-        return _export_recording(paths, out, form, lossless, rate)
+        return _export_recording(paths, out, form, lossless, cameras)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
     if len(paths) > 1:
@@ -113,12 +114,12 @@ def export(
 
 
 def _export_recording(
-    paths: list[Path], out: Path, form: str, lossless: bool, rate: float | None
+    paths: list[Path], out: Path, form: str, lossless: bool, cameras: CameraOptions | None
 ) -> int:
     path = paths[0]
     if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
-    with contextlib.closing(open_to_look(paths, rate)) as source:
+    with contextlib.closing(open_to_look(paths, cameras)) as source:
         if form in ("images", "mp4") and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
@@ -56,9 +57,11 @@ def open_log(
 
 
 def open_to_look(
-    paths: Sequence[Location], rate: float | None = None, *, salvage: bool = False
+    paths: Sequence[Location], cameras: CameraOptions | None = None, *, salvage: bool = False
 ) -> Logged:
     """Open what `open_log` does, with every topic of images; those that differ by their times.
+
+    What `cameras` choose is opened as they say.
 
     Raises:
         UsageError: as for `open_log`.
@@ -66,15 +69,18 @@ def open_to_look(
     """
     for path in paths:
         refuse_what_is_no_log(path)
-    if not any(map(only_foreign, paths)):
+    cameras = cameras or CameraOptions()
+    chosen = bool(cameras.topics or cameras.fields)
+    if not chosen and not any(map(only_foreign, paths)):
         with contextlib.suppress(NoRecordingError):
             return RecordedSource(paths, salvage=salvage)
     goal = ("convert", "REC")
+    if not chosen:
+        cameras = replace(cameras, topics=ALL)
     try:
-        return open_cameras(paths, CameraOptions(ALL, rate=rate), salvage=salvage, goal=goal)
+        return open_cameras(paths, cameras, salvage=salvage, goal=goal)
     except UnequalError:
-        options = CameraOptions(ALL, align="time", rate=rate)
-        return open_cameras(paths, options, salvage=salvage, goal=goal)
+        return open_cameras(paths, replace(cameras, align="time"), salvage=salvage, goal=goal)
 
 
 def open_cameras(
@@ -96,6 +102,8 @@ def open_cameras(
         start=cameras.start,
         stop=cameras.stop,
         depth=cameras.depth,
+        fields=cameras.fields,
+        time=cameras.time,
         rate=cameras.rate,
         loop=loop,
         salvage=salvage,

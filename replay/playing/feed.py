@@ -21,6 +21,7 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
+from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
 from replay.mcap.identity import starts_as_log
 from replay.mcap.reader import LogReader
@@ -88,7 +89,7 @@ def opened_source(paths: Sequence[Path], fps: float | None) -> Iterator[Logged]:
         LogDamagedError: it is damaged.
     """
     try:
-        source = open_to_look(paths, fps)
+        source = open_to_look(paths, CameraOptions(rate=fps))
     except UsageError as error:  # where --rate is how fast it is played
         raise UsageError(str(error).replace("--rate", "--fps")) from None
     with contextlib.closing(source):

@@ -15,6 +15,7 @@ from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, whole
+from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import holds_run
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_header
@@ -43,7 +44,7 @@ def build_view(
     all_views: Path | None = None,
     tab: str | None = None,
     beside: Sequence[Path] = (),
-    rate: float | None = None,
+    cameras: CameraOptions | None = None,
     body: bool = True,
 ) -> None:
     """Write the view of a run, a recording or camera logs as an .rrd file, whole or not at all.
@@ -56,7 +57,7 @@ def build_view(
         all_views: the recording that the run learned from, to show what was not watched too.
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
-        rate: frames a second of camera logs; by default the first stream's.
+        cameras: which streams of camera logs; by default all of images.
         body: show the robot's, where there is one.
 
     Raises:
@@ -79,7 +80,7 @@ def build_view(
         raise UsageError(f"{path} is a recording: all of its views are shown anyway")
     else:
         with recording_to(out, path.resolve().stem, path, force=force) as recording:
-            write_recording(recording, [path, *beside], every, tab, rate)
+            write_recording(recording, [path, *beside], every, tab, cameras)
 
 
 @contextlib.contextmanager

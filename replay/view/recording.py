@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
+from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
@@ -35,7 +36,7 @@ def write_recording(
     paths: Sequence[Path],
     every: int,
     tab: str | None = None,
-    rate: float | None = None,
+    cameras: CameraOptions | None = None,
 ) -> None:
     """Write a recording's views and ground truth, and the layout for them.
 
@@ -44,13 +45,13 @@ def write_recording(
         paths: the recording's folder, or files of its views; or camera logs of others.
         every: show images of every this many frames; values are all shown.
         tab: name of the tab that is open.
-        rate: frames a second of camera logs; by default the first stream's.
+        cameras: which streams of camera logs; by default all of images.
 
     Raises:
         UsageError: there is no such recording or tab.
         LogDamagedError: it cannot be read.
     """
-    with contextlib.closing(open_to_look(paths, rate)) as source:
+    with contextlib.closing(open_to_look(paths, cameras)) as source:
         first, count, spec = source.t, source.frames, source.spec
         ours = isinstance(source, RecordedSource)
         scenery = world_of_recording(paths[0]) if ours else None

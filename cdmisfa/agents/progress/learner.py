@@ -43,7 +43,7 @@ from cdmisfa.agents.progress.streams import (
 )
 from cdmisfa.core.arithmetic.choice import in_own_arithmetic
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
-from cdmisfa.core.expansion import expand
+from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
@@ -51,9 +51,6 @@ from cdmisfa.features.projection import mean_output, outputs
 from cdmisfa.features.slowness import instantaneous_slowness
 
 Float = NDArray[np.float64]
-
-FEW_VALUES = 32
-"""Frames of at most so many values are expanded quadratically where nothing else is said."""
 
 FEWEST_BLOCKS = 20
 """Of a window of tests, however long a block is."""
@@ -81,7 +78,8 @@ class ProgressLearner:
         self.config, self.spec = config, spec
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
-        few = math.prod(spec.frame_shape) <= FEW_VALUES
+        # Products beyond the components that are whitened would drive out what is slow.
+        few = expanded_size("quadratic", math.prod(spec.frame_shape)) <= config.components
         self._expansion = config.expansion or ("quadratic" if few else "none")
         self._n_inputs = count_inputs(self._expansion, spec)
         self._n_outputs = min(config.outputs, self._n_inputs)

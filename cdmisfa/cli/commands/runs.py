@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import rate_option
+from cdmisfa.cli.cameras import look_options
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.experiments.documents import markdown
 
@@ -113,7 +113,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 )
 @uploads.out("The file to write, for a recording the folder, or s3://...", required=True)
 @click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
-@rate_option
+@look_options
 @options.server_limits
 @options.force
 @options.as_json
@@ -122,24 +122,25 @@ def export_command(
     form: str | None,
     out: Path,
     lossless: bool,
-    rate: float | None,
     force: bool,
     as_json: bool,
+    **cameras: Any,
 ) -> None:
     """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
 
     Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
     outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
-    camera logs of others, several at once, too.
+    camera logs of others, several at once, too, and numbers in them with --field.
     """
+    from replay.camera_logs.options import CameraOptions
     from replay.export.forms import FORMS, export
     from replay.export.tables import CSV_LEAVES_OUT
 
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, force=force, lossless=lossless, rate=rate)
+    rows = export(path, out, form, force=force, lossless=lossless, cameras=CameraOptions(**cameras))
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)

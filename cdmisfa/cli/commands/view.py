@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import rate_option, tell
+from cdmisfa.cli.cameras import look_options, tell
 from cdmisfa.cli.commands.learn import announce
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
@@ -46,7 +46,7 @@ from cdmisfa.core.errors import UsageError
     help="Also show what was not watched, from the recording that the run learned from.",
 )
 @click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
-@rate_option
+@look_options
 @options.server_limits
 @options.force
 def view_command(
@@ -55,6 +55,9 @@ def view_command(
     web: bool,
     screenshot: Path | None,
     at: str | None,
+    topics: tuple[str, ...],
+    fields: tuple[str, ...],
+    time: str | None,
     rate: float | None,
     size: str | None,
     port: int | None,
@@ -74,10 +77,12 @@ def view_command(
         raise click.UsageError("--at goes with --screenshot")
     if size is not None and (web or save is not None):
         raise click.UsageError("--size goes with a window or --screenshot")
+    from replay.camera_logs.options import CameraOptions
     from replay.runs.folders import is_sweep, runs_in
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)
+    cameras = CameraOptions(topics, rate=rate, fields=fields, time=time)
     path, *beside = run
     if not beside and runs_in(path):
         if save is not None:
@@ -97,14 +102,14 @@ def view_command(
     from replay.viewer.window import open_window, serve
 
     if save is not None:
-        build_view(path, save, force=force, beside=beside, rate=rate, **shown)
+        build_view(path, save, force=force, beside=beside, cameras=cameras, **shown)
         click.echo(f"view {save}", err=True)
         return
     with contextlib.ExitStack() as until_seen:
-        if beside or rate is not None:
+        if beside or cameras != CameraOptions():
             folder = until_seen.enter_context(tempfile.TemporaryDirectory(prefix="cdmisfa-view-"))
             built = Path(folder) / f"{path.resolve().stem}.rrd"
-            build_view(path, built, beside=beside, rate=rate, **shown)
+            build_view(path, built, beside=beside, cameras=cameras, **shown)
             path, shown = built, {}
         if screenshot is not None:
             draw(path, screenshot, at=at, force=force, window=size or WINDOW, **shown)

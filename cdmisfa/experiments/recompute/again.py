@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,7 +21,7 @@ from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_keyframe
 
-CAMERAS = ("topics", "size", "fit", "align", "rate", "gaps", "start", "stop", "depth")
+CAMERAS = tuple(field.name for field in fields(CameraOptions))
 """Options of a command that say how images of others become frames."""
 
 

@@ -1,4 +1,4 @@
-"""Each kind of file that holds images as a stream of them."""
+"""Each kind of file that holds images or numbers as a stream of them."""
 
 from cdmisfa.core.faces import face
 
@@ -9,6 +9,7 @@ __getattr__, __dir__, __all__ = face(
         "replay.camera_logs.formats.lerobot": "LeRobotImages",
         "replay.camera_logs.formats.mcap_log": "McapImages",
         "replay.camera_logs.formats.picture_folder": "FolderImages",
+        "replay.camera_logs.formats.table": "TableNumbers",
         "replay.camera_logs.formats.video": "VideoImages",
     },
 )

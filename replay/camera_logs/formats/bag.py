@@ -1,10 +1,10 @@
-"""ROS bags: the images of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags."""
+"""ROS bags: the images, or numbers, of a rosbag2 (.db3) or of a ROS 1 .bag, through rosbags."""
 
 from __future__ import annotations
 
 import bz2
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -13,8 +13,10 @@ import lz4.frame
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from recorder.images.messages import Decoder, image_decoder
-from recorder.images.pixels import Depth
+from recorder.images.decoding import Taken, decoder_of
+from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.pixels import Shown
+from recorder.images.reading import IMAGES, MessageKind, Reading
 from replay.camera_logs.formats.bag_folder import plain_bag, unpacked_message
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -23,13 +25,13 @@ from replay.camera_logs.stream import (
     explained,
     sorted_times,
 )
-from replay.mcap.records import MAX_CHUNK, Bytes
+from replay.mcap.records import MAX_CHUNK
 
 BAGS: Final = (".bag", ".db3")
 
 
 class BagImages(ImageStream):
-    """The images on one topic of a .bag, a .db3 or a rosbag2's folder, by its time stamps.
+    """The images, or the numbers, on a topic of a .bag, .db3 or rosbag2's folder, by stamps.
 
     Raises:
         CdmisfaError: the package rosbags is missing.
@@ -37,15 +39,17 @@ class BagImages(ImageStream):
         LogDamagedError: rosbags cannot read it.
     """
 
-    def __init__(self, path: Path, topic: str | None, *, depth: Depth | None = None) -> None:
+    def __init__(self, path: Path, topic: str | None, *, reading: Reading = IMAGES) -> None:
         self.path = path
+        if reading.fields:
+            self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self._messages: Iterator[tuple[int, bytes]] = iter(())
         self._next = -1
         self._ros1 = _is_ros1(path)
         self._opened = contextlib.ExitStack()
         try:
             self._reader, self._packed = self._opened.enter_context(_opened(path))
-            self._connections, self._decode = self._find(topic, depth)
+            self._connections, self._decode = self._find(topic, reading)
             self.topic = str(self._connections[0].topic)
             with explained(path, "rosbags"):
                 stamps = [stamp for stamp, _ in self._from(None)]
@@ -57,7 +61,7 @@ class BagImages(ImageStream):
             raise
         self.warnings = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> Shown:
         with explained(self.path, "rosbags"):
             if row != self._next:
                 self._messages = self._from(int(self.times[row]))
@@ -85,10 +89,10 @@ class BagImages(ImageStream):
             before = stamp
             yield stamp, data
 
-    def _find(self, topic: str | None, depth: Depth | None) -> tuple[list[Any], Decoder]:
-        kinds, encoding = _kinds(self._reader, ros1=self._ros1)
-        channels = [(name, kind, encoding, name) for name, kind in kinds.items()]
-        chosen, decode = choose_images(self.path, topic, channels, depth)
+    def _find(self, topic: str | None, reading: Reading) -> tuple[list[Any], Taken]:
+        kinds = _kinds(self._reader, ros1=self._ros1)
+        channels = [(name, kind, name) for name, kind in kinds.items()]
+        chosen, decode = choose_images(self.path, topic, channels, reading)
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 
@@ -100,7 +104,7 @@ def bag_channels(path: Path) -> list[ChannelFacts]:
         LogDamagedError: rosbags cannot read it.
     """
     with _opened(path) as (reader, _):
-        kinds, encoding = _kinds(reader, ros1=_is_ros1(path))
+        kinds = _kinds(reader, ros1=_is_ros1(path))
         stamps: dict[str, list[int]] = {name: [] for name in kinds}
         with explained(path, "rosbags"):
             for connection, stamp, _ in reader.messages():
@@ -108,37 +112,39 @@ def bag_channels(path: Path) -> list[ChannelFacts]:
     return [
         ChannelFacts(
             name,
-            encoding,
-            kind,
+            kind.encoding,
+            kind.schema,
             len(stamps[name]),
             min(stamps[name], default=None),
             max(stamps[name], default=None),
-            image_decoder(kind, encoding) is not None,
+            decoder_of(kind, IMAGES) is not None,
         )
         for name, kind in kinds.items()
     ]
 
 
-def bag_topics(path: Path) -> list[str]:
-    """The topics of images in a bag; raises as `bag_channels` does."""
+def bag_topics(path: Path, reading: Reading = IMAGES) -> list[str]:
+    """The topics of a bag with what is wanted; raises as `bag_channels` does."""
     with _opened(path) as (reader, _):
-        kinds, encoding = _kinds(reader, ros1=_is_ros1(path))
-    return [name for name, kind in kinds.items() if image_decoder(kind, encoding)]
+        kinds = _kinds(reader, ros1=_is_ros1(path))
+    return [name for name, kind in kinds.items() if decoder_of(kind, reading) is not None]
 
 
 def _is_ros1(path: Path) -> bool:
     return path.suffix == ".bag" and path.is_file()
 
 
-def _kinds(reader: Any, *, ros1: bool) -> tuple[dict[str, str], str]:
-    """The type of each topic's messages, and how all are encoded.
+def _kinds(reader: Any, *, ros1: bool) -> Mapping[str, MessageKind]:
+    """The kind of each topic's messages; several publishers of ROS 1 are several connections."""
+    return {str(c.topic): _kind(c, ros1=ros1) for c in reader.connections}
 
-    Several publishers of ROS 1 are several connections.
-    """
-    kinds = {str(c.topic): str(c.msgtype) for c in reader.connections}
-    if not ros1:
-        return kinds, "cdr"
-    return {name: kind.replace("/msg/", "/") for name, kind in kinds.items()}, "ros1"
+
+def _kind(connection: Any, *, ros1: bool) -> MessageKind:
+    name, definition = str(connection.msgtype), str(connection.msgdef.data).encode()
+    if ros1:
+        return MessageKind(name.replace("/msg/", "/"), "ros1", definition, "ros1msg")
+    language = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg"
+    return MessageKind(name, "cdr", definition, language)
 
 
 @contextlib.contextmanager

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.messages import image_decoder
-from recorder.images.pixels import Depth
+from recorder.images.decoding import decoder_of
+from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.pixels import Shown
+from recorder.images.reading import IMAGES, MessageKind, Reading
 from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
 from replay.mcap.reader import LogReader
-from replay.mcap.records import Bytes, MalformedRecord
+from replay.mcap.records import Channel, MalformedRecord
 from replay.mcap.segments import Segment
 from replay.storage.location import Location
 
@@ -22,10 +24,10 @@ CACHE_BYTES: Final = 1024 * 1024
 
 
 class McapImages(ImageStream):
-    """The images on one topic of one log, in the order of log time.
+    """The images, or the numbers, on one topic of one log, in the order of log time.
 
     Raises:
-        UsageError: no such topic, or no images on it.
+        UsageError: no such topic, or not what is wanted on it.
         LogDamagedError: the log is damaged.
     """
 
@@ -35,17 +37,15 @@ class McapImages(ImageStream):
         topic: str | None,
         *,
         salvage: bool = False,
-        depth: Depth | None = None,
+        reading: Reading = IMAGES,
     ) -> None:
         self.path = path
+        if reading.fields:
+            self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
         try:
-            kinds = {number: schema.name for number, schema in self.reader.schemas.items()}
-            channels = [
-                (c.topic, kinds.get(c.schema_id, "no schema"), c.encoding, c)
-                for c in self.reader.channels.values()
-            ]
-            self._channel, self._decode = choose_images(path, topic, channels, depth)
+            channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
+            self._channel, self._decode = choose_images(path, topic, channels, reading)
             self.topic = self._channel.topic
             self._index()
         except BaseException:
@@ -53,7 +53,7 @@ class McapImages(ImageStream):
             raise
         self.warnings = self.reader.warnings
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> Shown:
         table = self.reader.table(self._segments[int(self._segment_of[row])])
         if table is None:
             raise MalformedRecord("it is damaged")
@@ -112,17 +112,20 @@ class McapImages(ImageStream):
             yield segment, pairs[:, 0], np.arange(len(pairs))
 
 
-def mcap_topics(path: Location) -> list[str]:
-    """The topics of images in an MCAP log.
+def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
+    """The topics of an MCAP log with what is wanted.
 
     Raises:
         LogDamagedError: it is no MCAP file.
     """
     with LogReader(path, salvage=True) as reader:
-        kinds = {number: schema.name for number, schema in reader.schemas.items()}
         channels = reader.channels.values()
-        return list(
-            dict.fromkeys(
-                c.topic for c in channels if image_decoder(kinds.get(c.schema_id, ""), c.encoding)
-            )
-        )
+        found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)
+        return list(dict.fromkeys(found))
+
+
+def _kind(reader: LogReader, channel: Channel) -> MessageKind:
+    schema = reader.schemas.get(channel.schema_id)
+    if schema is None:
+        return MessageKind("no schema", channel.encoding)
+    return MessageKind(schema.name, channel.encoding, schema.data, schema.encoding)

@@ -1,0 +1,159 @@
+"""Numbers within a message: named by a path, and taken out as a vector."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+from recorder.images.pixels import Depth, MalformedImage
+
+Numbers = NDArray[np.float64]
+
+NUMBERS_RECIPE: Final = "numbers as they are, float64"
+"""How numbers become a frame, for the record."""
+
+MOST: Final = 100_000
+"""Most numbers that a message may give."""
+
+_STEP: Final = re.compile(r"\.?([^.\[\]]+)|\[(\d{1,9})\]|\[(\d{0,9}):(\d{0,9})\]")
+
+_Step = str | int | slice
+
+
+class Field:
+    """Where numbers stand in a message: `position`, `pose.position.x`, `ranges[0:100]`, `p[2].x`.
+
+    What follows a list or a part of one is taken of each of its members.
+
+    Raises:
+        UsageError: it is no such path.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self._steps: list[_Step] = []
+        at = 0
+        while at < len(path):
+            found = _STEP.match(path, at)
+            if found is None or (at == 0) != (path[at] not in ".["):
+                raise UsageError(
+                    f"--field {path} is no field: write names with dots, an index or a part of "
+                    "it, as pose.position.x or ranges[0:100]"
+                )
+            name, index, start, stop = found.groups()
+            if name is not None:
+                self._steps.append(name)
+            elif index is not None:
+                self._steps.append(int(index))
+            else:
+                self._steps.append(slice(int(start or 0), int(stop) if stop else None))
+            at = found.end()
+        if not self._steps:
+            raise UsageError("--field is empty: name a field of the messages")
+
+    @property
+    def first(self) -> str:
+        """The name that it begins with."""
+        return str(self._steps[0])
+
+    def numbers(self, message: Any) -> list[float]:
+        """What stands there in a message.
+
+        Raises:
+            UsageError: there is no such field, or what is there is no number.
+        """
+        found: list[float] = []
+        _collect(self._value(message, self._steps), self.path, found)
+        return found
+
+    def _value(self, value: Any, steps: Sequence[_Step]) -> Any:
+        for place, step in enumerate(steps):
+            if isinstance(step, str) and _is_list(value):
+                return [self._value(member, steps[place:]) for member in value]
+            value = self._member(value, step)
+        return value
+
+    def _member(self, value: Any, step: _Step) -> Any:
+        if isinstance(step, str):
+            names = members(value)
+            if step not in names:
+                there = f"it has {', '.join(names)}" if names else "it is no message"
+                raise UsageError(f"--field {self.path}: there is no {step}, {there}")
+            return value[step] if isinstance(value, Mapping) else getattr(value, step)
+        if not _is_list(value):
+            raise UsageError(f"--field {self.path}: what the index is of is no list")
+        if isinstance(step, int) and step >= len(value):
+            raise UsageError(f"--field {self.path}: there are {len(value)} members only")
+        return value[step]
+
+
+def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> Numbers:
+    """The numbers of all fields of a message, one after the other, (I,) float64.
+
+    Args:
+        fields: where they stand.
+        message: decoded.
+        bounds: what they are kept in; what is no finite number becomes the first of them.
+
+    Raises:
+        UsageError: a field is not there, or is no number.
+        MalformedImage: one is not finite, and there are no bounds.
+    """
+    found: list[float] = []
+    for field in fields:
+        try:
+            own = field.numbers(message)
+        except (OverflowError, RecursionError):
+            raise MalformedImage(f"--field {field.path} is of no size that is read") from None
+        if bounds is None and not np.isfinite(own).all():
+            place = int(np.flatnonzero(~np.isfinite(own))[0])
+            raise MalformedImage(
+                f"--field {field.path} holds {own[place]} at place {place}, which is no finite "
+                "number: leave it out, or keep numbers in a range, as --range 0.1:10"
+            )
+        found += own
+    if not 0 < len(found) <= MOST:
+        raise UsageError(f"its fields hold {len(found)} numbers: choose from 1 to {MOST}")
+    return bounded(np.array(found, np.float64), bounds)
+
+
+def bounded(numbers: Numbers, bounds: Depth | None) -> Numbers:
+    """Numbers within bounds; those that are not finite become the first of them."""
+    if bounds is None:
+        return numbers
+    return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
+
+
+def members(value: Any) -> list[str]:
+    """The names of a message's fields, of whatever library it is; none of what is no message."""
+    if isinstance(value, Mapping):
+        return [str(name) for name in value]
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    if descriptor is not None:
+        return [field.name for field in descriptor.fields]
+    return [n for n in getattr(value, "__dataclass_fields__", ()) if not n.startswith("__")]
+
+
+def _is_list(value: Any) -> bool:
+    if isinstance(value, str | bytes | Mapping):
+        return False
+    return isinstance(value, np.ndarray) or hasattr(value, "__getitem__")
+
+
+def _collect(value: Any, path: str, found: list[float]) -> None:
+    if isinstance(value, bool | int | float | np.generic):
+        found.append(float(value))
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        found += value.astype(np.float64).reshape(-1).tolist()
+    elif _is_list(value):
+        for member in value:
+            _collect(member, path, found)
+    else:
+        names = members(value)
+        name = f"one of its fields: {', '.join(names)}" if names else "another"
+        raise UsageError(f"--field {path} is no number but {type(value).__name__}: name {name}")

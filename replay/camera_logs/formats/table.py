@@ -1,0 +1,211 @@
+"""Tables of numbers, CSV or Parquet, as a stream: a row is what an image is elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.untrusted.regular import check_regular
+from recorder.images.fields import NUMBERS_RECIPE, Field, bounded
+from recorder.images.pixels import Shown
+from recorder.images.reading import IMAGES, Reading
+from replay.camera_logs.stream import LAST_NS, ChannelFacts, ImageStream, explained, sorted_times
+
+TABLES: Final = (".csv", ".parquet")
+
+MAX_BYTES: Final = 1024**3
+"""Largest file that is read as a table, which is held in memory."""
+
+UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
+"""What a column of times may count, in nanoseconds."""
+
+
+class TableNumbers(ImageStream):
+    """The numbers in the rows of a table, in the order of time.
+
+    The columns are those that `reading` names, or all of numbers but that of the times; a column
+    of lists or of structures is a message, with the fields that `Field` names. Times stand in the
+    column `reading.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`.
+    Without it the rows are at an even rate.
+
+    Rows without a number or a time are left out.
+
+    Raises:
+        UsageError: no such column, or no numbers in it.
+        LogDamagedError: it is no table.
+    """
+
+    recipe = NUMBERS_RECIPE
+
+    def __init__(self, path: Path, topic: str | None, reading: Reading = IMAGES) -> None:
+        self.path, self.topic = path, path.stem
+        self.encoding = path.suffix[1:]
+        if topic not in (None, self.topic):
+            raise UsageError(f"{path}: a table has no topics, leave {topic} out; see --field")
+        table = _table(path)
+        times, of_times = _times(path, table, reading.time)
+        numeric = [n for n in table.column_names if _is_numeric(table[n]) and n != of_times]
+        names = reading.fields or numeric
+        if not names:
+            raise UsageError(f"{path}: it has no column of numbers")
+        with explained(path, "PyArrow"):
+            columns = [_column(path, table, name) for name in names]
+        numbers = bounded(np.concatenate(columns, axis=1), reading.depth)
+        whole = np.all(np.isfinite(numbers), axis=1)
+        if times is None:
+            if not whole.all():
+                raise UsageError(
+                    f"{path}: row {int(np.argmin(whole))} lacks a number: name the column of its "
+                    "times with --time, so that it can be left out, or keep numbers in a range"
+                )
+            times = np.empty(0, np.int64)
+        else:
+            whole &= times >= 0
+            times = times[whole]
+        self._places = np.flatnonzero(whole)
+        self._numbers = numbers[whole]
+        self.fields = tuple(names)
+        if not len(self._numbers):
+            raise UsageError(f"{path}: there is no row with all of {', '.join(names)}")
+        if len(times):
+            order = np.argsort(times, kind="stable")
+            self.times = sorted_times(str(path), times[order].astype(np.uint64))
+            self._numbers, self._places = self._numbers[order], self._places[order]
+        else:
+            self.times = np.empty(0, np.uint64)
+        left = len(whole) - len(self._numbers)
+        if left:
+            rows = "a row that lacks a number or its time is"
+            many = f"{left} of {len(whole)} rows lack a number or their time and are"
+            self.warnings = [f"{path}: {rows if left == 1 else many} left out"]
+
+    @property
+    def count(self) -> int:
+        return len(self._numbers)
+
+    def image(self, row: int) -> Shown:
+        shown: Shown = self._numbers[row]
+        return shown
+
+    def where(self, row: int) -> str:
+        return f"{self.path}: row {self._places[row]}"
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file is a table, by its name."""
+    return path.suffix.lower() in TABLES and path.is_file()
+
+
+def table_channels(path: Path) -> list[ChannelFacts]:
+    """What is in each column of a table; raises as `TableNumbers`."""
+    table, kind = _table(path), path.suffix[1:]
+    return [
+        ChannelFacts(n, kind, str(c.type), len(c) - c.null_count, None, None, images=False)
+        for n, c in zip(table.column_names, table.columns, strict=True)
+    ]
+
+
+def _table(path: Path) -> Any:
+    check_regular(path, MAX_BYTES)
+    with explained(path, "PyArrow"):
+        if path.suffix.lower() == ".csv":
+            import pyarrow.csv
+
+            table = pyarrow.csv.read_csv(path)
+        else:
+            import pyarrow.parquet
+
+            table = pyarrow.parquet.ParquetFile(path).read()
+        twice = [n for n in table.column_names if table.column_names.count(n) > 1]
+        if twice:
+            raise LogDamagedError(f"{path}: two columns are called {twice[0]!r}")
+        return table
+
+
+def _is_numeric(column: Any) -> bool:
+    import pyarrow.types as kinds
+
+    kind = column.type
+    return bool(kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind))
+
+
+def _column(path: Path, table: Any, name: str) -> NDArray[np.float64]:
+    """The numbers of a field in each row, (n, I) float64; NaN where there is none.
+
+    Raises:
+        UsageError: there is none in the table, or no number in it.
+    """
+    if name in table.column_names and _is_numeric(table[name]):
+        return _floats(table[name])[:, None]
+    field = Field(name)
+    first = next((n for n in (name, field.first) if n in table.column_names), None)
+    if first is None:
+        there = ", ".join(table.column_names[:20])
+        raise UsageError(f"{path}: there is no column {name}; it has {there}")
+    if first == name:  # whatever its name is made of
+        field = Field("column")
+    rows = [None if v is None else {field.first: v} for v in table[first].to_pylist()]
+    found = [None if row is None else field.numbers(row) for row in rows]
+    size = next((len(own) for own in found if own is not None), 1)
+    for place, own in enumerate(found):
+        if own is not None and len(own) != size:
+            raise UsageError(
+                f"{path}: {name} holds {size} numbers, and {len(own)} in row {place}: choose a "
+                f"part of it, as --field {field.first}[0:{min(len(own), size)}]"
+            )
+    return np.array([[np.nan] * size if own is None else own for own in found], np.float64)
+
+
+def _floats(column: Any) -> NDArray[np.float64]:
+    import pyarrow
+
+    found: NDArray[np.float64] = column.cast(pyarrow.float64(), safe=False).to_numpy()
+    return found
+
+
+def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64] | None, str]:
+    """When each row was, nanoseconds, -1 where nobody knows; and the name of the column."""
+    if named is None:
+        return None, ""
+    name, unit = named, "s"
+    if name not in table.column_names:
+        name, _, unit = named.rpartition(":")
+    if name not in table.column_names or unit not in UNITS:
+        there = ", ".join(table.column_names[:20])
+        raise UsageError(
+            f"{path}: there is no column {named}; it has {there}. A unit is one of "
+            f"{', '.join(UNITS)}, as --time COLUMN:ns"
+        )
+    import pyarrow
+    import pyarrow.types as kinds
+
+    column = table[name]
+    if kinds.is_timestamp(column.type):
+        with explained(path, "PyArrow"):
+            whole = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64())
+        scale = 1
+    elif _is_numeric(column):
+        whole, scale = column, UNITS[unit]
+    else:
+        raise UsageError(f"{path}: {name} holds {column.type}, neither dates nor numbers")
+    rough = _floats(whole) * scale
+    known = np.isfinite(rough)
+    if (np.abs(rough[known]) >= LAST_NS).any():
+        raise UsageError(
+            f"{path}: {name} holds times beyond any clock, counted in {unit}: say what they count, "
+            f"as --time {name}:ns"
+        )
+    if not known.any() or (rough[known] < 0).any():
+        raise UsageError(f"{path}: {name} holds no times, or some before 1970: name another column")
+    if kinds.is_floating(whole.type):
+        exact = np.round(np.where(known, rough, -1.0)).astype(np.int64)
+    else:
+        exact = whole.cast(pyarrow.int64(), safe=False).fill_null(-1).to_numpy() * np.int64(scale)
+    return np.where(known, exact, -1), name

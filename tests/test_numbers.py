@@ -1,0 +1,399 @@
+"""Numbers in messages and tables become streams, and are learned from."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from mcap.writer import Writer
+
+from cdmisfa.core.blocks import SeekableSource
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.testing.sources import SourceContract
+from recorder.images.decoding import message_decoder
+from recorder.images.fields import Field, numbers_of
+from recorder.images.reading import MessageKind
+from recorder.log.messages import descriptor_set
+from replay.camera_logs.source import ForeignSource
+from replay.recordings.source import RecordedSource
+
+COUNT = 90
+STEP = 20_000_000
+START = 10**18
+JOINTS = 3
+
+NESTED = {
+    "position": [1.0, 2.0, 3.0],
+    "on": True,
+    "pose": {"position": {"x": 4, "y": 5.5}},
+    "points": [{"x": 1, "y": 2}, {"x": 3, "y": 4}, {"x": 5, "y": 6}],
+    "grid": [[1, 2], [3, 4]],
+    "name": "arm",
+}
+
+
+@pytest.mark.parametrize(
+    ("path", "found"),
+    [
+        ("position", [1, 2, 3]),
+        ("position[1]", [2]),
+        ("position[0:2]", [1, 2]),
+        ("position[1:]", [2, 3]),
+        ("pose.position.y", [5.5]),
+        ("points[2].x", [5]),
+        ("points[0:2].y", [2, 4]),
+        ("points.x", [1, 3, 5]),
+        ("grid", [1, 2, 3, 4]),
+        ("grid[1][0]", [3]),
+        ("on", [1]),
+    ],
+)
+def test_a_field_names_numbers(path: str, found: list[float]) -> None:
+    assert Field(path).numbers(NESTED) == found
+
+
+@pytest.mark.parametrize(
+    ("path", "why"),
+    [
+        ("velocity", "there is no velocity, it has position, on, pose"),
+        ("pose.position.z", "there is no z, it has x, y"),
+        ("pose", "is no number but dict: name one of its fields: position"),
+        ("name", "is no number but str: name another"),
+        ("position[3]", "there are 3 members only"),
+        ("pose[0]", "what the index is of is no list"),
+        ("position.x", "there is no x, it is no message"),
+        ("position[0:0]", "hold 0 numbers"),
+        ("", "is empty"),
+        ("a..b", "is no field"),
+        ("a[x]", "is no field"),
+        ("[0]", "is no field"),
+        ("a[0]b", "is no field"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_words(path: str, why: str) -> None:
+    with pytest.raises(UsageError, match=why.replace("[", r"\[")):
+        numbers_of([Field(path)], NESTED, None)
+
+
+def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
+    ranges = {"ranges": [0.5, float("inf"), float("nan"), 50.0, -1.0]}
+    with pytest.raises(LogDamagedError, match=r"holds inf at place 1.* as --range"):
+        numbers_of([Field("ranges")], ranges, None)
+    kept = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
+    assert kept.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
+
+
+def angles(count: int = COUNT) -> np.ndarray:
+    """(count, JOINTS), different from each other."""
+    t = np.arange(count)[:, None]
+    return np.sin(t / (5 + np.arange(JOINTS))) + np.arange(JOINTS)
+
+
+def joint_state(store: Any, row: np.ndarray, *, ros1: bool) -> Any:
+    time = store.types["builtin_interfaces/msg/Time"](sec=7, nanosec=8)
+    header = store.types["std_msgs/msg/Header"](*([0] if ros1 else []), stamp=time, frame_id="")
+    names = [f"joint {i}" for i in range(len(row))]
+    none = np.empty(0)
+    kind = store.types["sensor_msgs/msg/JointState"]
+    return kind(header=header, name=names, position=row.copy(), velocity=-row, effort=none)
+
+
+def write_mcap(
+    path: Path, kind: MessageKind, topics: dict[str, tuple[int, Iterator[bytes]]]
+) -> Path:
+    """A log of messages of a kind: topic to nanoseconds between two, and they."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(kind.schema, kind.language, kind.definition)
+        for topic, (step, messages) in topics.items():
+            channel = writer.register_channel(topic, kind.encoding, schema)
+            for i, message in enumerate(messages):
+                writer.add_message(channel, START + i * step, message, START + i * step)
+        writer.finish()
+    return path
+
+
+def ros_mcap(folder: Path, *, ros1: bool) -> Path:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    name = "sensor_msgs/msg/JointState"
+    text, _ = store.generate_msgdef(name, ros_version=1 if ros1 else 2)
+    pack = store.serialize_ros1 if ros1 else store.serialize_cdr
+    rows = (bytes(pack(joint_state(store, row, ros1=ros1), name)) for row in angles())
+    kind = (
+        MessageKind("sensor_msgs/JointState", "ros1", text.encode(), "ros1msg")
+        if ros1
+        else MessageKind(name, "cdr", text.encode(), "ros2msg")
+    )
+    return write_mcap(folder / "joints.mcap", kind, {"/joint_states": (STEP, rows)})
+
+
+def json_mcap(folder: Path) -> Path:
+    rows = (json.dumps({"position": row.tolist()}).encode() for row in angles())
+    kind = MessageKind("joints", "json", b"{}", "jsonschema")
+    return write_mcap(folder / "joints.mcap", kind, {"/joint_states": (STEP, rows)})
+
+
+def bag(folder: Path, *, ros1: bool) -> Path:
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    path, name = folder / ("joints.bag" if ros1 else "joints"), "sensor_msgs/msg/JointState"
+    with rosbag1.Writer(path) if ros1 else rosbag2.Writer(path, version=9) as writer:
+        channel = writer.add_connection("/joint_states", name, typestore=store)
+        text = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        pack = store.serialize_ros1 if ros1 else store.serialize_cdr
+        for i, row in enumerate(angles()):
+            word = store.types["std_msgs/msg/String"](data="x")
+            writer.write(text, START + i * STEP, bytes(pack(word, "std_msgs/msg/String")))
+            state = joint_state(store, row, ros1=ros1)
+            writer.write(channel, START + i * STEP, bytes(pack(state, name)))
+    return path
+
+
+LOGS: dict[str, Callable[[Path], Path]] = {
+    "json": json_mcap,
+    "ros1 mcap": lambda folder: ros_mcap(folder, ros1=True),
+    "ros2 mcap": lambda folder: ros_mcap(folder, ros1=False),
+    "bag": lambda folder: bag(folder, ros1=True),
+    "db3 folder": lambda folder: bag(folder, ros1=False),
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_every_kind_of_message_gives_the_same_numbers(kind: str, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    path = LOGS[kind](tmp_path)
+    source = ForeignSource(path, ["/joint_states"], fields=["position[1:]", "position[0]"])
+    with contextlib.closing(source):
+        assert (source.spec.frame_shape, source.spec.dtype) == ((JOINTS,), "float64")
+        assert source.spec.fps == 50
+        assert (source.take(0, COUNT).frames == angles()[:, [1, 2, 0]]).all()
+        assert source.describe()["fields"] == [["position[1:]", "position[0]"]]
+
+
+def test_fields_of_protobuf_are_found_by_their_definition(tmp_path: Path) -> None:
+    def poses() -> Iterator[bytes]:
+        for i in range(COUNT):
+            message = PoseInFrame()
+            message.pose.position.x, message.pose.orientation.w = i, -i
+            yield message.SerializeToString()
+
+    definition = descriptor_set(PoseInFrame.DESCRIPTOR)
+    kind = MessageKind("foxglove.PoseInFrame", "protobuf", definition, "protobuf")
+    path = write_mcap(tmp_path / "p.mcap", kind, {"/pose": (STEP, poses())})
+    fields = ["pose.position.x", "pose.orientation.w"]
+    with contextlib.closing(ForeignSource(path, fields=fields)) as source:
+        assert source.take(0, 5).frames.tolist() == [[i, -i] for i in range(5)]
+    with pytest.raises(UsageError, match="there is no pos, it has timestamp, frame_id, pose"):
+        ForeignSource(path, fields=["pos"])
+
+
+@pytest.mark.parametrize("encoding", ["json", "protobuf", "cdr", "ros1"])
+def test_broken_messages_are_said_to_be(encoding: str) -> None:
+    definition = descriptor_set(PoseInFrame.DESCRIPTOR)
+    name = "foxglove.PoseInFrame"
+    if encoding in ("cdr", "ros1"):
+        pytest.importorskip("rosbags")
+        name, definition = "a_msgs/msg/A", b"float64[] a\nstring b\n"
+    decode = message_decoder(MessageKind(name, encoding, definition, ""))
+    assert decode is not None
+    chosen = random.Random(0)
+    broken = 0
+    for _ in range(200):
+        try:
+            numbers_of([Field("a")], decode(chosen.randbytes(chosen.randrange(60))), None)
+        except CdmisfaError:
+            broken += 1
+    assert broken > 150
+
+
+def test_topics_of_other_rates_are_put_on_one_clock_and_pauses_are_gaps(tmp_path: Path) -> None:
+    def counted(first: int, count: int) -> Iterator[bytes]:
+        return (json.dumps({"k": first + i}).encode() for i in range(count))
+
+    kind = MessageKind("k", "json")
+    path = write_mcap(
+        tmp_path / "a.mcap",
+        kind,
+        {"/fast": (STEP, counted(0, 90)), "/slow": (2 * STEP, counted(1000, 45))},
+    )
+    with contextlib.closing(ForeignSource(path, ["/*"], fields=["k"], align="time")) as source:
+        fast, slow = source.take_all(5)
+        assert fast.frames[:, 0].tolist() == [0, 1, 2, 3, 4]
+        assert slow.frames[:, 0].tolist() == [1000, 1000, 1001, 1001, 1002]
+        assert source.alignment["/slow"]["repeated"] == 44
+
+
+def write_table(path: Path, columns: dict[str, Any]) -> Path:
+    table = pa.table(columns)
+    if path.suffix == ".csv":
+        from pyarrow import csv
+
+        csv.write_csv(table, path)
+    else:
+        pq.write_table(table, path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+@pytest.mark.parametrize(
+    ("unit", "times"),
+    [
+        ("", np.arange(COUNT) / 50),
+        (":ms", np.arange(COUNT) * 20),
+        (":ns", START + np.arange(COUNT) * STEP),
+        ("", pa.array(START + np.arange(COUNT) * STEP, pa.timestamp("ns"))),
+    ],
+)
+def test_the_rows_of_a_table_are_frames_at_their_times(
+    name: str, unit: str, times: Any, tmp_path: Path
+) -> None:
+    columns = {"stamp": times, "a.b": angles()[:, 0], "word": ["x"] * COUNT, "c": range(COUNT)}
+    path = write_table(tmp_path / name, columns)
+    with contextlib.closing(ForeignSource(path, time="stamp" + unit)) as source:
+        assert source.spec.streams == ("t",)
+        assert source.spec.fps == 50
+        frames = source.take(0, COUNT).frames
+        assert (frames == np.c_[angles()[:, 0], np.arange(COUNT)]).all()
+        assert source.describe()["fields"] == [["a.b", "c"]]
+    with contextlib.closing(ForeignSource(path, fields=["c"], rate=10)) as source:
+        assert (source.spec.fps, source.take(0, 3).frames.tolist()) == (10, [[0], [1], [2]])
+
+
+def test_rows_without_a_number_are_left_out_and_a_pause_is_a_gap(tmp_path: Path) -> None:
+    stamps, numbers = (np.arange(COUNT) / 50).tolist(), angles()[:, 0].tolist()
+    numbers[3] = stamps[5] = None
+    numbers[40:60] = [None] * 20
+    shuffled = np.random.default_rng(0).permutation(COUNT)
+    columns = {"s": [stamps[i] for i in shuffled], "a": [numbers[i] for i in shuffled]}
+    path = write_table(tmp_path / "t.csv", columns)
+    with contextlib.closing(ForeignSource(path, time="s", align="time")) as source:
+        assert source.gaps
+        assert source.pauses == {"t": [(40, 60)]}
+        assert source.spans(0, 0, COUNT) == [(0, 40), (60, COUNT)]
+        assert "22 of 90 rows lack a number or their time" in source.warnings[0]
+        shown = source.take(0, 7).frames[:, 0]
+        assert (shown == angles()[[0, 1, 2, 2, 4, 4, 6], 0]).all()
+    with pytest.raises(UsageError, match="lacks a number: name the column of its times"):
+        ForeignSource(path, fields=["a"], rate=10)
+
+
+def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "t.parquet", {"state": angles().tolist(), "n": range(COUNT)})
+    with contextlib.closing(ForeignSource(path, fields=["state[1:3]", "n"], rate=5)) as source:
+        assert (source.take(0, 2).frames == np.c_[angles()[:2, 1:3], [0, 1]]).all()
+    with pytest.raises(UsageError, match="state holds 3 numbers, and 2 in row 1"):
+        ForeignSource(
+            write_table(tmp_path / "u.parquet", {"state": [[1, 2, 3], [1, 2]]}),
+            fields=["state"],
+            rate=5,
+        )
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({}, "tells no rate: set one with --rate, or name the column of its times with --time"),
+        ({"fields": ["z"], "rate": 5}, "there is no column z; it has s, a, word"),
+        ({"fields": ["word"], "rate": 5}, "is no number but str"),
+        ({"time": "z"}, "there is no column z; it has s, a, word"),
+        ({"time": "word"}, "word holds string, neither dates nor numbers"),
+        ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),
+        ({"time": "big"}, "beyond any clock, counted in s: say what they count, as --time big:ns"),
+        ({"rate": 5, "size": (4, 4)}, "--size and --fit are for images"),
+        ({"rate": 5, "topics": ["x"]}, "a table has no topics, leave x out; see --field"),
+    ],
+)
+def test_what_a_table_lacks_is_said(options: Any, why: str, tmp_path: Path) -> None:
+    columns = {"s": [0.0, 1.0], "a": [1, 2], "word": ["x", "y"], "big": [10**18, 10**18 + 1]}
+    with pytest.raises(UsageError, match=why):
+        ForeignSource(write_table(tmp_path / "t.csv", columns), **options)
+
+
+def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> None:
+    one = write_table(tmp_path / "one.csv", {"a": [1.0, 2.0], "b": [1.0, 2.0]})
+    two = write_table(tmp_path / "two.csv", {"a": [1.0, 2.0]})
+    with pytest.raises(UsageError, match="these show 2 numbers and a number: take as many"):
+        ForeignSource([one, two], rate=5)
+    ragged = (json.dumps({"p": [0] * (3 - i % 2)}).encode() for i in range(9))
+    path = write_mcap(tmp_path / "r.mcap", MessageKind("p", "json"), {"/p": (STEP, ragged)})
+    with (
+        contextlib.closing(ForeignSource(path, fields=["p"])) as source,
+        pytest.raises(UsageError, match=r"holds 2 numbers, and the first 3.*position\[0:2\]"),
+    ):
+        source.take(0, 2)
+
+
+def test_a_table_that_is_none_is_damaged(tmp_path: Path) -> None:
+    (tmp_path / "t.parquet").write_bytes(b"PAR1" + b"x" * 100)
+    (tmp_path / "t.csv").write_bytes(b"a,b\n1,2\n1,2,3\n")
+    for name in ("t.parquet", "t.csv"):
+        with pytest.raises(LogDamagedError, match="PyArrow cannot read it"):
+            ForeignSource(tmp_path / name, rate=5)
+
+
+class TestTable(SourceContract):
+    ends = True
+
+    @pytest.fixture(autouse=True)
+    def _table(self, tmp_path: Path) -> None:
+        self.path = write_table(tmp_path / "t.csv", {"a": angles(500)[:, 0]})
+
+    def open(self) -> SeekableSource:
+        return ForeignSource(self.path, rate=50)
+
+
+def test_a_slow_sine_hidden_in_fields_of_noise_is_learned(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    rng = np.random.default_rng(20)
+    t = np.arange(4000)
+    sine = np.sin(2 * np.pi * t / 200)
+    fields = np.c_[sine, rng.normal(size=(len(t), 6))] @ rng.normal(size=(7, 7))
+    noise = rng.normal(size=(len(t), 7))
+    for name, values in {"arm": fields, "noise": noise}.items():
+        columns = {"stamp": t / 50, **{f"joint {i}": values[:, i] for i in range(7)}}
+        write_table(tmp_path / f"{name}.csv", columns)
+    logs = [tmp_path / "arm.csv", tmp_path / "noise.csv"]
+    run = tmp_path / "run"
+    done = cdmisfa("learn", *logs, "--time", "stamp", "-o", run, "--no-rerun", "--json").json
+    assert done["ended"] == "all_decided"
+    arm, noisy = done["streams"]
+    assert (arm["state"], noisy["state"]) == ("learned", "given_up")
+    assert arm["slowness"] == pytest.approx(1 / 200, rel=0.1)
+    from replay.runs.modules import load_modules
+
+    (module,) = load_modules(run / "modules.npz")
+    heard = np.asarray(module.transform(fields))[:, 0]
+    assert abs(np.corrcoef(heard, sine)[0, 1]) > 0.99
+
+
+def test_commands_take_numbers_of_a_log(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    log, rec = json_mcap(tmp_path), tmp_path / "rec"
+    words = [log, "--topic", "/joint_states", "--field", "position"]
+    plan = cdmisfa("learn", *words, "--dry-run", "--json").json
+    assert (plan["size"], plan["streams"][0]["shape"]) == ([3], "3 numbers")
+    assert "90 messages, 0 frames repeated" in cdmisfa("convert", *words, "-o", rec).err
+    with contextlib.closing(RecordedSource(rec)) as source:
+        assert (source.take(0, COUNT).frames == angles()).all()
+    options = ["--max-iterations", "2", "--json"]
+    live = cdmisfa("learn", *words, *options, "-o", tmp_path / "run", "--no-rerun").json
+    assert cdmisfa("learn", rec, *options).json["signals_sha256"] == live["signals_sha256"]
+    assert cdmisfa("check", tmp_path / "run").code == 0
+    assert cdmisfa("view", *words, "--save", tmp_path / "v.rrd").code == 0
+    assert cdmisfa("export", *words, "--to", "lerobot", "-o", tmp_path / "set").code == 0
+    refused = cdmisfa("export", *words, "--to", "images", "-o", tmp_path / "pngs")
+    assert (refused.code, "holds no images" in refused.err) == (2, True)
+    assert cdmisfa("info", rec).code == cdmisfa("verify", rec).code == 0
