@@ -161,9 +161,15 @@ def explained(path: Location, program: str, *, held: int = 0) -> Iterator[None]:
         program: the library.
         held: bytes of the memory that it may take which are taken already.
     """
+    with in_one_line(path, program), budget(max(BUDGET - held, 0)):
+        yield
+
+
+@contextmanager
+def in_one_line(path: Location, program: str) -> Iterator[None]:
+    """Say in one line what a library cannot read that lets any exception through."""
     try:
-        with budget(max(BUDGET - held, 0)):
-            yield
+        yield
     except CdmisfaError:
         raise
     except MemoryError:
