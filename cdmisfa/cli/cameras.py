@@ -156,6 +156,13 @@ camera_options = options.together(
     ),
     range_option,
     click.option(
+        "--stamp",
+        type=click.Choice(["log", "header"]),
+        default="log",
+        show_default=True,
+        help="When a message is of: when it was logged, or the time in its header.",
+    ),
+    click.option(
         "--dry-run",
         is_flag=True,
         help="Say what would be read from camera logs, and write nothing.",

@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
+from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.pixels import Bytes, Depth, MalformedImage, compressed_gray, gray
 
 Decoder = Callable[[bytes | memoryview], Bytes]
@@ -92,8 +93,9 @@ class _RosFields:
             if head[0] != 0 or head[1] not in (0, 1, 6, 7, 8, 9, 10, 11):
                 raise MalformedImage("a message is no CDR")
             self._order = "<" if head[1] & 1 else ">"
-        for _ in range(3 if ros1 else 2):  # sequence number of ROS 1, seconds, nanoseconds
-            self.u32()
+        if ros1:
+            self.u32()  # its number
+        self.stamp = self.u32() * NANOSECONDS + self.u32()
         self.text()
 
     def take(self, count: int) -> memoryview:
@@ -113,6 +115,17 @@ class _RosFields:
     def text(self) -> str:
         raw = bytes(self.data())
         return str(raw if self._ros1 else raw.removesuffix(b"\0"), "utf-8", "replace")
+
+
+def ros_stamp(data: bytes | memoryview, *, ros1: bool) -> int:
+    """The time in the header that a ROS message begins with, nanoseconds."""
+    return _RosFields(data, ros1=ros1).stamp
+
+
+def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
+    """What opens Foxglove's images, of which logs need not state a definition; None of others."""
+    kind = {"foxglove.RawImage": RawImage, "foxglove.CompressedImage": CompressedImage}.get(schema)
+    return None if kind is None or encoding != "protobuf" else partial(_parse, kind)
 
 
 def _ros_raw(data: bytes | memoryview, *, ros1: bool, depth: Depth | None = None) -> Bytes:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from recorder.images.pixels import Depth
+
+Clock = Literal["log", "header"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,12 +17,14 @@ class Reading:
     Attributes:
         depth: what is shown of distances, see `gray`, and the range that numbers are kept in.
         fields: the numbers that are taken instead of images; see `Field`.
+        stamp: the times of messages: those of the log, or those in their headers.
         time: the column of a table's times, with its unit; see `TableNumbers`.
     """
 
     depth: Depth | None = None
     fields: tuple[str, ...] = ()
     time: str | None = None
+    stamp: Clock = "log"
 
 
 IMAGES = Reading()

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import UsageError
-from recorder.images.pixels import Shown
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.pixels import MalformedImage, Shown
 from replay.camera_logs.alignment import Times, even_times
-from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.stream import ImageStream, sorted_times
+from replay.mcap.records import MalformedRecord
 from replay.storage.location import Location
 
 
@@ -36,12 +37,54 @@ class JoinedImages(ImageStream):
     def image(self, row: int) -> Shown:
         return self.parts[int(self._part_of[row])].image(int(self._row_in[row]))
 
+    def stamp(self, row: int) -> int:
+        return self.parts[int(self._part_of[row])].stamp(int(self._row_in[row]))
+
     def where(self, row: int) -> str:
         return self.parts[int(self._part_of[row])].where(int(self._row_in[row]))
 
     def close(self) -> None:
         for part in self.parts:
             part.close()
+
+
+class Stamped(ImageStream):
+    """The images of a stream in the order and at the times that their messages say.
+
+    Every message is read for it.
+
+    Raises:
+        UsageError: they say nothing.
+        LogDamagedError: a message cannot be read.
+    """
+
+    def __init__(self, images: ImageStream) -> None:
+        self.path, self.topic, self.encoding = images.path, images.topic, images.encoding
+        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
+        self.parts = getattr(images, "parts", [images])
+        self._images = images
+        stamps = np.empty(images.count, np.int64)
+        for row in range(images.count):
+            try:
+                stamps[row] = images.stamp(row)
+            except (MalformedRecord, MalformedImage) as error:
+                raise LogDamagedError(f"{images.where(row)}: {error}") from None
+        if len(stamps) > 1 and stamps.min() == stamps.max():
+            raise UsageError(
+                f"{self.path}: the headers on {self.topic} all say {stamps[0]} ns: leave out "
+                "--stamp header"
+            )
+        self._order = np.argsort(stamps, kind="stable")
+        self.times = sorted_times(f"{self.path}: {self.topic}", stamps[self._order])
+
+    def image(self, row: int) -> Shown:
+        return self._images.image(int(self._order[row]))
+
+    def where(self, row: int) -> str:
+        return self._images.where(int(self._order[row]))
+
+    def close(self) -> None:
+        self._images.close()
 
 
 class Excerpt(ImageStream):

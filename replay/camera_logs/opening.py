@@ -15,7 +15,7 @@ from replay.camera_logs.formats.mcap_log import McapImages
 from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
 from replay.camera_logs.formats.table import TableNumbers, is_table
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
-from replay.camera_logs.joined import JoinedImages
+from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.identity import identity
 from replay.storage.checksum import sha256
@@ -26,6 +26,18 @@ from replay.storage.location import Location, Url, location
 def open_images(
     path: Location, topic: str | None, *, salvage: bool = False, reading: Reading = IMAGES
 ) -> ImageStream:
+    """Open what `_open` does, by the times that are wanted; raises the same."""
+    images = _open(path, topic, salvage=salvage, reading=reading)
+    if reading.stamp == "log":
+        return images
+    try:
+        return Stamped(images)
+    except BaseException:
+        images.close()
+        raise
+
+
+def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
     """Open the images on a topic of a log, or in a folder, or numbers.
 
     Args:

@@ -7,6 +7,7 @@ from typing import Literal
 
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import Depth
+from recorder.images.reading import Clock
 
 Align = Literal["index", "time"]
 Gaps = Literal["skip", "hold"]
@@ -31,6 +32,7 @@ class CameraOptions:
             are kept in; None for none.
         fields: the numbers that are taken of messages or of a table instead of images, one after
             the other; see `Field`.
+        stamp: when a message is taken to be of: when it was logged, or as its header says.
         time: the column of a table's times; see `TableNumbers`.
     """
 
@@ -45,3 +47,4 @@ class CameraOptions:
     depth: Depth | None = None
     fields: tuple[str, ...] = ()
     time: str | None = None
+    stamp: Clock = "log"

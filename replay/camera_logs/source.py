@@ -14,7 +14,7 @@ from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.framing import Fit, Size, framings
 from recorder.images.pixels import Depth, MalformedImage, Shown
-from recorder.images.reading import Reading
+from recorder.images.reading import Clock, Reading
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -64,6 +64,7 @@ class ForeignSource(StoredSource):
         depth: distances in metres that are shown black and white.
         fields: the numbers that are taken instead of images, one after the other.
         time: the column of a table's times.
+        stamp: the times of messages: those of the log, or those in their headers.
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged.
@@ -94,6 +95,7 @@ class ForeignSource(StoredSource):
         depth: Depth | None = None,
         fields: Sequence[str] = (),
         time: str | None = None,
+        stamp: Clock = "log",
         rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
@@ -115,7 +117,7 @@ class ForeignSource(StoredSource):
         self._files = image_logs(named)
         self._loop = loop
         self._hashes: list[dict[str, Any]] | None = None
-        self._fit, self._reading = fit, Reading(depth, tuple(fields), time)
+        self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp)
         self._asked_size = size
         self._goal = goal
         self._streams: list[ImageStream] = []
@@ -213,6 +215,8 @@ class ForeignSource(StoredSource):
             chosen["fields"] = [list(s.fields) for s in self._streams]
         if self._reading.time is not None:
             chosen["time"] = self._reading.time
+        if self._reading.stamp != "log":
+            chosen["stamp"] = self._reading.stamp
         return chosen
 
     def close(self) -> None:
@@ -312,6 +316,8 @@ class ForeignSource(StoredSource):
             words += ["--field", field]
         if self._reading.time is not None:
             words += ["--time", self._reading.time]
+        if self._reading.stamp != "log":
+            words += ["--stamp", self._reading.stamp]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
 

@@ -84,6 +84,15 @@ class ImageStream(ABC):
             LogDamagedError: the log is damaged there.
         """
 
+    def stamp(self, row: int) -> int:
+        """When an image was made, as its message says, nanoseconds.
+
+        Raises:
+            UsageError: it is in no message, or this says nothing.
+            MalformedRecord, LogDamagedError: as for `image`.
+        """
+        raise UsageError(f"{self.path}: {self.topic} is no topic of messages: leave out --stamp")
+
     def where(self, row: int) -> str:
         """How an error names an image."""
         return f"{self.path}: {self.topic} at {self.times[row]} ns"

@@ -104,6 +104,7 @@ def open_cameras(
         depth=cameras.depth,
         fields=cameras.fields,
         time=cameras.time,
+        stamp=cameras.stamp,
         rate=cameras.rate,
         loop=loop,
         salvage=salvage,

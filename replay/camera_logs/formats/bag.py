@@ -17,6 +17,7 @@ from recorder.images.decoding import Taken, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
+from recorder.images.stamps import stamp_of
 from replay.camera_logs.formats.bag_folder import plain_bag, unpacked_message
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -62,6 +63,16 @@ class BagImages(ImageStream):
         self.warnings = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
     def image(self, row: int) -> Shown:
+        return self._decode(self._message(row))
+
+    def stamp(self, row: int) -> int:
+        if self._stamp is None:
+            raise UsageError(
+                f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
+            )
+        return self._stamp(self._message(row))
+
+    def _message(self, row: int) -> bytes:
         with explained(self.path, "rosbags"):
             if row != self._next:
                 self._messages = self._from(int(self.times[row]))
@@ -71,7 +82,7 @@ class BagImages(ImageStream):
                 self._next += 1
             if self._packed:
                 data = unpacked_message(data)
-        return self._decode(data)
+        return data
 
     def close(self) -> None:
         self._messages = iter(())
@@ -93,6 +104,7 @@ class BagImages(ImageStream):
         kinds = _kinds(self._reader, ros1=self._ros1)
         channels = [(name, kind, name) for name, kind in kinds.items()]
         chosen, decode = choose_images(self.path, topic, channels, reading)
+        self._stamp = stamp_of(kinds[chosen])
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 

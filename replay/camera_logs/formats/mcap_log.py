@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Final
+from collections.abc import Callable, Iterator
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from recorder.images.decoding import decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
+from recorder.images.stamps import stamp_of
 from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel, MalformedRecord
@@ -21,6 +22,9 @@ from replay.storage.location import Location
 
 CACHE_BYTES: Final = 1024 * 1024
 """Decoded chunks that are kept; one always is."""
+
+
+Found = TypeVar("Found")
 
 
 class McapImages(ImageStream):
@@ -47,6 +51,7 @@ class McapImages(ImageStream):
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
             self._channel, self._decode = choose_images(path, topic, channels, reading)
             self.topic = self._channel.topic
+            self._stamp = stamp_of(_kind(self.reader, self._channel))
             self._index()
         except BaseException:
             self.reader.close()
@@ -54,6 +59,17 @@ class McapImages(ImageStream):
         self.warnings = self.reader.warnings
 
     def image(self, row: int) -> Shown:
+        return self._taken(row, self._decode)
+
+    def stamp(self, row: int) -> int:
+        if self._stamp is None:
+            raise UsageError(
+                f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
+            )
+        return self._taken(row, self._stamp)
+
+    def _taken(self, row: int, take: Callable[[memoryview], Found]) -> Found:
+        """What is taken of a message."""
         table = self.reader.table(self._segments[int(self._segment_of[row])])
         if table is None:
             raise MalformedRecord("it is damaged")
@@ -64,7 +80,7 @@ class McapImages(ImageStream):
                 raise MalformedRecord("its chunk holds other messages than the summary names")
             place = int(own[place])
         with explained(self.path, "its decoder", held=table.data.nbytes):
-            return self._decode(table.view(place))
+            return take(table.view(place))
 
     def confirm(self) -> None:
         self.reader.confirm()

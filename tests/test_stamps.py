@@ -1,0 +1,119 @@
+"""Messages by the times in their headers, where the log's own say when they came."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from test_foreign import raw_json
+from test_numbers import START, STEP, bag, joint_state, write_mcap
+
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.reading import MessageKind
+from recorder.images.stamps import stamp_of
+from replay.camera_logs.source import ForeignSource
+
+COUNT = 40
+MADE = 5 * NANOSECONDS + 7
+
+
+def made(i: int) -> int:
+    """When the i-th message was made: 40 ms after the one before, the second and third swapped."""
+    return MADE + {1: 2, 2: 1}.get(i, i) * 2 * STEP
+
+
+def foxglove() -> Iterator[bytes]:
+    for i, image in enumerate(pictures(COUNT)):
+        message = RawImage(width=WIDTH, height=HEIGHT, step=WIDTH, encoding="mono8")
+        message.timestamp.seconds, message.timestamp.nanos = divmod(made(i), NANOSECONDS)
+        message.data = image.tobytes()
+        yield message.SerializeToString()
+
+
+def in_json() -> Iterator[bytes]:
+    for i, image in enumerate(pictures(COUNT)):
+        seconds, rest = divmod(made(i), NANOSECONDS)
+        size = {"height": HEIGHT, "width": WIDTH, "encoding": "mono8", "step": WIDTH, "big": 0}
+        message = json.loads(raw_json(data=image.tobytes(), **size))
+        message["timestamp"] = {"sec": seconds, "nsec": rest}
+        yield json.dumps(message).encode()
+
+
+LOGS = {
+    "protobuf": (MessageKind("foxglove.RawImage", "protobuf"), foxglove),
+    "json": (MessageKind("foxglove.RawImage", "json"), in_json),
+}
+
+
+@pytest.mark.parametrize("kind", LOGS)
+def test_images_are_shown_at_the_times_of_their_headers(kind: str, tmp_path: Path) -> None:
+    what, messages = LOGS[kind]
+    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": (STEP, messages())})
+    images = list(pictures(COUNT))
+    with contextlib.closing(ForeignSource(path)) as logged:
+        assert (logged.spec.fps, logged.spec.start_ns) == (50, START)
+        assert (logged.take(0, 3).frames == images[:3]).all()
+    with contextlib.closing(ForeignSource(path, stamp="header")) as source:
+        assert (source.spec.fps, source.spec.start_ns) == (25, MADE)
+        shown = source.take(0, COUNT).frames
+        assert (shown == [images[i] for i in (0, 2, 1, *range(3, COUNT))]).all()
+        assert source.describe()["stamp"] == "header"
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_ros_says_it_in_the_header_that_a_message_begins_with(ros1: bool) -> None:
+    pytest.importorskip("rosbags")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    name, version = "sensor_msgs/msg/JointState", 1 if ros1 else 2
+    text, _ = store.generate_msgdef(name, ros_version=version)
+    pack = store.serialize_ros1 if ros1 else store.serialize_cdr
+    kind = MessageKind(name, "ros1" if ros1 else "cdr", text.encode(), f"ros{version}msg")
+    stamp = stamp_of(kind)
+    assert stamp is not None
+    message = joint_state(store, np.arange(2.0), ros1=ros1)
+    assert stamp(bytes(pack(message, name))) == 7 * NANOSECONDS + 8
+    with pytest.raises(LogDamagedError, match="cut short"):
+        stamp(bytes(pack(message, name))[:9])
+    assert stamp_of(kind._replace(definition=b"# of\nfloat64 a\nHeader header")) is None
+
+
+def test_what_says_no_time_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    write_cameras(tmp_path / "a.mcap", {"/cam": (20, 20)})
+    (tmp_path / "t.csv").write_text("s,a\n0,1\n1,2\n")
+    for path, topics, options, why in (
+        (bag(tmp_path, ros1=True), ["/chatter"], {"fields": ["data"]}, "have no header"),
+        (bag(tmp_path, ros1=False), ["/joint_states"], {"fields": ["position"]}, "all say 7000"),
+        (tmp_path / "a.mcap", [], {}, "the headers on /cam all say 0 ns: leave out --stamp"),
+        (tmp_path / "t.csv", [], {"time": "s"}, "is no topic of messages: leave out --stamp"),
+    ):
+        with pytest.raises(UsageError, match=why):
+            ForeignSource(path, topics, stamp="header", **options)
+    plain = write_mcap(
+        tmp_path / "j.mcap", MessageKind("k", "json"), {"/k": (STEP, iter([b'{"k": 1}'] * 2))}
+    )
+    with pytest.raises(LogDamagedError, match=r"no time of its own, as header.stamp or timestamp"):
+        ForeignSource(plain, fields=["k"], stamp="header")
+
+
+def test_learning_by_headers_is_the_same_from_the_conversion(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    what, messages = LOGS["protobuf"]
+    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": (STEP, messages())})
+    options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
+    run = cdmisfa("learn", path, "--stamp", "header", *options, "-o", tmp_path / "run").json
+    assert cdmisfa("convert", path, "--stamp", "header", "-o", tmp_path / "rec").code == 0
+    again = cdmisfa("learn", tmp_path / "rec", *options).json
+    assert again["signals_sha256"] == run["signals_sha256"]
+    assert cdmisfa("check", tmp_path / "run").code == 0
