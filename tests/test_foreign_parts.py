@@ -92,7 +92,7 @@ def test_a_part_may_lack_a_topic(parts: list[Path]) -> None:
     assert [stop - start for start, stop in source.pauses["/right"]] == [10]
     with pytest.raises(UsageError, match="no topic /up"):
         ForeignSource(parts[0].parent, ["/up"], size=SIZE)
-    with pytest.raises(UsageError, match="name one --topic"):
+    with pytest.raises(UsageError, match="name one --topic or more; it has images on"):
         ForeignSource(parts[0].parent, size=SIZE)
 
 

@@ -209,6 +209,11 @@ def test_there_is_no_moment_after_the_end(place: Path, k: int) -> None:
         check_run(place / "2.0-live", stop=k)
 
 
+def test_no_part_ends_before_it_begins(place: Path) -> None:
+    with pytest.raises(UsageError, match="from 20 to 10 there is nothing to check"):
+        check_run(place / "2.0-live", start=20, stop=10)
+
+
 def test_without_its_source_a_run_has_its_keyframes(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     log, run = tmp_path / "log", tmp_path / "run"
     cdmisfa("record", "oscillatory", "-o", log, "--frames", 2000)
@@ -356,5 +361,9 @@ def test_compare_says_what_differs_and_shows_both(
     assert (first > second, document["signals"]["t"]) == (True, [800, 800])
     keys = [told["key"] for told in document["runs"][1]["told_otherwise"]]
     assert keys == ["learner.epsilon_decay", "seed"]
+    other = cdmisfa("compare", parent, place / "progress-live").out
+    assert "learner.algorithm 2.0 against progress; " in other
+    assert "; only one of them says learner.agreement, learner.alpha" in other
+    assert "None against" not in other
     same = cdmisfa("compare", parent, place / "2.0-live-resumed", "--json").json
     assert (same["signals"], same["identical"]) == ({}, True)

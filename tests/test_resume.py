@@ -327,7 +327,7 @@ def test_a_kill_while_a_run_is_replaced_leaves_none_or_says_how_to_go_on(
         cdmisfa(*words)
     verified = cdmisfa("verify", run)
     if removed:
-        assert (verified.code, "record or learn first" in verified.err) == (2, True)
+        assert (verified.code, "record or learn first, or name each" in verified.err) == (2, True)
         resumed = cdmisfa("learn", "--resume", "-o", run)
         assert (resumed.code, "begin one there with --force" in resumed.err) == (2, True)
     else:

@@ -119,7 +119,8 @@ class FoxgloveCamera:
         wanted = "messages with fields" if self._reading.fields else "images"
         known = ", ".join(sorted(t for t, c in channels.items() if self._decoder(c))) or "nothing"
         what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
-        raise CdmisfaError(f"{self._where} {what}: it has {wanted} on {known}")
+        remedy = f"; name one as {self._where}/TOPIC" if known != "nothing" else ""
+        raise CdmisfaError(f"{self._where} {what}: it has {wanted} on {known}{remedy}")
 
     def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
         schema, language = channel.get("schema"), str(channel.get("schemaEncoding", ""))

@@ -119,7 +119,9 @@ def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Readin
             raise refusal
         topics = {part.topic for part in parts}
         if len(topics) > 1:
-            raise UsageError(f"{path}: name one --topic; it has several: {sorted(topics)}")
+            raise UsageError(
+                f"{path}: name one --topic or more; it has {', '.join(sorted(topics))}"
+            )
     except BaseException:
         for part in parts:
             part.close()

@@ -136,7 +136,7 @@ def choose_images(
     known = ", ".join(sorted({name for name, _, _ in readable})) or "none"
     what = "messages with fields" if reading.fields else "images"
     if topic is None:
-        raise UsageError(f"{path}: name one --topic; it has {what} on: {known}")
+        raise UsageError(f"{path}: name one --topic or more; it has {what} on: {known}")
     if len(found) > 1:
         raise UsageError(f"{path}: {len(found)} channels share the topic {topic}")
     if topic in others and reading.fields:

@@ -249,8 +249,11 @@ class Row:
         """What explains its difference, in words; "" where nothing known does."""
         found = []
         if self.told:
-            what = "; ".join(f"{key} {_short(a)} against {_short(b)}" for key, a, b in self.told)
-            found.append(f"{self.name} was told otherwise: {what}")
+            both = [(key, a, b) for key, a, b in self.told if a is not None and b is not None]
+            what = [f"{key} {_short(a)} against {_short(b)}" for key, a, b in both]
+            if alone := [key for key, a, b in self.told if a is None or b is None]:
+                what.append(f"only one of them says {', '.join(alone)}")
+            found.append(f"{self.name} was told otherwise: {'; '.join(what)}")
         if self.otherwise:
             why = "; ".join(self.otherwise)
             found.append(f"{self.name} was computed otherwise, which may be why: {why}")

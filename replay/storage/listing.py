@@ -30,7 +30,10 @@ def log_files(paths: str | Location | Iterable[str | Location]) -> list[Location
             cut = sorted(path.glob(f"*.mcap{PARTIAL}"))
             found = whole + [p for p in cut if p.with_suffix("") not in whole]
             if not found:
-                raise UsageError(f"{path}: no .mcap file in this folder; record or learn first")
+                raise UsageError(
+                    f"{path}: no .mcap file in this folder; record or learn first, or name each "
+                    "video, bag or folder of pictures in it"
+                )
             files += found
         elif path.exists():
             files.append(path)

@@ -115,7 +115,8 @@ class _HttpServer:
             length = headers.get("Content-Length", "")
             if start or not _LENGTH.fullmatch(length) or int(length) > stop:
                 raise UnreachableError(
-                    "the server sends no parts of a file (range requests): download it first"
+                    "the server sends no parts of a file (range requests): download it first, "
+                    "or put av: before the address of a camera"
                 )
             return Part(await answer.content.readexactly(int(length)), int(length), tag)
         total, count = _range_of(headers.get("Content-Range", ""), start, stop)

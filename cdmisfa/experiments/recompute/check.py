@@ -77,6 +77,10 @@ def check_run(
         UsageError: there is no such run, source or part.
         LogDamagedError: the log cannot be read.
     """
+    if stop is not None and 0 < start >= stop:
+        raise UsageError(
+            f"from {start} to {stop} there is nothing to check: --from comes before --to"
+        )
     with Again(Path(run), start, source) as again:
         first = again.learner.iteration
         versions = again.header.arithmetic, arithmetic_of(again.learner)
