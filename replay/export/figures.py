@@ -195,12 +195,13 @@ def _became(history: History, row: int) -> str:
 
 
 def _share(axes: Axes, history: History) -> None:
-    """How much of the iterations around each went to each stream."""
+    """How much of the iterations around each, as far as there are some, went to each stream."""
     n, names = history.outline.iterations, history.outline.names()
     window = max(min(50, n // 4), 1)
+    around = np.convolve(np.ones(n), np.ones(window), mode="same")
     for s in history.shown:
-        share = np.convolve(history.stream == s, np.ones(window) / window, mode="same")
-        axes.plot(np.arange(n), share, color=_shade(history, s), label=names[s])
+        watched = np.convolve(history.stream == s, np.ones(window), mode="same")
+        axes.plot(np.arange(n), watched / around, color=_shade(history, s), label=names[s])
     axes.set_ylim(0, 1.4)  # with room for the legend
     axes.set_ylabel(f"share of time\n({window} iterations)")
 
