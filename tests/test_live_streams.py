@@ -398,7 +398,7 @@ def test_a_topic_that_is_no_image_is_refused(
         (["learn", TEST, "--resume", "-o", "run"], "learn from a recording of them"),
         (
             ["learn", TEST, "--topic", "/x"],
-            "of live streams only --size, --fit, --range, --field and --rate",
+            "of live streams only --size, --fit, --range, --field, --color and --rate",
         ),
         (["learn", "oscillatory", "--record", "x"], "--record is for live streams"),
         (["record", TEST, "-o", "x", "--resume"], "leave out --resume"),
@@ -406,11 +406,11 @@ def test_a_topic_that_is_no_image_is_refused(
         (["record", "icub", "oscillatory", "-o", "x"], "record one scene at a time"),
         (
             ["record", "icub", "--fit", "pad", "-o", "x"],
-            "--fit, --rate, --range and --field are for cameras",
+            "--fit, --rate, --range, --field and --color are for cameras",
         ),
         (
             ["record", "icub", "--size", "32x24", "-o", "x"],
-            "--size, --fit, --rate, --range and --field are for cameras",
+            "--size, --fit, --rate, --range, --field and --color are for cameras",
         ),
     ],
 )

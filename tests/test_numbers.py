@@ -314,7 +314,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
         ({"time": "word"}, "word holds string, neither dates nor numbers"),
         ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),
         ({"time": "big"}, "beyond any clock, counted in s: say what they count, as --time big:ns"),
-        ({"rate": 5, "size": (4, 4)}, "--size and --fit are for images"),
+        ({"rate": 5, "size": (4, 4)}, "--size, --fit, --color are for images"),
         ({"rate": 5, "topics": ["x"]}, "a table has no topics, leave x out; see --field"),
     ],
 )

@@ -120,7 +120,15 @@ number_options = options.together(
 look_options = options.together(topic_option, number_options, rate_option)
 """What of camera logs is shown or exported."""
 
-frame_options = options.together(size_option, fit_option, rate_option, range_option, field_option)
+color_option = click.option(
+    "--color",
+    is_flag=True,
+    help="Show red, green and blue beside one another, as a frame of three times the width.",
+)
+
+frame_options = options.together(
+    color_option, size_option, fit_option, rate_option, range_option, field_option
+)
 """How images of cameras, live or stored, become frames."""
 
 camera_options = options.together(
@@ -155,6 +163,7 @@ camera_options = options.together(
         "--to", "stop", callback=_seconds, metavar="TIME", help="Leave out images from then on."
     ),
     range_option,
+    color_option,
     click.option(
         "--stamp",
         type=click.Choice(["log", "header"]),

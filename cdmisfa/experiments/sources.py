@@ -264,11 +264,13 @@ def open_cameras_now(
             f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
             "and logs apart"
         )
-    framing = {key: getattr(cameras, key) for key in ("size", "fit", "depth", "fields", "rate")}
+    framing = {
+        key: getattr(cameras, key) for key in ("size", "fit", "depth", "fields", "color", "rate")
+    }
     if cameras != CameraOptions(**framing):
         raise UsageError(
-            "of live streams only --size, --fit, --range, --field and --rate are set: leave out "
-            "the others"
+            "of live streams only --size, --fit, --range, --field, --color and --rate are set: "
+            "leave out the others"
         )
     live = replace(live, **framing)
     source = open_live([str(word) for word in words], live, say=say, stop=stop)

@@ -21,6 +21,7 @@ class _Frames:
 
     size: Size | None
     fit: Fit
+    color: bool = False
     numbers: Vector | None = None
 
 
@@ -29,6 +30,7 @@ def framed(
     size: Size | None,
     fit: Fit,
     *,
+    color: bool = False,
     say: Callable[[str], None] = lambda line: None,
 ) -> list[FramedCamera]:
     """Cameras whose images are frames.
@@ -40,9 +42,10 @@ def framed(
         cameras: each is read in a thread of its own.
         size: (height, width) of a frame, or None.
         fit: see `fitted`.
+        color: show red, green and blue beside one another.
         say: told in a line what is cut or added, and when a camera's images change their size.
     """
-    frames = _Frames(size, fit)
+    frames = _Frames(size, fit, color)
     return [FramedCamera(camera, frames, say, gives=not n) for n, camera in enumerate(cameras)]
 
 
@@ -90,7 +93,7 @@ class FramedCamera:
         frames = self._frames
         if first.ndim > 1 and frames.size is None and not self._gives:
             return None
-        framing = framings([first], frames.size, frames.fit)[0]
+        framing = framings([first], frames.size, frames.fit, color=frames.color)[0]
         if isinstance(framing, Framing):
             frames.size = framing.size
             if size_of(first) != framing.size:

@@ -16,7 +16,8 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, one_line
 from recorder.cameras.stepped import Step, SteppedSource
-from recorder.images.framing import Fit, Framing, Size, default_size, size_of
+from recorder.images.frames import COLOR_RECIPE
+from recorder.images.framing import Fit, Size, framings
 from recorder.images.pixels import RECIPE, Bytes
 
 LARGEST_SEED: Final = 2**31 - 1
@@ -42,6 +43,7 @@ class GymSource(SteppedSource):
         seed: of the environments and of random actions.
         policy: gives the action for an observation; by default actions are random.
         hold: frames for which an action is kept.
+        color: show red, green and blue beside one another.
 
     Raises:
         UsageError: Gymnasium is missing, or there is no such environment.
@@ -58,12 +60,14 @@ class GymSource(SteppedSource):
         seed: int = 0,
         policy: Policy | None = None,
         hold: int = 1,
+        color: bool = False,
     ) -> None:
         self._environments = [make(task) if isinstance(task, str) else task for task in tasks]
         self._tasks = [str(getattr(e.spec, "id", e)) for e in self._environments]
         stated = self._environments[0].metadata.get("render_fps")
         numbered = [_numbers(e.observation_space) for e in self._environments]
         self._fit, self._seed, self._hold, self._random = fit, seed, hold, policy is None
+        self._color = color
         names = tuple(names or self._tasks)
         truth = tuple(
             f"{re.sub(r'[^0-9A-Za-z]', '_', name)}_{i}"
@@ -76,23 +80,23 @@ class GymSource(SteppedSource):
             for number, environment in enumerate(self._environments)
         ]
 
+        shown = np.asarray if color else picture
+
         def step(seen: Sequence[Any]) -> Step:
             known = [np.ravel(o) for o, n in zip(seen, numbered, strict=True) if n]
-            pictures = [picture(environment.render()) for environment in self._environments]
+            pictures = [shown(environment.render()) for environment in self._environments]
             return pictures, np.concatenate([*known, np.empty(0)]).astype(np.float64)
 
         steps = map(step, zip(*played, strict=True))
         first = next(steps)
-        sizes = [size_of(picture) for picture in first[0]]
-        size = size or default_size(sizes[0])
-        framings = [Framing(own, size, fit) for own in sizes]
+        made = framings(first[0], size, fit, color=color)
 
-        def shown() -> Iterator[Step]:
+        def frames() -> Iterator[Step]:
             for pictures, values in chain([first], steps):
-                framed = zip(framings, pictures, strict=True)
+                framed = zip(made, pictures, strict=True)
                 yield [framing.frame(picture) for framing, picture in framed], values
 
-        super().__init__(SourceSpec(names, size, "uint8", truth, fps, START_NS), shown())
+        super().__init__(SourceSpec(names, made[0].shape, "uint8", truth, fps, START_NS), frames())
 
     def describe(self) -> Mapping[str, Any]:
         """The environments, their seed, and how they were played."""
@@ -106,7 +110,7 @@ class GymSource(SteppedSource):
             "size": list(self._spec.frame_shape),
             "fit": self._fit,
             "rate": self._spec.fps,
-            "recipe": RECIPE,
+            "recipe": COLOR_RECIPE if self._color else RECIPE,
         }
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from recorder.images.frames import frame_gray
+from recorder.images.frames import frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS, Bytes
 
 DRIFT: Final = 1e-3
@@ -42,13 +42,21 @@ class VideoCamera:
         form: the format FFmpeg takes it for; None to find out.
         name: of the stream.
         timeout: seconds that opening and reading may take of a network stream.
+        color: show its colours.
 
     Raises:
         UsageError: PyAV is missing.
     """
 
     def __init__(
-        self, word: str, address: str, form: str | None, name: str, *, timeout: float
+        self,
+        word: str,
+        address: str,
+        form: str | None,
+        name: str,
+        *,
+        timeout: float,
+        color: bool = False,
     ) -> None:
         self.name = name
         self.rate: float | None = None
@@ -56,6 +64,7 @@ class VideoCamera:
         self._remote = _NETWORK.match(address) is not None
         self.finite = not self._remote and not address.startswith("/dev/")
         self._av = pyav(word)
+        self._shown = frame_colors if color else frame_gray
 
     def pictures(self) -> Iterator[tuple[int, Bytes]]:
         """See `Camera`."""
@@ -95,7 +104,7 @@ class VideoCamera:
             early = steady.early(time.monotonic(), presented)
             if early > 0 and not self._remote:
                 time.sleep(early)
-            yield steady.age(time.monotonic(), presented), frame_gray(frame)
+            yield steady.age(time.monotonic(), presented), self._shown(frame)
 
     def describe(self) -> Mapping[str, Any]:
         """The word, without what may be a password."""
@@ -136,7 +145,7 @@ class Steady:
         return round((delay - self._offset) * NANOSECONDS)
 
 
-def video_camera(word: str, name: str, *, timeout: float) -> VideoCamera:
+def video_camera(word: str, name: str, *, timeout: float, color: bool = False) -> VideoCamera:
     """The camera that a word names: `camera:DEVICE`, `av:FORMAT:ADDRESS`, `av:ADDRESS`, or a URL.
 
     Raises:
@@ -144,7 +153,7 @@ def video_camera(word: str, name: str, *, timeout: float) -> VideoCamera:
     """
     head, _, rest = word.partition(":")
     if head not in ("camera", "av"):
-        return VideoCamera(word, word, None, name, timeout=timeout)
+        return VideoCamera(word, word, None, name, timeout=timeout, color=color)
     if not rest:
         raise UsageError(f"{word} names no device: write {head}:/dev/video0, as it is")
     form = None
@@ -157,7 +166,7 @@ def video_camera(word: str, name: str, *, timeout: float) -> VideoCamera:
         formats = pyav(word).formats_available
         if address and not address.startswith("//") and known in formats:
             form, rest = known, address
-    return VideoCamera(word, rest, form, name, timeout=timeout)
+    return VideoCamera(word, rest, form, name, timeout=timeout, color=color)
 
 
 def _reason(error: Exception) -> str:

@@ -16,7 +16,7 @@ from recorder.cameras.framed import framed
 from recorder.cameras.live import HOLD, LiveSource
 from recorder.cameras.readers import STALL, OnLoss, Readers
 from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.frames import VIDEO_RECIPE
+from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import RECIPE, Depth
 from recorder.images.reading import Reading
@@ -36,12 +36,12 @@ class CameraKind:
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
             cannot open is a UsageError.
-        reads: whether `open` takes `reading`, too: what is taken of what it shows.
+        reads: what of a `Reading` it can give; where any, `open` takes `reading`, too.
         recipe: how what it shows becomes gray and small, for the record.
     """
 
     open: Callable[..., Camera]
-    reads: bool = False
+    reads: tuple[str, ...] = ()
     recipe: str = RECIPE
 
 
@@ -51,17 +51,17 @@ def _foxglove(word: str, name: str, *, reading: Reading) -> Camera:
     return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=reading)
 
 
-def _video(word: str, name: str) -> Camera:
+def _video(word: str, name: str, *, reading: Reading) -> Camera:
     from recorder.cameras.video import video_camera
 
-    return video_camera(word, name, timeout=_TIMEOUT)
+    return video_camera(word, name, timeout=_TIMEOUT, color=reading.color)
 
 
 CAMERAS: Registry[CameraKind] = Registry(
     "kind of camera",
     {
-        "foxglove": CameraKind(_foxglove, reads=True),
-        **{kind: CameraKind(_video, recipe=VIDEO_RECIPE) for kind in _VIDEO},
+        "foxglove": CameraKind(_foxglove, ("depth", "fields", "color")),
+        **{kind: CameraKind(_video, ("color",), VIDEO_RECIPE) for kind in _VIDEO},
     },
     group="cdmisfa.sources",
 )
@@ -78,6 +78,7 @@ class LiveOptions:
         depth: distances in metres that are shown black and white, and the range that numbers
             are kept in; None for none.
         fields: the numbers that are taken of messages instead of images; see `Field`.
+        color: whether frames show red, green and blue beside one another.
         rate: frames a second; None for the first stream's.
         hold: seconds for which a picture stands for those that are missing.
         on_loss: what is done about a camera that stalls or goes away.
@@ -89,6 +90,7 @@ class LiveOptions:
     fit: Fit = "crop"
     depth: Depth | None = None
     fields: tuple[str, ...] = ()
+    color: bool = False
     rate: float | None = None
     hold: float = HOLD
     on_loss: OnLoss = "reconnect"
@@ -141,17 +143,20 @@ def open_live(
             fit=options.fit,
             fps=options.rate,
             seed=options.seed,
+            color=options.color,
         )
     kinds = [CAMERAS[word.partition(":")[0].lower()] for word in words]
-    reading = Reading(options.depth, options.fields)
+    reading = Reading(options.depth, options.fields, color=options.color)
     for kind, word in zip(kinds, words, strict=True):
-        if options.fields and not kind.reads:
+        if options.fields and "fields" not in kind.reads:
             raise UsageError(f"{word} shows images: --field is for messages, of foxglove://")
+        if options.color and "color" not in kind.reads:
+            raise UsageError(f"{word} shows gray images: leave out --color")
     opened = [
         kind.open(word, name, reading=reading) if kind.reads else kind.open(word, name)
         for kind, word, name in zip(kinds, words, names, strict=True)
     ]
-    cameras = framed(opened, options.size, options.fit, say=say)
+    cameras = framed(opened, options.size, options.fit, color=options.color, say=say)
     inbox = Readers(cameras, on_loss=options.on_loss, stall=options.stall, say=say)
     about: dict[str, Any] = {
         "cameras": [dict(camera.describe()) for camera in cameras],
@@ -160,6 +165,8 @@ def open_live(
     }
     if options.fields:
         about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
+    if options.color:
+        about["recipe"] = COLOR_RECIPE
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
     return LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)

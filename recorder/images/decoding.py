@@ -33,7 +33,7 @@ def decoder_of(kind: MessageKind, reading: Reading) -> Taken | None:
         messages have no such field.
     """
     if not reading.fields:
-        return image_decoder(kind.schema, kind.encoding, reading.depth)
+        return image_decoder(kind.schema, kind.encoding, reading.depth, color=reading.color)
     opened = message_decoder(kind)
     if opened is None:
         return None

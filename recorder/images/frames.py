@@ -24,6 +24,48 @@ _STRETCH: Final[Bytes] = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 25
 """Luma of limited range as full range, a value for each byte, (256,)."""
 
 
+COLOR_RECIPE: Final = (
+    "red, green and blue beside one another, each as gray is; of a Bayer pattern green is the mean "
+    "of two; of a video by BT.709 or, where it states another or none, BT.601, in 16 bit whole "
+    "numbers, with each chroma pixel repeated"
+)
+"""How any image becomes a frame in colours, for the record."""
+
+_BT709: Final = 1
+_WEIGHTS: Final = {
+    True: (1.5748, -0.187324, -0.468124, 1.8556),
+    False: (1.402, -0.344136, -0.714136, 1.772),
+}
+"""Of BT.709 and BT.601: red by Cr, green by Cb and by Cr, blue by Cb."""
+
+
+def frame_colors(frame: Any) -> Bytes:
+    """The colours of a frame of PyAV, (height, width, 3) uint8, or the luma of one without."""
+    form = frame.format
+    if form.name.startswith("gray"):
+        return frame_gray(frame)
+    luma_first = form.name.startswith("yuv") and len(form.components) >= 3
+    if not luma_first or form.components[0].bits != 8 or not form.is_planar:
+        colours: Bytes = frame.to_ndarray(format="rgb24")
+        return colours
+    luma = frame_gray(frame).astype(np.int32) << 16
+    full = form.name.startswith("yuvj") or frame.color_range == _FULL_RANGE
+    height, width = luma.shape
+    chroma = []
+    for plane in frame.planes[1:3]:
+        values = gray(memoryview(plane), plane.height, plane.width, "mono8", plane.line_size)
+        rows, columns = -(-height // plane.height), -(-width // plane.width)
+        large = values.repeat(rows, axis=0).repeat(columns, axis=1)[:height, :width]
+        chroma.append(large.astype(np.int32) - 128)
+    scale = (1 if full else 255 / 224) * 65536
+    red, green_cb, green_cr, blue = (
+        round(weight * scale) for weight in _WEIGHTS[frame.colorspace == _BT709]
+    )
+    cb, cr = chroma
+    colors = (luma + red * cr, luma + green_cb * cb + green_cr * cr, luma + blue * cb)
+    return np.stack([((c + 32768) >> 16).clip(0, 255).astype(np.uint8) for c in colors], axis=2)
+
+
 def frame_gray(frame: Any) -> Bytes:
     """The luma of a frame of PyAV, or the grey of its colours, (height, width) uint8."""
     form = frame.format

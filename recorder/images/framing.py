@@ -29,19 +29,29 @@ class Framing:
         first: size of its first image.
         size: of a frame.
         fit: see `fitted`.
+        color: whether a frame shows red, green and blue beside one another.
     """
 
     first: Size
     size: Size
     fit: Fit
+    color: bool = False
 
     def frame(self, image: Bytes) -> Bytes:
         """Make an image a frame; one of another size than the first may be smaller than a frame.
 
+        Args:
+            image: (height, width), or (height, width, 3) in colours.
+
         Raises:
             UsageError: the image is smaller, as the first is.
         """
-        return fitted(image, self.size, self.fit, enlarge=size_of(image) != self.first)
+        enlarge = size_of(image) != self.first
+        if not self.color:
+            return fitted(image, self.size, self.fit, enlarge=enlarge)
+        planes = [image] if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
+        shown = [fitted(plane, self.size, self.fit, enlarge=enlarge) for plane in planes]
+        return np.hstack(shown if len(shown) == 3 else shown * 3)
 
     def change(self, image: Bytes) -> str:
         """What the user should know of an image of another size; "" of one like the first."""
@@ -54,7 +64,7 @@ class Framing:
     @property
     def shape(self) -> tuple[int, ...]:
         """Of a frame."""
-        return self.size
+        return self.size[0], self.size[1] * (3 if self.color else 1)
 
     @property
     def lossy(self) -> str:
@@ -106,20 +116,23 @@ class Vector:
         return "a number" if self.count == 1 else f"{self.count} numbers"
 
 
-def framings(firsts: Sequence[Shown], size: Size | None, fit: Fit) -> list[Framing] | list[Vector]:
+def framings(
+    firsts: Sequence[Shown], size: Size | None, fit: Fit, *, color: bool = False
+) -> Sequence[Framing | Vector]:
     """How what streams show becomes frames, all of one shape.
 
     Args:
         firsts: what each stream shows first.
         size: (height, width) of a frame; None for the `default_size` of the first image.
         fit: see `fitted`.
+        color: show red, green and blue beside one another.
 
     Raises:
         UsageError: some show images and some numbers, or not as many.
     """
     if all(first.ndim > 1 for first in firsts):
         size = size or default_size(size_of(firsts[0]))
-        return [Framing(size_of(first), size, fit) for first in firsts]
+        return [Framing(size_of(first), size, fit, color) for first in firsts]
     counts = [len(first) for first in firsts if first.ndim == 1]
     if len(counts) < len(firsts) or len(set(counts)) > 1:
         raise UsageError(
@@ -127,8 +140,8 @@ def framings(firsts: Sequence[Shown], size: Size | None, fit: Fit) -> list[Frami
             + " and ".join(dict.fromkeys(_shown_in_words(first) for first in firsts))
             + ": take as many numbers of each, as with --field position[0:6], or each apart"
         )
-    if size is not None or fit != "crop":
-        raise UsageError("numbers are taken as they are: --size and --fit are for images")
+    if size is not None or fit != "crop" or color:
+        raise UsageError("numbers are taken as they are: --size, --fit, --color are for images")
     return [Vector(count) for count in counts]
 
 

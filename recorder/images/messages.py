@@ -21,26 +21,30 @@ Decoder = Callable[[bytes | memoryview], Bytes]
 """Turns a message into a gray image, (height, width) uint8; raises MalformedImage."""
 
 
-def image_decoder(schema: str, encoding: str, depth: Depth | None = None) -> Decoder | None:
+def image_decoder(
+    schema: str, encoding: str, depth: Depth | None = None, *, color: bool = False
+) -> Decoder | None:
     """The decoder for messages of a schema in an encoding, or None.
 
     Args:
         schema: type of the messages.
         encoding: of the messages.
         depth: how distances are shown; see `gray`.
+        color: give what has colours as they are; see `gray`.
     """
-    decoder = _DECODERS.get((schema, encoding))
-    raw = _RAW.get((schema, encoding))
-    return decoder if raw is None or depth is None else partial(raw, depth=depth)
+    if (raw := _RAW.get((schema, encoding))) is not None:
+        return partial(raw, depth=depth, color=color)
+    packed = _COMPRESSED.get((schema, encoding))
+    return None if packed is None else partial(packed, color=color)
 
 
-def _foxglove_raw(data: bytes | memoryview, depth: Depth | None = None) -> Bytes:
+def _foxglove_raw(data: bytes | memoryview, **shown: Any) -> Bytes:
     m = _parse(RawImage, data)
-    return gray(m.data, m.height, m.width, m.encoding, m.step, depth=depth)
+    return gray(m.data, m.height, m.width, m.encoding, m.step, **shown)
 
 
-def _foxglove_compressed(data: bytes | memoryview) -> Bytes:
-    return compressed_gray(_parse(CompressedImage, data).data)
+def _foxglove_compressed(data: bytes | memoryview, *, color: bool) -> Bytes:
+    return compressed_gray(_parse(CompressedImage, data).data, color=color)
 
 
 def _parse(kind: Any, data: bytes | memoryview) -> Any:
@@ -50,17 +54,17 @@ def _parse(kind: Any, data: bytes | memoryview) -> Any:
         raise MalformedImage(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
 
 
-def _json_raw(data: bytes | memoryview, depth: Depth | None = None) -> Bytes:
+def _json_raw(data: bytes | memoryview, **shown: Any) -> Bytes:
     fields = _json(data)
     numbers = [fields.get(k) for k in ("height", "width", "step")]
     if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
         raise MalformedImage("a JSON image needs whole height, width and step")
     height, width, step = (int(n) for n in numbers if n is not None)
-    return gray(_base64(fields), height, width, str(fields.get("encoding")), step, depth=depth)
+    return gray(_base64(fields), height, width, str(fields.get("encoding")), step, **shown)
 
 
-def _json_compressed(data: bytes | memoryview) -> Bytes:
-    return compressed_gray(_base64(_json(data)))
+def _json_compressed(data: bytes | memoryview, *, color: bool) -> Bytes:
+    return compressed_gray(_base64(_json(data)), color=color)
 
 
 def _json(data: bytes | memoryview) -> Mapping[str, Any]:
@@ -128,29 +132,18 @@ def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
     return None if kind is None or encoding != "protobuf" else partial(_parse, kind)
 
 
-def _ros_raw(data: bytes | memoryview, *, ros1: bool, depth: Depth | None = None) -> Bytes:
+def _ros_raw(data: bytes | memoryview, *, ros1: bool, **shown: Any) -> Bytes:
     fields = _RosFields(data, ros1=ros1)
     height, width, encoding = fields.u32(), fields.u32(), fields.text()
     big_endian, step = bool(fields.take(1)[0]), fields.u32()
-    return gray(fields.data(), height, width, encoding, step, big_endian=big_endian, depth=depth)
+    return gray(fields.data(), height, width, encoding, step, big_endian=big_endian, **shown)
 
 
-def _ros_compressed(data: bytes | memoryview, *, ros1: bool) -> Bytes:
+def _ros_compressed(data: bytes | memoryview, *, ros1: bool, color: bool) -> Bytes:
     fields = _RosFields(data, ros1=ros1)
     fields.text()
-    return compressed_gray(bytes(fields.data()))
+    return compressed_gray(bytes(fields.data()), color=color)
 
-
-_DECODERS: Final[Mapping[tuple[str, str], Decoder]] = {
-    ("foxglove.RawImage", "protobuf"): _foxglove_raw,
-    ("foxglove.CompressedImage", "protobuf"): _foxglove_compressed,
-    ("foxglove.RawImage", "json"): _json_raw,
-    ("foxglove.CompressedImage", "json"): _json_compressed,
-    ("sensor_msgs/msg/Image", "cdr"): lambda data: _ros_raw(data, ros1=False),
-    ("sensor_msgs/msg/CompressedImage", "cdr"): lambda data: _ros_compressed(data, ros1=False),
-    ("sensor_msgs/Image", "ros1"): lambda data: _ros_raw(data, ros1=True),
-    ("sensor_msgs/CompressedImage", "ros1"): lambda data: _ros_compressed(data, ros1=True),
-}
 
 _RAW: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
     ("foxglove.RawImage", "protobuf"): _foxglove_raw,
@@ -158,7 +151,14 @@ _RAW: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
     ("sensor_msgs/msg/Image", "cdr"): partial(_ros_raw, ros1=False),
     ("sensor_msgs/Image", "ros1"): partial(_ros_raw, ros1=True),
 }
-"""Those of messages that hold pixels, which may be distances."""
+"""Decoders of messages that hold pixels, which may be distances."""
 
-SCHEMAS: Final = tuple(sorted({schema for schema, _ in _DECODERS}))
+_COMPRESSED: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
+    ("foxglove.CompressedImage", "protobuf"): _foxglove_compressed,
+    ("foxglove.CompressedImage", "json"): _json_compressed,
+    ("sensor_msgs/msg/CompressedImage", "cdr"): partial(_ros_compressed, ros1=False),
+    ("sensor_msgs/CompressedImage", "ros1"): partial(_ros_compressed, ros1=True),
+}
+
+SCHEMAS: Final = tuple(sorted({schema for schema, _ in (*_RAW, *_COMPRESSED)}))
 """Message types that are read."""

@@ -71,6 +71,7 @@ def gray(
     *,
     big_endian: bool = False,
     depth: Depth | None = None,
+    color: bool = False,
 ) -> Bytes:
     """Turn pixels of any supported format into gray, (height, width) uint8.
 
@@ -85,6 +86,7 @@ def gray(
         big_endian: the byte order of 16 and 32 bits.
         depth: show distances, 16UC1 in millimetres and 32FC1 in metres, from black to white;
             black, too, where none was measured. None takes 16UC1 as gray.
+        color: give what has colours as they are, (height, width, 3) red, green and blue.
 
     Raises:
         UsageError: 32FC1, and no `depth`.
@@ -120,11 +122,14 @@ def gray(
         values = np.ndarray((height, width), order + number, raw, 0, (step, size))
         return _shown_depth(values, metres, depth)
     if kind == "bayer":
-        return _bayer_gray(rows[:, :, 0 if big_endian else size - 1], _BAYER[encoding])
+        pattern, order = rows[:, :, 0 if big_endian else size - 1], _BAYER[encoding]
+        return _bayer_colors(pattern, order) if color else _bayer_gray(pattern, order)
     if kind == "gray":
         return np.ascontiguousarray(rows[:, :, 0])
     if kind == "gray16":
         return np.ascontiguousarray(rows[:, :, 0 if big_endian else 1])
+    if color:
+        return np.ascontiguousarray(rows[:, :, [kind.index(c) for c in "rgb"]])
     found = np.empty((height, width), np.uint8)
     for band in _bands(height, width):
         red, green, blue = (rows[band, :, kind.index(c)].astype(np.uint32) for c in "rgb")
@@ -147,6 +152,17 @@ def _bayer_gray(pixels: Bytes, order: str) -> Bytes:
             total += weights[colour] * cell.astype(np.uint32)
         found[band] = total >> 16
     return found
+
+
+def _bayer_colors(pixels: Bytes, order: str) -> Bytes:
+    """The colours of each two by two pixels of a Bayer pattern; green is the mean of its two."""
+    height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
+    if not height * width:
+        raise MalformedImage("a Bayer pattern has two rows and columns at least")
+    cells = [pixels[i // 2 : 2 * height : 2, i % 2 : 2 * width : 2] for i in range(4)]
+    one, two = (cells[i].astype(np.uint16) for i, colour in enumerate(order) if colour == "g")
+    green = ((one + two + 1) >> 1).astype(np.uint8)
+    return np.stack([cells[order.index("r")], green, cells[order.index("b")]], axis=2)
 
 
 def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> Bytes:
@@ -196,8 +212,8 @@ def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> B
     return np.asarray(small, np.uint8)
 
 
-def compressed_gray(data: bytes) -> Bytes:
-    """Decode a JPEG or PNG into gray.
+def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
+    """Decode a JPEG or PNG into gray, or into colours where it has them; see `gray`.
 
     Raises:
         MalformedImage: it is neither, broken, or too large.
@@ -217,8 +233,7 @@ def compressed_gray(data: bytes) -> Bytes:
                 return _high_bytes(np.asarray(image))
             if image.mode not in ("L", "RGB"):
                 image = image.convert("RGB")
-            image = image.convert("L")
-            return np.array(image, np.uint8)
+            return np.array(image if color else image.convert("L"), np.uint8)
     except MalformedImage:
         raise
     except MemoryError:

@@ -18,6 +18,7 @@ class Reading:
         depth: what is shown of distances, see `gray`, and the range that numbers are kept in.
         fields: the numbers that are taken instead of images; see `Field`.
         stamp: the times of messages: those of the log, or those in their headers.
+        color: whether images are taken in their colours; see `gray`.
         time: the column of a table's times, with its unit; see `TableNumbers`.
     """
 
@@ -25,6 +26,7 @@ class Reading:
     fields: tuple[str, ...] = ()
     time: str | None = None
     stamp: Clock = "log"
+    color: bool = False
 
 
 IMAGES = Reading()

@@ -60,11 +60,11 @@ def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading)
         if reading.fields and (path.is_dir() or is_video(path)):
             raise UsageError(f"{path} holds images: --field is for messages and tables")
         if is_dataset(path):
-            return LeRobotImages(path, topic)
+            return LeRobotImages(path, topic, color=reading.color)
         if path.is_dir():
-            return FolderImages(path, topic)
+            return FolderImages(path, topic, color=reading.color)
         if is_video(path):
-            return VideoImages(path, topic)
+            return VideoImages(path, topic, color=reading.color)
     return McapImages(path, topic, salvage=salvage, reading=reading)
 
 

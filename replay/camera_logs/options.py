@@ -33,6 +33,7 @@ class CameraOptions:
         fields: the numbers that are taken of messages or of a table instead of images, one after
             the other; see `Field`.
         stamp: when a message is taken to be of: when it was logged, or as its header says.
+        color: whether frames show red, green and blue beside one another.
         time: the column of a table's times; see `TableNumbers`.
     """
 
@@ -48,3 +49,4 @@ class CameraOptions:
     fields: tuple[str, ...] = ()
     time: str | None = None
     stamp: Clock = "log"
+    color: bool = False

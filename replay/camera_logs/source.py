@@ -12,6 +12,7 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
 from recorder.images.pixels import Depth, MalformedImage, Shown
 from recorder.images.reading import Clock, Reading
@@ -64,6 +65,7 @@ class ForeignSource(StoredSource):
         depth: distances in metres that are shown black and white.
         fields: the numbers that are taken instead of images, one after the other.
         time: the column of a table's times.
+        color: show red, green and blue beside one another, (height, 3 width).
         stamp: the times of messages: those of the log, or those in their headers.
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
@@ -96,6 +98,7 @@ class ForeignSource(StoredSource):
         fields: Sequence[str] = (),
         time: str | None = None,
         stamp: Clock = "log",
+        color: bool = False,
         rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
@@ -117,7 +120,7 @@ class ForeignSource(StoredSource):
         self._files = image_logs(named)
         self._loop = loop
         self._hashes: list[dict[str, Any]] | None = None
-        self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp)
+        self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp, color)
         self._asked_size = size
         self._goal = goal
         self._streams: list[ImageStream] = []
@@ -137,7 +140,7 @@ class ForeignSource(StoredSource):
                 self._times = known_times(self._streams, self._fps)
             start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
-            self._framings = framings(firsts, size, fit)
+            self._framings = framings(firsts, size, fit, color=color)
             shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
@@ -174,12 +177,13 @@ class ForeignSource(StoredSource):
         else:
             for part in parts:
                 part.confirm()
+        recipes = dict.fromkeys(s.recipe for s in self._streams)
         return {
             "kind": "foreign",
             "files": self._hashes,
             "topics": [s.topic for s in self._streams],
             "size": list(self._spec.frame_shape),
-            "recipe": "; ".join(dict.fromkeys(s.recipe for s in self._streams)),
+            "recipe": COLOR_RECIPE if self._reading.color else "; ".join(recipes),
             "align": self._align_by,
             "rate": self._fps,
             **self._chosen(),
@@ -217,6 +221,8 @@ class ForeignSource(StoredSource):
             chosen["time"] = self._reading.time
         if self._reading.stamp != "log":
             chosen["stamp"] = self._reading.stamp
+        if self._reading.color:
+            chosen["color"] = "red, green and blue beside one another"
         return chosen
 
     def close(self) -> None:
@@ -318,6 +324,8 @@ class ForeignSource(StoredSource):
             words += ["--time", self._reading.time]
         if self._reading.stamp != "log":
             words += ["--stamp", self._reading.stamp]
+        if self._reading.color:
+            words += ["--color"]
         words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
 

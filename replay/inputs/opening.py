@@ -105,6 +105,7 @@ def open_cameras(
         fields=cameras.fields,
         time=cameras.time,
         stamp=cameras.stamp,
+        color=cameras.color,
         rate=cameras.rate,
         loop=loop,
         salvage=salvage,

@@ -121,8 +121,8 @@ def record_command(
         return
     if cameras != CameraOptions():
         raise UsageError(
-            "--size, --fit, --rate, --range and --field are for cameras: a scene has record.fps, "
-            "and its own"
+            "--size, --fit, --rate, --range, --field and --color are for cameras: a scene has "
+            "record.fps, and its own"
         )
     _refuse_logs(source)
     begun = read_recording(out) if resume and out is not None else Begun()

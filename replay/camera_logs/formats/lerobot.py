@@ -33,8 +33,8 @@ class LeRobotImages(ImageStream):
         CdmisfaError: the package av is missing.
     """
 
-    def __init__(self, path: Path, topic: str | None) -> None:
-        self.path = path
+    def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
+        self.path, self._color = path, color
         self._info = _info(path)
         cameras = dataset_cameras(path)
         if topic is None and len(cameras) == 1:
@@ -78,7 +78,8 @@ class LeRobotImages(ImageStream):
             self.close()
             if not file.is_file():
                 raise LogDamagedError(f"{file}: there is no such file, its dataset names it")
-            self._open = (file, VideoImages(file, None) if self._video else self._table(file))
+            images = self._opened(file)
+            self._open = (file, images)
         images = self._open[1]
         if not self._video:
             return self._picture(images, place)
@@ -94,6 +95,9 @@ class LeRobotImages(ImageStream):
         opened, self._open = self._open, None
         if opened is not None and self._video:
             opened[1].close()
+
+    def _opened(self, file: Path) -> Any:
+        return VideoImages(file, None, color=self._color) if self._video else self._table(file)
 
     def _table(self, file: Path) -> Any:
         import pyarrow.parquet as pq
@@ -111,7 +115,7 @@ class LeRobotImages(ImageStream):
         if not isinstance(data, bytes):
             raise MalformedRecord("its table holds no picture there")
         with explained(self.path, "Pillow", held=table.nbytes + len(data)):
-            return compressed_gray(data)
+            return compressed_gray(data, color=self._color)
 
 
 def is_dataset(path: Path) -> bool:

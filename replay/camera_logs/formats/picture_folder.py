@@ -23,8 +23,8 @@ MAX_BYTES: Final = 64 * 1024 * 1024
 class FolderImages(ImageStream):
     """The pictures of a folder, in the order of their names, numbers by value."""
 
-    def __init__(self, path: Path, topic: str | None) -> None:
-        self.path = path
+    def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
+        self.path, self._color = path, color
         self.topic = path.resolve().name
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a folder of pictures has no topics, leave {topic} out")
@@ -41,7 +41,7 @@ class FolderImages(ImageStream):
         return len(self._files)
 
     def image(self, row: int) -> Bytes:
-        return compressed_gray(read_regular(self._files[row], MAX_BYTES))
+        return compressed_gray(read_regular(self._files[row], MAX_BYTES), color=self._color)
 
     def where(self, row: int) -> str:
         return str(self._files[row])

@@ -17,7 +17,7 @@ import numpy as np
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import data_bytes
-from recorder.images.frames import VIDEO_RECIPE, frame_gray
+from recorder.images.frames import VIDEO_RECIPE, frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 from replay.mcap.records import Bytes, MalformedRecord
@@ -39,8 +39,9 @@ class VideoImages(ImageStream):
 
     recipe = VIDEO_RECIPE
 
-    def __init__(self, path: Path, topic: str | None) -> None:
+    def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
         self.path = path
+        self._shown = frame_colors if color else frame_gray
         self.topic = path.stem
         self._av = _pyav(path)
         self._next = _NOWHERE
@@ -73,7 +74,7 @@ class VideoImages(ImageStream):
             if found is None or found.pts != stamp or found.is_corrupt:
                 self._next = _NOWHERE
                 raise MalformedRecord("the video is broken, no frame can be decoded")
-            return frame_gray(found)
+            return self._shown(found)
 
     def where(self, row: int) -> str:
         return f"{self.path}: at {float(int(self._stamps[row]) * self._tick):g} s"

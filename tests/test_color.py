@@ -1,0 +1,152 @@
+"""Images in their colours: red, green and blue beside one another."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from PIL import Image
+from test_numbers import STEP, write_mcap
+
+from cdmisfa import GymSource
+from cdmisfa.core.errors import UsageError
+from recorder.cameras.words import CAMERAS, CameraKind, LiveOptions, open_live
+from recorder.images.frames import frame_colors
+from recorder.images.framing import Framing
+from recorder.images.messages import image_decoder
+from recorder.images.reading import MessageKind
+from replay.camera_logs.source import ForeignSource
+from replay.recordings.source import RecordedSource
+
+HEIGHT, WIDTH, COUNT = 12, 16, 60
+
+
+def colors(count: int = COUNT) -> np.ndarray:
+    """(count, HEIGHT, WIDTH, 3): what is slow is in the blue alone."""
+    shown = np.random.default_rng(5).integers(0, 255, (count, HEIGHT, WIDTH, 3))
+    shown[..., 2] = (127 + 120 * np.sin(np.arange(count) / 9))[:, None, None]
+    return shown.astype(np.uint8)
+
+
+def beside(images: np.ndarray) -> np.ndarray:
+    return np.concatenate([images[..., c] for c in range(3)], axis=-1)
+
+
+def raw(image: np.ndarray, encoding: str) -> bytes:
+    height, width = image.shape[:2]
+    step = image.size // height * image.itemsize
+    message = RawImage(width=width, height=height, step=step, encoding=encoding)
+    message.data = np.ascontiguousarray(image).tobytes()
+    return bytes(message.SerializeToString())
+
+
+@pytest.mark.parametrize(
+    ("encoding", "places"), [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("bgra8", (2, 1, 0, 0))]
+)
+def test_pixels_keep_their_colours(encoding: str, places: tuple[int, ...]) -> None:
+    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
+    assert decode is not None
+    image = colors(1)[0]
+    assert (decode(raw(image[:, :, list(places)], encoding)) == image).all()
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_two_by_two_pixels_of_a_bayer_pattern_are_one_in_colours(bits: int) -> None:
+    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
+    assert decode is not None
+    pattern = np.array([[10, 200, 11], [101, 30, 0], [1, 2, 3]]) << (bits - 8)
+    shown = decode(raw(pattern.astype(f"<u{bits // 8}"), f"bayer_grbg{bits}"))
+    assert shown.tolist() == [[[200, 20, 101]]]
+
+
+def test_gray_images_are_shown_three_times_among_colours() -> None:
+    framing = Framing((2, 4), (1, 2), "crop", color=True)
+    gray = np.array([[0, 10, 20, 30], [0, 10, 20, 30]], np.uint8)
+    assert framing.shape == (1, 6)
+    assert framing.frame(gray).tolist() == [[5, 25] * 3]
+    assert framing.frame(np.stack([gray, gray + 1, gray + 2], axis=2)).tolist() == [
+        [5, 25, 6, 26, 7, 27]
+    ]
+
+
+@pytest.mark.parametrize("form", ["yuv420p", "yuv422p", "yuv444p", "yuvj420p"])
+def test_colours_of_a_video_are_those_that_ffmpeg_shows(form: str) -> None:
+    av = pytest.importorskip("av")
+    smooth = np.indices((32, 48)).transpose(1, 2, 0) * [5, 3]
+    image = np.dstack([smooth, 200 - smooth[..., :1]]).astype(np.uint8)
+    frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=form)
+    ours, theirs = frame_colors(frame).astype(int), frame.to_ndarray(format="rgb24").astype(int)
+    inner = np.s_[2:-2, 2:-2]
+    assert np.abs(ours - theirs)[inner].max() <= 6
+    assert np.abs(ours - theirs)[inner].mean() < 2
+
+
+def test_colours_of_other_formats_are_taken(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    image = colors(1)[0]
+    (tmp_path / "pngs").mkdir()
+    for i in range(3):
+        Image.fromarray(image).save(tmp_path / "pngs" / f"{i}.png")
+    with contextlib.closing(ForeignSource(tmp_path / "pngs", rate=5, color=True)) as source:
+        assert source.spec.frame_shape == (HEIGHT, 3 * WIDTH)
+        assert (source.take(0, 1).frames[0] == beside(image)).all()
+    for form in ("rgb24", "gray"):
+        frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format=form)
+        assert frame_colors(frame).ndim == (2 if form == "gray" else 3)
+
+
+def test_colours_are_learned_from_recorded_and_replayed_alike(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    def packed(image: np.ndarray) -> bytes:
+        data = io.BytesIO()
+        Image.fromarray(image).save(data, "PNG")
+        return bytes(CompressedImage(data=data.getvalue(), format="png").SerializeToString())
+
+    kind = MessageKind("foxglove.CompressedImage", "protobuf")
+    messages = (packed(image) for image in colors())
+    log = write_mcap(tmp_path / "a.mcap", kind, {"/cam": (STEP, messages)})
+    options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
+    out = tmp_path / "run"
+    run = cdmisfa("learn", log, "--color", *options, "-o", out, "--no-rerun").json
+    assert run["source"]["size"] == [HEIGHT, 3 * WIDTH]
+    assert run["source"]["color"] == "red, green and blue beside one another"
+    assert run["source"]["recipe"].startswith("red, green and blue")
+    assert cdmisfa("learn", log, *options).json["signals_sha256"] != run["signals_sha256"]
+    assert cdmisfa("check", out).code == 0
+    assert cdmisfa("convert", log, "--color", "-o", tmp_path / "rec").code == 0
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
+        assert (source.take(0, COUNT).frames == beside(colors())).all()
+    again = cdmisfa("learn", tmp_path / "rec", *options).json
+    assert again["signals_sha256"] == run["signals_sha256"]
+
+
+def test_live_streams_are_recorded_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    rec = tmp_path / "rec"
+    words = ["av:lavfi:color=c=red:size=32x24:rate=50", "--color", "--size", "16x12"]
+    done = cdmisfa("record", *words, "--frames", "5", "-o", rec)
+    assert done.code == 0, done.err
+    with contextlib.closing(RecordedSource(rec)) as source:
+        red, green, blue = np.split(source.take(0, 2).frames[1], 3, axis=1)
+        assert red.shape == (12, 16)
+        assert red.min() >= 250
+        assert max(green.max(), blue.max()) <= 5
+    with contextlib.closing(GymSource(["CartPole-v1"], size=(20, 30), color=True)) as task:
+        assert task.spec.frame_shape == (20, 90)
+        assert task.take(0, 2).frames.shape == (2, 20, 90)
+
+
+def test_what_has_no_colours_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "t.csv").write_text("a\n1\n2\n")
+    with pytest.raises(UsageError, match=r"--color are for images"):
+        ForeignSource(tmp_path / "t.csv", rate=5, color=True)
+    monkeypatch.setitem(CAMERAS._entries, "plain", CameraKind(lambda word, name: None))
+    with pytest.raises(UsageError, match="plain:1 shows gray images: leave out --color"):
+        open_live(["plain:1"], LiveOptions(color=True))
