@@ -161,8 +161,17 @@ def record(
         if resume:
             earlier, split, frames = _as_begun(folder, identity, chosen, split, frames)
         frames = frames or length or DEFAULT_FRAMES
+        begun = read_recording(folder).options["frames"] if resume else {}
         places = {
-            view: resume_view(folder, view, identity, split, there, frames)
+            view: resume_view(
+                folder,
+                view,
+                identity,
+                split,
+                there,
+                frames,
+                ended=identity.gaps and view not in begun,
+            )
             for view, there in earlier.items()
         }
         if resume and (others := other_recordings(folder, identity)):

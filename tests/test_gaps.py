@@ -21,7 +21,7 @@ from cdmisfa.experiments.convert import convert
 from cdmisfa.testing.sources import SourceContract
 from recorder.images.framing import FRAME_PIXELS, Fit, default_size, fitted
 from recorder.log.split import Split
-from recorder.recording import RecordingStoppedError
+from recorder.recording import RecordingStoppedError, recorded
 from replay.camera_logs.options import Align
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
@@ -221,6 +221,25 @@ def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: Split | None) 
             assert sorted(path.name for path in part.iterdir()) == names
             assert all((part / n).read_bytes() == (whole / n).read_bytes() for n in names)
             converted(part.name, 999, resume=True)
+
+
+def test_a_whole_conversion_with_gaps_is_left_as_it_is(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    left = write_log(tmp_path / "left.mcap", PAUSED)
+    # pauses where the other ends, so that its view ends before
+    right = write_log(tmp_path / "right.mcap", [*range(0, 8000, STEP_MS), 12000])
+    words = ["convert", left, right, "--align", "time", "-o", tmp_path / "rec"]
+    assert cdmisfa(*words).code == 0
+    ends = [stretches[-1][1] for stretches in coverage(tmp_path / "rec").values()]
+    assert len(set(ends)) == 2
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "rec").iterdir()}
+    again = cdmisfa(*words, "--resume")
+    assert again.code == 0, again.err
+    assert "is complete: nothing was left to record" in again.err
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "rec").iterdir()} == before
+    assert sorted(v.frames for v in recorded(tmp_path / "rec")) == sorted(
+        sum(high - low for low, high in stretches)
+        for stretches in coverage(tmp_path / "rec").values()
+    )
 
 
 def test_images_that_change_their_size_are_said_and_shown(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

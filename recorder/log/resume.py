@@ -47,12 +47,14 @@ class FramesHeld(NamedTuple):
         stop: its frames [first, stop) are all there, except those of gaps.
         end: one more than its last frame; 0 without any.
         gaps: whether the source may lack frames, the first of a log, too.
+        count: how many of [first, stop) are there.
     """
 
     first: int
     stop: int
     end: int
     gaps: bool = False
+    count: int = 0
 
     def whole(self, first: int) -> int:
         """Up to before which frame all from a given one on are there."""
@@ -68,15 +70,15 @@ def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
         view: name of the view.
         gaps: whether the source may lack frames.
     """
-    first = stop = end = 0
+    first = stop = end = count = 0
     for channel, message in messages(path):
         if channel.topic == view_topic(view):
             if not end:
                 first = stop = message.sequence
             if message.sequence == stop or (gaps and message.sequence > stop):
-                stop = message.sequence + 1
+                stop, count = message.sequence + 1, count + 1
             end = max(end, message.sequence + 1)
-    return FramesHeld(first, stop, end, gaps)
+    return FramesHeld(first, stop, end, gaps, count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,8 @@ def resume_view(
     split: Split | None,
     there: Mapping[Path, FramesHeld],
     frames: int,
+    *,
+    ended: bool = False,
 ) -> Resume:
     """Pass over the parts that are finished, and find where to resume. Changes nothing.
 
@@ -119,6 +123,7 @@ def resume_view(
         split: where parts end.
         there: all of the view's files, and what they hold.
         frames: how many the view shall have; no file has more.
+        ended: whether its recording has ended, so that what its files lack is a gap.
 
     Raises:
         UsageError: what is there is something else, or split in another way.
@@ -158,9 +163,9 @@ def resume_view(
                 f"{best} has {stop - first} frames, with this --split it would have {length}: "
                 "use the same, or overwrite with --force"
             )
-        if best == path and stop == frames and not follows:
+        if best == path and (stop == frames or ended) and not follows:
             copied += [p for p in found if p == aside_path(path)]
-            parts.append((path, stop - first))
+            parts.append((path, there[path].count))
             return Resume(path, tuple(parts), stop, stale=tuple(copied), complete=True)
         if not follows:
             place = Resume(path, tuple(parts), first, best, stop, (*copied, *later))
@@ -171,7 +176,7 @@ def resume_view(
                 "or overwrite with --force"
             )
         copied += [p for p in found if p == aside_path(path)]
-        parts.append((path, stop - first))
+        parts.append((path, there[path].count))
         first = stop
     finished = next((p for p in later if p.suffix == ".mcap"), None)
     if finished is not None:
@@ -191,7 +196,7 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
     logs = logs_in(folder) if folder.is_dir() and not (folder / RECORDING).exists() else []
     found: list[tuple[str, Path, int]] = []
     streams: set[str] = set()
-    count = ""
+    count, gaps = "", False
     stops: dict[str, int] = {}
     for path in sorted(logs, key=lambda path: (len(path.name), path.name)):
         record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
@@ -199,13 +204,14 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
             return []
         streams.update(filter(None, record.metadata.get("streams", "").split(",")))
         count = record.metadata.get("stream_count", "")
-        held = frames_held(path, view := record.metadata.get("view", ""))
-        if held.first != stops.get(view, 0) or held.stop != held.end:
+        gaps = record.metadata.get("gaps") == str(True)
+        held = frames_held(path, view := record.metadata.get("view", ""), gaps=gaps)
+        if held.whole(stops.get(view, 0)) != held.end or not held.end:
             return []
         stops[view] = held.stop
-        found.append((view, path, held.stop - held.first))
+        found.append((view, path, held.count))
     every = stops.keys() == streams if streams else str(len(stops)) == count
-    return found if every and len(set(stops.values())) == 1 else []
+    return found if every and (gaps or len(set(stops.values())) == 1) else []
 
 
 def other_recordings(folder: Path, identity: Identity) -> list[Path]:

@@ -10,7 +10,12 @@ import click
 
 from cdmisfa.cli import options, uploads
 from cdmisfa.cli.cameras import camera_options, live_options, print_plan, say_about, say_changes
-from cdmisfa.cli.commands.record import print_recording, record_streams, recording_stoppable
+from cdmisfa.cli.commands.record import (
+    print_recording,
+    record_streams,
+    recording_stoppable,
+    say_complete,
+)
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
@@ -86,7 +91,13 @@ def convert_command(
             print_plan(frames, as_json=as_json)
             return
         say_about(frames)
-        length = frames.spec.length or 0
+        length, told = frames.spec.length or 0, False
+
+        def report(done: float) -> None:
+            nonlocal told
+            told = True
+            shown.update(done, length)
+
         with bar("converting", "frames") as shown, recording_stoppable(ctx, out) as stop:
             files = convert(
                 frames,
@@ -95,7 +106,9 @@ def convert_command(
                 resume=resume,
                 fsync_every=fsync_every,
                 stop=stop,
-                progress=lambda done: shown.update(done, length),
+                progress=report,
             )
         say_changes(frames)
+    if resume and not told:
+        say_complete(out)
     print_recording(out, files, as_json=as_json)

@@ -140,7 +140,7 @@ def record_command(
         from recorder.recording import recorded
 
         if files := recorded(out):
-            _say_complete(out)
+            say_complete(out)
             print_recording(out, files, as_json=as_json)
             return
     if not named:
@@ -188,11 +188,12 @@ def record_command(
             progress=report,
         )
     if nothing_left:
-        _say_complete(out)
+        say_complete(out)
     print_recording(out, files, as_json=as_json)
 
 
-def _say_complete(folder: Path) -> None:
+def say_complete(folder: Path) -> None:
+    """Say that there was nothing to resume."""
     click.echo(f"{folder} is complete: nothing was left to record", err=True)
 
 
