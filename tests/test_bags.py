@@ -152,6 +152,28 @@ def test_a_bag_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -
     assert again.json["signals_sha256"] == learned.json["signals_sha256"]
 
 
+def test_a_bag_is_described_by_its_index(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = ros1_bag(tmp_path)
+    read = cdmisfa("verify", path, "--json").json
+    assert read["ok"]
+    monkeypatch.setattr(rosbag1.Reader, "messages", lambda *_: pytest.fail("it was read"))
+    channels = {c["topic"]: c for c in cdmisfa("info", path, "--json").json["channels"]}
+    assert {c["messages"] for c in channels.values()} == {COUNT}
+    last = 10**18 + (COUNT - 1) * 20_000_000
+    assert {(c["start_ns"], c["end_ns"]) for c in channels.values()} == {(10**18, last)}
+
+
+@pytest.mark.parametrize("word", ["https://host/film.mp4", "s3://bucket/a.bag", "http://h/t.csv"])
+@pytest.mark.parametrize("command", ["info", "verify", "learn", "convert"])
+def test_urls_are_of_mcap_logs(command: str, word: str, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    out = ["-o", tmp_path / "out"] if command in ("learn", "convert") else []
+    refused = cdmisfa(command, word, *out)
+    assert (refused.code, refused.err.count("\n")) == (2, 1)
+    assert "of URLs MCAP logs are read: copy this file here first" in refused.err
+
+
 @pytest.mark.parametrize("mode", ["FILE", "MESSAGE"])
 def test_a_packed_rosbag2_is_the_same(tmp_path: Path, mode: str) -> None:
     whole, packed = open_images(ros2_bag(tmp_path), TOPICS[0]), tmp_path / "packed"

@@ -47,14 +47,14 @@ class FramesHeld(NamedTuple):
         stop: its frames [first, stop) are all there, except those of gaps.
         end: one more than its last frame; 0 without any.
         gaps: whether the source may lack frames, the first of a log, too.
-        count: how many of [first, stop) are there.
+        frames: how many of [first, stop) are there.
     """
 
     first: int
     stop: int
     end: int
     gaps: bool = False
-    count: int = 0
+    frames: int = 0
 
     def whole(self, first: int) -> int:
         """Up to before which frame all from a given one on are there."""
@@ -165,7 +165,7 @@ def resume_view(
             )
         if best == path and (stop == frames or ended) and not follows:
             copied += [p for p in found if p == aside_path(path)]
-            parts.append((path, there[path].count))
+            parts.append((path, there[path].frames))
             return Resume(path, tuple(parts), stop, stale=tuple(copied), complete=True)
         if not follows:
             place = Resume(path, tuple(parts), first, best, stop, (*copied, *later))
@@ -176,7 +176,7 @@ def resume_view(
                 "or overwrite with --force"
             )
         copied += [p for p in found if p == aside_path(path)]
-        parts.append((path, there[path].count))
+        parts.append((path, there[path].frames))
         first = stop
     finished = next((p for p in later if p.suffix == ".mcap"), None)
     if finished is not None:
@@ -209,7 +209,7 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
         if held.whole(stops.get(view, 0)) != held.end or not held.end:
             return []
         stops[view] = held.stop
-        found.append((view, path, held.count))
+        found.append((view, path, held.frames))
     every = stops.keys() == streams if streams else str(len(stops)) == count
     return found if every and (gaps or len(set(stops.values())) == 1) else []
 

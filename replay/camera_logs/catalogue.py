@@ -44,8 +44,12 @@ def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
     return mcap_topics(path, reading)
 
 
-def channels_of(path: Path) -> list[ChannelFacts]:
+def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
     """What is on each topic of a camera log that is not in MCAP files.
+
+    Args:
+        path: the log.
+        whole: read all of a bag, of which otherwise an index may do.
 
     Raises:
         LogDamagedError: it cannot be read.
@@ -54,7 +58,7 @@ def channels_of(path: Path) -> list[ChannelFacts]:
     if is_dataset(path):
         return dataset_channels(path)
     if is_bag(path):
-        return bag_channels(path)
+        return bag_channels(path, whole=whole)
     if is_table(path):
         return table_channels(path)
     images = FolderImages(path, None) if path.is_dir() else VideoImages(path, None)

@@ -6,11 +6,18 @@ import fnmatch
 import glob
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from cdmisfa.core.errors import UsageError
-from replay.camera_logs.formats.picture_folder import by_number
+from replay.camera_logs.formats.bag import BAGS
+from replay.camera_logs.formats.picture_folder import PICTURES, by_number
+from replay.camera_logs.formats.table import TABLES
+from replay.camera_logs.formats.video import VIDEOS
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
+
+_WHOLE: Final = frozenset((*VIDEOS, *BAGS, *TABLES, *PICTURES))
+"""Endings of files that are read whole, and so by their paths alone."""
 
 
 def places(words: Sequence[str | Location]) -> list[Location]:
@@ -22,6 +29,9 @@ def places(words: Sequence[str | Location]) -> list[Location]:
     found: list[Location] = []
     for word in words:
         found += _matches(word) if isinstance(word, str) and _is_pattern(word) else [location(word)]
+    for place in found:
+        if isinstance(place, Url) and place.suffix.lower() in _WHOLE:
+            raise UsageError(f"{place}: of URLs MCAP logs are read: copy this file here first")
     return found
 
 

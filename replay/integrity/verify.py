@@ -106,7 +106,7 @@ def _check_images(path: Path) -> LogCheck:
     problems: list[Problem] = []
     notes: dict[str, None] = {}
     try:
-        for channel in channels_of(path):
+        for channel in channels_of(path, whole=True):
             if channel.images and channel.messages:
                 with contextlib.closing(open_images(path, channel.topic)) as images:
                     problems += _broken(images)

@@ -108,8 +108,12 @@ class BagImages(ImageStream):
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 
-def bag_channels(path: Path) -> list[ChannelFacts]:
-    """What is on each topic of a bag, of which every message is read.
+def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+    """What is on each topic of a bag, by the index of a .bag, else by all messages.
+
+    Args:
+        path: the bag.
+        whole: read every message in any case.
 
     Raises:
         CdmisfaError: the package rosbags is missing.
@@ -119,8 +123,13 @@ def bag_channels(path: Path) -> list[ChannelFacts]:
         kinds = _kinds(reader, ros1=_is_ros1(path))
         stamps: dict[str, list[int]] = {name: [] for name in kinds}
         with explained(path, "rosbags"):
-            for connection, stamp, _ in reader.messages():
-                stamps[str(connection.topic)].append(stamp)
+            if _is_ros1(path) and not whole:
+                for connection in reader.connections:
+                    entries = reader.indexes.get(connection.id, ())
+                    stamps[str(connection.topic)] += [entry.time for entry in entries]
+            else:
+                for connection, stamp, _ in reader.messages():
+                    stamps[str(connection.topic)].append(stamp)
     return [
         ChannelFacts(
             name,
