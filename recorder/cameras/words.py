@@ -19,7 +19,7 @@ from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import RECIPE, Depth
-from recorder.images.reading import Reading
+from recorder.images.reading import IMAGES, Reading
 
 _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp")
 
@@ -45,13 +45,13 @@ class CameraKind:
     recipe: str = RECIPE
 
 
-def _foxglove(word: str, name: str, *, reading: Reading) -> Camera:
+def _foxglove(word: str, name: str, *, reading: Reading = IMAGES) -> Camera:
     from recorder.cameras.foxglove import FoxgloveCamera
 
     return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=reading)
 
 
-def _video(word: str, name: str, *, reading: Reading) -> Camera:
+def _video(word: str, name: str, *, reading: Reading = IMAGES) -> Camera:
     from recorder.cameras.video import video_camera
 
     return video_camera(word, name, timeout=_TIMEOUT, color=reading.color)
