@@ -174,6 +174,13 @@ def explained(path: Location, program: str, *, held: int = 0) -> Iterator[None]:
         yield
 
 
+def limit_arrow() -> None:
+    """Let PyArrow take memory of the system: what its own pool has in reserve has no budget."""
+    import pyarrow
+
+    pyarrow.set_memory_pool(pyarrow.system_memory_pool())
+
+
 @contextmanager
 def in_one_line(path: Location, program: str) -> Iterator[None]:
     """Say in one line what a library cannot read that lets any exception through."""

@@ -16,7 +16,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
 from recorder.images.pixels import compressed_gray
 from replay.camera_logs.formats.video import VideoImages
-from replay.camera_logs.stream import ChannelFacts, ImageStream, explained, in_one_line
+from replay.camera_logs.stream import ChannelFacts, ImageStream, explained, in_one_line, limit_arrow
 from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
 
 INFO: Final = "meta/info.json"
@@ -102,6 +102,7 @@ class LeRobotImages(ImageStream):
     def _table(self, file: Path) -> Any:
         import pyarrow.parquet as pq
 
+        limit_arrow()
         with explained(file, "PyArrow", held=MAX_CHUNK):
             return pq.read_table(file, columns=["index", self.topic], use_threads=False)
 
@@ -171,6 +172,7 @@ def _episodes(path: Path, columns: list[str]) -> list[dict[str, Any]]:
     """The rows of the tables of episodes, in their order."""
     import pyarrow.parquet as pq
 
+    limit_arrow()
     rows: list[dict[str, Any]] = []
     files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
     if not files:

@@ -13,7 +13,14 @@ from cdmisfa.core.untrusted.regular import check_regular
 from recorder.images.fields import NUMBERS_RECIPE, Field, bounded
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, Reading
-from replay.camera_logs.stream import LAST_NS, ChannelFacts, ImageStream, explained, sorted_times
+from replay.camera_logs.stream import (
+    LAST_NS,
+    ChannelFacts,
+    ImageStream,
+    explained,
+    limit_arrow,
+    sorted_times,
+)
 
 TABLES: Final = (".csv", ".parquet")
 
@@ -114,6 +121,7 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 
 def _table(path: Path) -> Any:
     check_regular(path, MAX_BYTES)
+    limit_arrow()
     with explained(path, "PyArrow"):
         if path.suffix.lower() == ".csv":
             import pyarrow.csv
