@@ -181,7 +181,10 @@ def test_logs_that_are_no_mcap_files_are_played_frame_by_frame(tmp_path: Path) -
         for i, image in enumerate(images[:5]):
             Image.fromarray(image).save(tmp_path / name / f"{i:03}.png")
     folders = [tmp_path / "left", tmp_path / "right"]
-    with pytest.raises(UsageError, match="tell no rate; set one with --fps"), opened_feed(folders):
+    with (
+        pytest.raises(UsageError, match="left tells no rate: set one with --fps"),
+        opened_feed(folders),
+    ):
         pass
     with opened_feed(folders, 25) as feed:
         first, again = list(feed.messages()), list(feed.messages())

@@ -19,6 +19,7 @@ from replay.view.build import build_view
 from replay.view.layouts import panels
 from replay.view.layouts.of_run import run_layout
 from replay.view.summary import summary_text
+from replay.view.world.first import First
 
 ITERATIONS = 30
 TAU = 40
@@ -174,7 +175,7 @@ def tabs_of(run, patch):
     """Each tab of a run's layout."""
     tabs = []
     patch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
-    run_layout(read_outline(run))
+    run_layout(read_outline(run), First(scene=False, wall=None))
     return {tab.name: tab for tab in tabs}
 
 
@@ -214,7 +215,13 @@ def check_no_view_is_empty(run, patch):
 
 def test_the_gate_and_the_decision_have_no_tab(shown, monkeypatch):
     _, folder, _, _ = shown
-    assert sorted(tabs_of(folder, monkeypatch)) == ["Candidate", "Modules", "Overview", "Table"]
+    assert sorted(tabs_of(folder, monkeypatch)) == [
+        "Candidate",
+        "Modules",
+        "Overview",
+        "Table",
+        "World",
+    ]
 
 
 @pytest.mark.parametrize("algorithm", ["2.0", "1.0", "progress"])
