@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -25,6 +28,7 @@ from recorder.recording import RecordingStoppedError, recorded
 from replay.camera_logs.options import Align
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
+from replay.recordings.view_file import intersection
 from replay.stored import in_laps, outside
 
 STEP_MS = 20
@@ -240,6 +244,45 @@ def test_a_whole_conversion_with_gaps_is_left_as_it_is(cdmisfa: Cdmisfa, tmp_pat
         sum(high - low for low, high in stretches)
         for stretches in coverage(tmp_path / "rec").values()
     )
+
+
+def test_a_dataset_has_an_episode_between_gaps(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    left = write_log(tmp_path / "left.mcap", PAUSED)
+    right = write_log(tmp_path / "right.mcap", [*range(0, 4000, STEP_MS), *range(5990, 9000, 20)])
+    rec, out = tmp_path / "rec", tmp_path / "set"
+    assert cdmisfa("convert", left, right, "--align", "time", "-o", rec).code == 0
+    done = cdmisfa("export", rec, "--to", "lerobot", "--lossless", "-o", out)
+    assert done.code == 0, done.err
+    with contextlib.closing(RecordedSource(rec)) as source:
+        one, two = source.coverage().values()
+        shared = intersection(one, two)
+        assert len(shared) == 2
+        assert shared not in (one, two)
+        wanted = [[_frames(source, stream, *span) for span in shared] for stream in range(2)]
+    info = json.loads((out / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["splits"]) == (2, {"train": "0:2"})
+    rows = pq.read_table(out / "data" / "chunk-000" / "file-000.parquet").to_pydict()
+    lengths = [high - low for low, high in shared]
+    assert rows["episode_index"] == [0] * lengths[0] + [1] * lengths[1]
+    assert rows["frame_index"] == [*range(lengths[0]), *range(lengths[1])]
+    assert rows["index"] == [*range(sum(lengths))]
+    episodes = pq.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    keys = sorted(key.split("/")[1] for key in episodes[0] if key.endswith("/to_timestamp"))
+    for stream, key in enumerate(keys):
+        starts = [row[f"videos/{key}/from_timestamp"] for row in episodes]
+        assert starts == [0, lengths[0] / 50]
+        for row, frames in zip(episodes, wanted[stream], strict=True):
+            assert row["length"] == len(frames)
+            assert row[f"stats/{key}/mean"][0][0][0] == pytest.approx(frames.mean() / 255)
+        with contextlib.closing(ForeignSource(out, [key])) as source:
+            read = [_frames(source, 0, *span) for span in source.spans(0, 0, source.frames)]
+        for frames, again in zip(wanted[stream], read, strict=True):
+            assert np.abs(frames.astype(int) - again).max() <= 1
+
+
+def _frames(source: Any, stream: int, low: int, high: int) -> np.ndarray:
+    source.seek(low)
+    return np.asarray(source.take(stream, high - low).frames)
 
 
 def test_images_that_change_their_size_are_said_and_shown(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

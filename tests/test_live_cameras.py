@@ -416,8 +416,7 @@ def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Pat
     assert export(tmp_path / "rec", tmp_path / "png", "images") == 90 - 29 + 90
     names = sorted(path.name for path in (tmp_path / "png" / "left").iterdir())
     assert (names[30], names[31]) == ("00000030.png", "00000060.png")
-    with pytest.raises(UsageError, match="has gaps, and LeRobot's format none"):
-        export(tmp_path / "rec", tmp_path / "robot", "lerobot")
+    assert export(tmp_path / "rec", tmp_path / "robot", "lerobot") == 90 - 29
     with pytest.raises(UsageError, match="a recording of cameras cannot be followed"):
         FollowedSource(tmp_path / "rec")
     with contextlib.closing(RecordedSource(tmp_path / "rec", loop=True)) as looped:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from replay.inputs.opening import Logged
+from replay.stored import StoredSource
 
 PIECE = 1000
 """Most frames that are held at once."""
@@ -22,7 +23,7 @@ PIECE_BYTES = 64 * 2**20
 _UNSAFE = re.compile(r"[^\w.-]|^\.")
 
 
-def pieces(source: Logged, stream: int) -> Iterator[Block]:
+def pieces(source: StoredSource, stream: int) -> Iterator[Block]:
     """Every frame of one view, in order.
 
     The source's clock is moved.

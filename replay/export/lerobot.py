@@ -1,4 +1,4 @@
-"""A recording as a LeRobot dataset, layout v3.0: one episode, its views as videos.
+"""A recording as a LeRobot dataset, layout v3.0: its views as videos, an episode without gaps.
 
 The layout is written as it is published (github.com/huggingface/lerobot), with PyArrow and
 PyAV: the `lerobot` package itself pins a Rerun older than the viewer's and cannot be
@@ -8,7 +8,7 @@ installed beside it. `LeRobotDataset("name", root=FOLDER)` and Rerun open the fo
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,15 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.export.images import count, file_names, pieces
+from replay.export.episodes import Stitched, shared_spans
+from replay.export.images import file_names, pieces
 from replay.export.videos import pixel_format, write_film
 from replay.inputs.opening import Logged
+from replay.stored import Span, StoredSource
 
 VERSION = "v3.0"
 FILE = "chunk-000/file-000"
-"""An export is one episode, which is one file of each kind."""
+"""An export is one file of each kind, whatever its episodes."""
 
 KEY_EVERY = 2
 """Frames from a key frame to the next, as in LeRobot: training reads single frames."""
@@ -36,7 +38,7 @@ STATE = "observation.environment_state"
 
 ABOUT = """# {name}
 
-A recording of cdmisfa as a LeRobot dataset ({version}): one episode, {frames} frames at {fps}
+A recording of cdmisfa as a LeRobot dataset ({version}): {episodes}, {frames} frames at {fps}
 frames per second. `meta/info.json` names its features. `{state}` is the ground truth; there
 are no actions, because nothing in the recording was moved by what was seen.
 
@@ -54,6 +56,7 @@ Stats = dict[str, list[Any]]
 def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) -> int:
     """Write a recording as a LeRobot dataset, and return how many frames it has.
 
+    Each stretch of frames that every view has is an episode: one, or several between gaps.
     Images become videos `observation.images.VIEW`, values `observation.VIEW`; numbers become
     float32, as LeRobot's own. The dataset's card calls it by `name`.
 
@@ -68,34 +71,39 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
             f"LeRobot knows whole frame rates only, not {source.spec.fps:g} per second: "
             "change it with cdmisfa convert --rate"
         )
-    columns, features = _columns(source, fps)
-    if count(source) < source.frames * len(source.spec.streams):
-        raise UsageError(
-            "the recording has gaps, and LeRobot's format none: export a recording without, or "
-            "to images or mp4"
-        )
+    spans = shared_spans(source)
+    whole = Stitched(source, spans) if len(spans) > 1 or source.gaps else source
+    lengths = [high - low for low, high in spans]
+    columns, features = _columns(whole, lengths, fps)
     stats = {key: _number_stats(column) for key, column in columns.items()}
     videos = []
     if source.spec.images:
         for stream, view in enumerate(file_names(source.spec)):
             videos.append(key := f"observation.images.{view}")
             file = _place(folder / "videos" / key, "mp4")
-            write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY)
+            write_film(whole, stream, file, lossless=lossless, key_every=KEY_EVERY)
             features[key] = _video_feature(source.spec.frame_shape, fps)
-            stats[key] = _image_stats(source, stream)
+            stats[key] = _image_stats(whole, stream)
     task = f"what {source.scene().get('scene', 'a recording')} shows"
     pq.write_table(_table(columns, features), _place(folder / "data", "parquet"))
-    episode = _episode(source.frames, fps, task, videos, stats)
-    pq.write_table(episode, _place(folder / "meta" / "episodes", "parquet"))
+    own = [stats]
+    if len(spans) > 1:
+        own = [_stats_of(source, span, rows, videos) for span, rows in _cut(spans, columns)]
+    episodes = _episodes(lengths, fps, task, videos, own)
+    pq.write_table(episodes, _place(folder / "meta" / "episodes", "parquet"))
     pq.write_table(_tasks(task), folder / "meta" / "tasks.parquet")
-    _write_json(folder / "meta" / "info.json", _info(source.frames, fps, features))
+    _write_json(folder / "meta" / "info.json", _info(lengths, fps, features))
     _write_json(folder / "meta" / "stats.json", stats)
-    card = ABOUT.format(name=name, version=VERSION, frames=source.frames, fps=fps, state=STATE)
+    many = "one episode" if len(spans) == 1 else f"{len(spans)} episodes, split at its gaps"
+    about = {"name": name, "version": VERSION, "episodes": many, "state": STATE}
+    card = ABOUT.format(**about, frames=whole.frames, fps=fps)
     (folder / "README.md").write_text(card, "utf-8")
-    return source.frames
+    return whole.frames
 
 
-def _columns(source: Logged, fps: int) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
+def _columns(
+    source: StoredSource, lengths: Sequence[int], fps: int
+) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
     """All numbers, (n,) or (n, k), and what they are."""
     spec, n = source.spec, source.frames
     columns: dict[str, NDArray[Any]] = {}
@@ -116,9 +124,10 @@ def _columns(source: Logged, fps: int) -> tuple[dict[str, NDArray[Any]], dict[st
             names = [f"x{i + 1}" for i in range(frames.shape[1])]
             add(f"observation.{view}", frames.astype(np.float32), names)
     index, zero = np.arange(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-    add("timestamp", (index / fps).astype(np.float32), None)
-    add("frame_index", index, None)
-    add("episode_index", zero, None)
+    within = np.concatenate([np.arange(length, dtype=np.int64) for length in lengths])
+    add("timestamp", (within / fps).astype(np.float32), None)
+    add("frame_index", within, None)
+    add("episode_index", np.repeat(np.arange(len(lengths), dtype=np.int64), lengths), None)
     add("index", index, None)
     add("task_index", zero, None)
     return columns, features
@@ -156,7 +165,7 @@ def _number_stats(values: NDArray[Any]) -> Stats:
     return {key: value.tolist() for key, value in stats.items()}
 
 
-def _image_stats(source: Logged, stream: int) -> Stats:
+def _image_stats(source: StoredSource, stream: int) -> Stats:
     """Statistics of a view's pixels from 0 to 1, (3, 1, 1) each, from how often each value is."""
     counts = np.zeros(256, dtype=np.int64)
     for block in pieces(source, stream):
@@ -184,30 +193,59 @@ def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature])
     return pa.table(arrays)
 
 
-def _episode(
-    frames: int, fps: int, task: str, videos: list[str], stats: Mapping[str, Stats]
+def _cut(
+    spans: Sequence[Span], columns: Mapping[str, NDArray[Any]]
+) -> Iterator[tuple[Span, dict[str, NDArray[Any]]]]:
+    """Each episode's stretch of the source, and its rows of the columns."""
+    start = 0
+    for low, high in spans:
+        stop = start + high - low
+        yield (low, high), {key: column[start:stop] for key, column in columns.items()}
+        start = stop
+
+
+def _stats_of(
+    source: Logged, span: Span, rows: Mapping[str, NDArray[Any]], videos: Sequence[str]
+) -> dict[str, Stats]:
+    """The statistics of one episode."""
+    episode = Stitched(source, [span])
+    stats = {key: _number_stats(column) for key, column in rows.items()}
+    return stats | {key: _image_stats(episode, stream) for stream, key in enumerate(videos)}
+
+
+def _episodes(
+    lengths: Sequence[int],
+    fps: int,
+    task: str,
+    videos: list[str],
+    stats: Sequence[Mapping[str, Stats]],
 ) -> pa.Table:
-    """The one row of the table of episodes."""
-    row: dict[str, Any] = {
-        "episode_index": 0,
-        "tasks": [task],
-        "length": frames,
-        "data/chunk_index": 0,
-        "data/file_index": 0,
-        "dataset_from_index": 0,
-        "dataset_to_index": frames,
-    }
-    for key in videos:
-        row |= {
-            f"videos/{key}/chunk_index": 0,
-            f"videos/{key}/file_index": 0,
-            f"videos/{key}/from_timestamp": 0.0,
-            f"videos/{key}/to_timestamp": frames / fps,
+    """The table of episodes, a row each."""
+    rows, start = [], 0
+    for episode, (length, own) in enumerate(zip(lengths, stats, strict=True)):
+        stop = start + length
+        row: dict[str, Any] = {
+            "episode_index": episode,
+            "tasks": [task],
+            "length": length,
+            "data/chunk_index": 0,
+            "data/file_index": 0,
+            "dataset_from_index": start,
+            "dataset_to_index": stop,
         }
-    for key, values in stats.items():
-        row |= {f"stats/{key}/{name}": value for name, value in values.items()}
-    row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-    return pa.Table.from_pylist([row])
+        for key in videos:
+            row |= {
+                f"videos/{key}/chunk_index": 0,
+                f"videos/{key}/file_index": 0,
+                f"videos/{key}/from_timestamp": start / fps,
+                f"videos/{key}/to_timestamp": stop / fps,
+            }
+        for key, values in own.items():
+            row |= {f"stats/{key}/{name}": value for name, value in values.items()}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        rows.append(row)
+        start = stop
+    return pa.Table.from_pylist(rows)
 
 
 def _tasks(task: str) -> pa.Table:
@@ -229,20 +267,20 @@ def _tasks(task: str) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _info(frames: int, fps: int, features: Mapping[str, Feature]) -> dict[str, Any]:
+def _info(lengths: Sequence[int], fps: int, features: Mapping[str, Feature]) -> dict[str, Any]:
     place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
     videos = any(feature["dtype"] == "video" for feature in features.values())
     return {
         "codebase_version": VERSION,
         "robot_type": None,
-        "total_episodes": 1,
-        "total_frames": frames,
+        "total_episodes": len(lengths),
+        "total_frames": sum(lengths),
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": fps,
-        "splits": {"train": "0:1"},
+        "splits": {"train": f"0:{len(lengths)}"},
         "data_path": f"data/{place}.parquet",
         "video_path": f"videos/{{video_key}}/{place}.mp4" if videos else None,
         "features": features,

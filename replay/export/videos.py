@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.export.episodes import Stitched
 from replay.export.images import count, file_names, pieces
 from replay.inputs.opening import Logged
+from replay.stored import StoredSource
 
 LOSSY = {"crf": "18", "preset": "medium"}
 """Compression at which a difference is hardly seen."""
@@ -40,7 +42,7 @@ def write_films(source: Logged, folder: Path, *, lossless: bool) -> int:
 
 
 def write_film(
-    source: Logged, stream: int, file: Path, *, lossless: bool, key_every: int = 0
+    source: Logged | Stitched, stream: int, file: Path, *, lossless: bool, key_every: int = 0
 ) -> None:
     """Write one view as a video of the recording's frame rate.
 
@@ -83,7 +85,7 @@ def write_film(
         raise CdmisfaError(f"{file} cannot be written: {error}") from error
 
 
-def _pictures(av: Any, source: Logged, stream: int) -> Iterator[Any]:
+def _pictures(av: Any, source: StoredSource, stream: int) -> Iterator[Any]:
     """The frames of a view as PyAV's, in one buffer."""
     height, width = source.spec.frame_shape
     kind = pixel_format(source.spec.frame_shape)
