@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -16,6 +16,7 @@ from cdmisfa.core.errors import UsageError
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.sources import Configuration
+    from recorder.cameras.readers import OnLoss
     from recorder.cameras.words import LiveOptions
     from replay.camera_logs.options import CameraOptions
 
@@ -205,13 +206,11 @@ live_options = options.together(
 )
 
 
-def live_streams(values: Mapping[str, Any]) -> LiveOptions:
+def live_streams(hold: float, lost: OnLoss, stall: float, *, seed: int = 0) -> LiveOptions:
     """What `live_options` and a seed say."""
     from recorder.cameras.words import LiveOptions
 
-    return LiveOptions(
-        hold=values["hold"], on_loss=values["lost"], stall=values["stall"], seed=values["seed"]
-    )
+    return LiveOptions(hold=hold, on_loss=lost, stall=stall, seed=seed)
 
 
 def tell(line: str) -> None:
@@ -285,7 +284,7 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
 @contextlib.contextmanager
 def live_source(
     words: Sequence[str],
-    live: Mapping[str, Any],
+    live: LiveOptions,
     cameras: CameraOptions,
     out: Path | None,
     record_to: Path | None,
@@ -316,7 +315,7 @@ def live_source(
         if folder is not None:
             refuse_existing(folder, force=force)
     source, configuration = open_cameras_now(
-        words, live_streams(live), cameras=cameras, preset=preset, settings=settings, say=tell
+        words, live, cameras=cameras, preset=preset, settings=settings, say=tell
     )
     with contextlib.closing(source):
         try:

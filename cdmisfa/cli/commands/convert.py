@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import camera_options, live_options, print_plan, say_about, say_changes
+from cdmisfa.cli.cameras import (
+    camera_options,
+    live_options,
+    live_streams,
+    print_plan,
+    say_about,
+    say_changes,
+)
 from cdmisfa.cli.commands.record import (
     print_recording,
     record_streams,
@@ -18,6 +25,9 @@ from cdmisfa.cli.commands.record import (
 )
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from recorder.cameras.readers import OnLoss
 
 
 @click.command("convert")
@@ -44,7 +54,7 @@ def convert_command(
     as_json: bool,
     dry_run: bool,
     hold: float,
-    lost: str,
+    lost: OnLoss,
     stall: float,
     **cameras: Any,
 ) -> None:
@@ -75,7 +85,7 @@ def convert_command(
             fsync_every=fsync_every,
             force=force,
             as_json=as_json,
-            live={"hold": hold, "lost": lost, "stall": stall, "seed": 0},
+            live=live_streams(hold, lost, stall),
             cameras=CameraOptions(**cameras),
         )
         return

@@ -16,6 +16,7 @@ from cdmisfa.cli.cameras import (
     camera_options,
     live_options,
     live_source,
+    live_streams,
     print_plan,
     say_about,
     say_changes,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.runs import RunResult
+    from recorder.cameras.readers import OnLoss
 
 TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
@@ -113,7 +115,7 @@ def learn_command(
     as_json: bool,
     dry_run: bool,
     hold: float,
-    lost: str,
+    lost: OnLoss,
     stall: float,
     **cameras: Any,
 ) -> None:
@@ -154,7 +156,7 @@ def learn_command(
                 )
             opened = live_source(
                 source,
-                {"hold": hold, "lost": lost, "stall": stall, "seed": seed},
+                live_streams(hold, lost, stall, seed=seed),
                 CameraOptions(**cameras),
                 out,
                 record_to,

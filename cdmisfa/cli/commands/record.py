@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,8 @@ from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
+    from recorder.cameras.readers import OnLoss
+    from recorder.cameras.words import LiveOptions
     from recorder.recording import ViewRecording
     from replay.camera_logs.options import CameraOptions
 
@@ -79,7 +81,7 @@ def record_command(
     split: str | None,
     as_json: bool,
     hold: float,
-    lost: str,
+    lost: OnLoss,
     stall: float,
     **framing: Any,
 ) -> None:
@@ -113,7 +115,7 @@ def record_command(
             fsync_every=fsync_every,
             force=force,
             as_json=as_json,
-            live={"hold": hold, "lost": lost, "stall": stall, "seed": seed},
+            live=live_streams(hold, lost, stall, seed=seed),
             cameras=cameras,
             preset=preset,
             settings=settings,
@@ -219,7 +221,7 @@ def record_streams(
     fsync_every: float | None,
     force: bool,
     as_json: bool,
-    live: Mapping[str, Any],
+    live: LiveOptions,
     cameras: CameraOptions,
     preset: str | None = None,
     settings: Sequence[str] = (),
@@ -235,7 +237,7 @@ def record_streams(
     with stoppable(notice="finishing the recording; again to stop at once\n") as stop:
         source, configuration = open_cameras_now(
             words,
-            live_streams(live),
+            live,
             cameras=cameras,
             preset=preset,
             settings=settings,
