@@ -53,6 +53,7 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     project = tomllib.loads((TOY / "pyproject.toml").read_text())["project"]
     install(folder, project["name"], project["version"], project["entry-points"])
     monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr("cdmisfa.core.plugins._LOADED", {})
     before = [dict(registry) for registry, _ in NAMES]
     yield folder
     for (registry, _), known in zip(NAMES, before, strict=True):
