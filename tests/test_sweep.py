@@ -263,7 +263,8 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
 def test_the_processes_of_a_killed_sweep_end_with_it(tmp_path: Path) -> None:
     """In the midst of trials that take hours: who has a result to hand over notices by itself."""
     words = [sys.executable, "-m", "cdmisfa", "sweep", "oscillatory", "--seeds", "0:2"]
-    words += ["--set", "learner.delta=1e-300", "--max-iterations", "1000000000"]
+    words += ["--set", "learner.delta=1e-300", "--set", "learner.patience=1000000000"]
+    words += ["--max-iterations", "1000000000"]
     workers: list[psutil.Process] = []
 
     def busy() -> bool:
