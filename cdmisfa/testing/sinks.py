@@ -1,8 +1,8 @@
 """What every `Sink` promises, as tests: say what to open.
 
 class TestDigest(SinkContract):
-def open(self, folder, source, learner) -> Sink:
-return Digest()
+    def open(self, folder, source, learner) -> Sink:
+        return Digest()
 """
 
 from __future__ import annotations
