@@ -7,9 +7,10 @@ import fcntl
 import hashlib
 import os
 import resource
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,11 @@ from recorder.log.split import Split
 from recorder.log.viewfacts import MOST_NAMED
 from recorder.recording import RecordingStoppedError, record, record_scene, recorded
 from replay.integrity.verify import check_log
+from replay.mcap.mending import MendedStore
 from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.storage import store
+from replay.storage.once import Excerpt, OnePass
 from replay.storage.store import FileStore
 
 HERE = Path(__file__).parent
@@ -102,6 +105,41 @@ def test_a_file_that_was_replaced_is_not_read_on(files: list[Path], there: bool)
         files[0].write_bytes(b"z")
     with pytest.raises(LogDamagedError, match=r"a\.mcap: .*while it was read"):
         one.read(0, 6)
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda store: store.read(1, 5),
+        lambda store: store.peek(1, 2),
+        lambda store: list(store.blocks(0, store.size)),
+        lambda store: store.crc(0, store.size),
+        lambda store: store.grow(),
+        lambda store: Excerpt(store, 1, 6),
+        lambda store: OnePass(store).pass_to(6),
+        lambda store: MendedStore(store).read(1, 5),
+    ],
+)
+@pytest.mark.parametrize("left", [0, 3])
+def test_a_file_that_became_shorter_is_damage_to_whoever_reads_it(
+    files: list[Path], read: Callable[[FileStore], object], left: int
+) -> None:
+    one = FileStore(files[0])
+    assert one.read(3, 20) == b"cap"  # its end is no damage
+    os.truncate(files[0], left)
+    with pytest.raises(LogDamagedError, match=r"a\.mcap: it was cut while it was read$"):
+        read(one)
+
+
+@pytest.mark.parametrize("left", [0, 100])
+def test_a_log_that_became_shorter_is_damage(tmp_path: Path, parts: Path, left: int) -> None:
+    path = Path(shutil.copy(min(parts.glob("*.mcap")), tmp_path))
+    with LogReader(path) as reader:
+        assert reader.by_index
+        os.truncate(path, left)
+        for look in (lambda: list(reader.tables()), reader.digest):
+            with pytest.raises(LogDamagedError, match=r"it was cut while it was read$"):
+                look()
 
 
 def test_a_closed_file_stays_closed(files: list[Path]) -> None:

@@ -91,8 +91,6 @@ class Chunks:
         if size > MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
         raw = self._file.read(first, size)
-        if len(raw) < size:
-            raise MalformedRecord("its message index was cut off since the file was opened")
         pairs = np.frombuffer
         return [
             (p.channel, pairs(raw, "<u8", 2 * p.count, p.offset - first).reshape(-1, 2))

@@ -36,7 +36,7 @@ class Store(ABC):
 
     @abstractmethod
     def read_at(self, offset: int, count: int) -> bytes:
-        """Up to `count` bytes from `offset` on; none at the end.
+        """Up to `count` bytes from `offset` on; none where the file ends by now.
 
         Raises:
             LogDamagedError: they cannot be read.
@@ -54,7 +54,11 @@ class Store(ABC):
         self._window = b""
 
     def grow(self) -> bool:
-        """Look at the size again; whether it grew."""
+        """Look at the size again; whether it grew.
+
+        Raises:
+            LogDamagedError: it is smaller.
+        """
         return False
 
     def is_at(self, path: Path) -> bool:
@@ -71,10 +75,17 @@ class Store(ABC):
         return self._window[at : at + count]
 
     def read(self, offset: int, count: int) -> bytes:
-        """`count` bytes, fewer only where the file ends."""
+        """`count` bytes, fewer only where the `size` bytes end.
+
+        Raises:
+            LogDamagedError: they cannot be read, or are not there any more.
+        """
         count = max(min(count, self.size - offset), 0)
         parts: list[bytes] = []
-        while count and (part := self.read_at(offset, count)):
+        while count:
+            part = self.read_at(offset, count)
+            if not part:
+                raise self._was_cut()
             parts.append(part)
             offset, count = offset + len(part), count - len(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
@@ -91,6 +102,9 @@ class Store(ABC):
         for block in self.blocks(offset, stop):
             value = crc32(block, value)
         return value
+
+    def _was_cut(self) -> LogDamagedError:
+        return LogDamagedError(f"{self.path}: it was cut while it was read")
 
 
 class FileStore(Store):
@@ -127,8 +141,10 @@ class FileStore(Store):
         return unchanged and os.path.samestat(now, self._seen)
 
     def grow(self) -> bool:
-        self._seen = os.fstat(self._open().number)
-        before, self.size = self.size, self._seen.st_size
+        now = os.fstat(self._open().number)
+        if now.st_size < self.size:
+            raise self._was_cut()
+        self._seen, before, self.size = now, self.size, now.st_size
         self.forget()
         return self.size > before
 
