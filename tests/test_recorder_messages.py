@@ -53,7 +53,13 @@ def test_images(time, height, width, frame_id):
     assert (image.height, image.width, image.step) == (height, width, width)
     assert (image.encoding, image.frame_id) == ("mono8", frame_id)
     assert image.timestamp.ToNanoseconds() == time
+    assert message == image.SerializeToString()
     assert decode(encoder, message).data == frame.tobytes()
+
+
+def test_images_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="a frame of 6 bytes given, not of 8"):
+        ImageEncoder(2, 4, "left")(0, np.zeros((2, 3), np.uint8))
 
 
 @given(TIMES, DOUBLES)

@@ -54,6 +54,7 @@ FORBIDDEN = {
     "recorder.cameras": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner", "rerun"),
     "recorder.images": ("recorder.log.logfile", "recorder.cameras.live", "replay.palette"),
     "recorder.log": ("recorder.recording", "replay.palette", "cdmisfa.agents.learner"),
+    "recorder.mcap": ("recorder.log.logfile", "recorder.world.scenes", "replay.mcap.records"),
     "recorder.world": ("recorder.log.logfile", "replay.palette", "cdmisfa.features.sfa", "mcap"),
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),

@@ -15,13 +15,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Self
 
-from mcap.writer import CompressionType, Writer
-
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
 from recorder.log.appended import AppendedFile, write_error
 from recorder.log.folder import refuse_held
 from recorder.log.whole import partial_path, refuse_special, refuse_taken, to_disk
+from recorder.mcap.writer import McapWriter
 
 FLUSH_NS = 1_000_000_000
 """Log time after which the chunk in progress is handed to the operating system, by default.
@@ -91,15 +90,14 @@ class LogFile:
                 )
             refuse_held(self.partial.parent)
         self._stream = AppendedFile(self.partial)
-        self._writer = Writer(
-            self._stream,  # type: ignore[arg-type]
-            chunk_size=chunk_size,
-            compression=CompressionType[compression.upper()],
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
         try:
-            self._writer.start(profile=profile, library=library)
+            self._writer = McapWriter(
+                self._stream,
+                library=library,
+                profile=profile,
+                compression=compression,
+                chunk_size=chunk_size,
+            )
         except BaseException:
             self._stream.close()
             raise
@@ -118,7 +116,7 @@ class LogFile:
         """Register a message schema, and return its id; the same schema gets the same."""
         key = (name, encoding, data)
         if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(name, encoding, data)
+            self._schemas[key] = self._writer.add_schema(name, encoding, data)
         return self._schemas[key]
 
     def add_channel(
@@ -130,18 +128,20 @@ class LogFile:
         metadata: Mapping[str, str] | None = None,
     ) -> int:
         """Register a channel of messages on a topic, and return its id; schema 0 is none."""
-        return self._writer.register_channel(topic, encoding, schema, dict(metadata or {}))
+        return self._writer.add_channel(topic, encoding, schema, metadata or {})
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a named string map at once, outside the chunks."""
-        self._writer.add_metadata(name, dict(values))
+        self._writer.add_metadata(name, values)
         self._stream.flush()
 
     def add_attachment(
         self, name: str, media_type: str, data: bytes, *, log_time: int = 0, create_time: int = 0
     ) -> None:
         """Write a named file at once, outside the chunks; times in nanoseconds."""
-        self._writer.add_attachment(create_time, log_time, name, media_type, data)
+        self._writer.add_attachment(
+            name, media_type, data, log_time=log_time, create_time=create_time
+        )
         self._stream.flush()
 
     def write(
@@ -176,7 +176,8 @@ class LogFile:
         """Close the chunk in progress and hand everything to the operating system."""
         self._stream.check()
         self._chunk_start = None
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.end_chunk()
+        self._stream.flush()
         if time.monotonic() >= self._next_sync:
             self._sync()
 
@@ -201,7 +202,7 @@ class LogFile:
         """
         try:
             self._stream.check()
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.finish()
             self._stream.sync()
         finally:
             self._stream.close()

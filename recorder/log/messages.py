@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -116,11 +117,24 @@ class ImageEncoder(_Encoder):
                 width=width, height=height, step=width, encoding=IMAGE_ENCODING, frame_id=frame_id
             )
         )
+        payload = image_payload(height, width, frame_id)
+        self._size = payload.size
+        self._message.data = bytes(payload.size)
+        blank = self._message.SerializeToString()
+        end = len(blank) - payload.tail
+        # All but its time and its pixels is the same in every message of the view.
+        self._around = blank[: end - payload.size], blank[end:]
 
     def __call__(self, time_ns: int, frame: NDArray[np.uint8]) -> bytes:
-        """Encode one frame, (height, width) uint8."""
-        self._message.data = frame.tobytes()
-        return self._encoded(time_ns)
+        """Encode one frame, (height, width) uint8.
+
+        Raises:
+            ValueError: it is of another size.
+        """
+        before, after = self._around
+        if frame.nbytes != self._size:
+            raise ValueError(f"a frame of {frame.nbytes} bytes given, not of {self._size}")
+        return b"".join((_timestamp(time_ns), before, frame.tobytes(), after))
 
 
 class VectorEncoder(_Encoder):
@@ -235,6 +249,15 @@ def _message(name: str, fields: Sequence[Any]) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"cdmisfa.{name}"))()
 
 
+def _timestamp(time_ns: int) -> bytes:
+    """A time as field 1 of a message, a `google.protobuf.Timestamp`."""
+    seconds, nanos = divmod(time_ns, 1_000_000_000)
+    since = b"\x08" + varint(seconds) if seconds else b""
+    rest = b"\x10" + varint(nanos) if nanos else b""
+    return b"\x0a" + varint(len(since) + len(rest)) + since + rest
+
+
+@lru_cache(1024)
 def varint(number: int) -> bytes:
     """A whole number as protobuf's variable-length integer."""
     out = bytearray()

@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import freeze
+from recorder.mcap.checksum import crc32
 from replay.mcap.compression import Decompressor, check_size
 from replay.mcap.records import (
     INDEX_HEADER,
@@ -24,7 +25,6 @@ from replay.mcap.records import (
 )
 from replay.mcap.segments import Definitions, Segment
 from replay.mcap.tables import MessageTable, Spans, indexed_table, walked_table
-from replay.storage.checksum import crc32
 from replay.storage.once import OnePass
 from replay.storage.store import Store
 

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.mcap.checksum import crc32
 from replay.mcap.records import MAGIC
 from replay.mcap.summary import FOOTER_BYTES
 from replay.mcap.walk import DATA_END_BYTES, LogStructure
-from replay.storage.checksum import crc32
 from replay.storage.location import Url
 from replay.storage.store import Store
 

@@ -13,13 +13,13 @@ from typing import Final
 import numpy as np
 from mcap.opcode import Opcode
 
+from recorder.mcap.checksum import crc32
 from replay.mcap.compression import Decompressor, check_size
 from replay.mcap.records import MESSAGE_HEADER, RECORD_HEADER, Bytes, MalformedRecord
 from replay.mcap.segments import Problem, Segment
 from replay.mcap.summary import stated_chunks
 from replay.mcap.tables import MessageTable, walked_table
 from replay.mcap.walk import LogStructure
-from replay.storage.checksum import crc32
 from replay.storage.store import Store
 
 _TIMES_AND_SIZE: Final = struct.Struct("<QQQ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from replay.storage.checksum import crc32
+from recorder.mcap.checksum import crc32
 from replay.storage.store import Store
 
 MAX_HELD: Final = 512 * 1024 * 1024

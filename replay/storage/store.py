@@ -13,7 +13,7 @@ from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.whole import PARTIAL
-from replay.storage.checksum import crc32
+from recorder.mcap.checksum import crc32
 from replay.storage.location import Location
 
 OPEN_FILES = 24

@@ -1,0 +1,273 @@
+"""Writing MCAP: chunked, compressed, indexed, with every checksum.
+
+The bytes are those that the mcap package writes, in a quarter of its time a message: of a message
+nothing is done until its chunk ends but to keep it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, Protocol
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from recorder.config import Compression
+from recorder.mcap.checksum import crc32
+
+_MAGIC: Final = b"\x89MCAP0\r\n"
+
+_MESSAGE: Final = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence, log time, publish time; the data follow."""
+_OF_MESSAGE: Final = int(Opcode.MESSAGE)
+_MESSAGE_FIELDS: Final = _MESSAGE.size - 9
+_INDEX: Final = struct.Struct("<BQHI")
+"""Opcode, length, channel, bytes of the pairs, which follow: log time and place in the chunk."""
+_CHUNK: Final = struct.Struct("<BQQQQI")
+"""Opcode, length, first and last log time, size and checksum of what it holds."""
+_FOOTER: Final = struct.Struct("<BQQQ")
+"""What a summary's checksum counts of the footer."""
+
+_COMPRESS: Final[Mapping[Compression, tuple[str, Callable[[memoryview], bytes]]]] = {
+    "zstd": ("zstd", zstandard.compress),
+    "lz4": ("lz4", lz4.frame.compress),
+    "none": ("", bytes),
+}
+
+
+class Appended(Protocol):
+    """What takes a file's bytes, one after the other."""
+
+    def write(self, data: bytes, /) -> int:
+        """Append all of the bytes."""
+
+    def tell(self) -> int:
+        """Bytes that were appended."""
+
+
+class McapWriter:
+    """Writes one file, from its first byte to its last.
+
+    Args:
+        out: what takes the bytes.
+        library: what writes the file, as its header states.
+        profile: of the messages, as the header states.
+        compression: of the chunks.
+        chunk_size: bytes of records at which a chunk ends.
+    """
+
+    def __init__(
+        self,
+        out: Appended,
+        *,
+        library: str,
+        profile: str,
+        compression: Compression,
+        chunk_size: int,
+    ) -> None:
+        self._out = out
+        self._chunk_size = chunk_size
+        self._compression, self._compress = _COMPRESS[compression]
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._chunks: list[ChunkIndex] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}
+        self._records = bytearray()  # only grows: memory that is used again is in the cache
+        self._size = 0
+        self._index: dict[int, list[int]] = {}
+        self._crc = 0
+        self._append(_MAGIC)
+        self._append(_encoded(Header(profile, library)))
+
+    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Define how messages are decoded, and return its id."""
+        schema = Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
+        self._schemas.append(schema)
+        self._define(schema)
+        return schema.id
+
+    def add_channel(
+        self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str]
+    ) -> int:
+        """Define a channel of messages, and return its id; schema 0 is none."""
+        channel = Channel(
+            id=len(self._channels) + 1,
+            topic=topic,
+            message_encoding=encoding,
+            metadata=dict(metadata),
+            schema_id=schema,
+        )
+        self._channels.append(channel)
+        self._define(channel)
+        return channel.id
+
+    def add_message(
+        self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int
+    ) -> None:
+        """Add a message to the chunk; times in nanoseconds."""
+        length = _MESSAGE_FIELDS + len(data)
+        at = self._size
+        self._add(_MESSAGE.pack(_OF_MESSAGE, length, channel, sequence, log_time, publish_time))
+        self._add(data)
+        pairs = self._index.get(channel)
+        if pairs is None:
+            pairs = self._index[channel] = []
+        pairs += (log_time, at)
+        if self._size > self._chunk_size:
+            self.end_chunk()
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Append a named map of texts, outside the chunks."""
+        data = _encoded(Metadata(name=name, metadata=dict(values)))
+        self._metadata.append(MetadataIndex(offset=self._out.tell(), length=len(data), name=name))
+        self._append(data)
+
+    def add_attachment(
+        self, name: str, media_type: str, data: bytes, *, log_time: int, create_time: int
+    ) -> None:
+        """Append a named file, outside the chunks; times in nanoseconds."""
+        attachment = Attachment(
+            create_time=create_time,
+            log_time=log_time,
+            name=name,
+            media_type=media_type,
+            data=data,
+        )
+        stored = _encoded(attachment)
+        self._attachments.append(
+            AttachmentIndex(
+                offset=self._out.tell(),
+                length=len(stored),
+                log_time=log_time,
+                create_time=create_time,
+                data_size=len(data),
+                name=name,
+                media_type=media_type,
+            )
+        )
+        self._append(stored)
+
+    def end_chunk(self) -> None:
+        """Append the chunk in progress with its message indexes, where it holds a message."""
+        if not self._index:
+            return
+        records, index = memoryview(self._records)[: self._size], self._index
+        self._size, self._index = 0, {}
+        times = [pairs[::2] for pairs in index.values()]
+        first, last = min(map(min, times)), max(map(max, times))
+        stored = self._compress(records)
+        name = self._compression.encode()
+        length = _CHUNK.size - 9 + 4 + len(name) + 8 + len(stored)
+        chunk = b"".join(
+            (
+                _CHUNK.pack(Opcode.CHUNK, length, first, last, len(records), crc32(records)),
+                len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little"),
+                stored,
+            )
+        )
+        offset = self._out.tell()
+        self._append(chunk)
+        offsets, parts, at = {}, [], offset + len(chunk)
+        for channel, pairs in index.items():
+            offsets[channel] = at
+            size = 8 * len(pairs)
+            parts += [
+                _INDEX.pack(Opcode.MESSAGE_INDEX, size + 6, channel, size),
+                struct.pack(f"<{len(pairs)}Q", *pairs),
+            ]
+            at += _INDEX.size + size
+            self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
+        self._append(b"".join(parts))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(chunk),
+                chunk_start_offset=offset,
+                compression=self._compression,
+                compressed_size=len(stored),
+                message_end_time=last,
+                message_index_length=at - offset - len(chunk),
+                message_index_offsets=offsets,
+                message_start_time=first,
+                uncompressed_size=len(records),
+            )
+        )
+
+    def finish(self) -> None:
+        """End the chunk in progress and append the summary."""
+        self.end_chunk()
+        self._append(_encoded(DataEnd(self._crc)))
+        start = at = self._out.tell()
+        groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+        parts, offsets = [], []
+        for opcode, records in groups:
+            part = _encoded(*records)
+            parts.append(part)
+            offsets.append(SummaryOffset(opcode, at, len(part)))
+            at += len(part)
+        summary = b"".join(parts) + _encoded(*offsets)
+        crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, at), crc32(summary))
+        self._append(summary + _encoded(Footer(start, at, crc)) + _MAGIC)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=max((c.message_end_time for c in self._chunks), default=0),
+            message_start_time=min((c.message_start_time for c in self._chunks), default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+    def _define(self, record: McapRecord) -> None:
+        self._add(_encoded(record))
+        if self._size > self._chunk_size:
+            self.end_chunk()
+
+    def _add(self, data: bytes) -> None:
+        """Add bytes to the records of the chunk."""
+        start, stop = self._size, self._size + len(data)
+        if stop > len(self._records):
+            self._records.extend(bytes(stop - len(self._records)))
+        self._records[start:stop] = data
+        self._size = stop
+
+    def _append(self, data: bytes) -> None:
+        self._crc = crc32(data, self._crc)
+        self._out.write(data)
+
+
+def _encoded(*records: McapRecord) -> bytes:
+    builder: Any = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
