@@ -10,6 +10,7 @@ import socket
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from urllib.error import URLError
 from urllib.parse import urlsplit
@@ -28,6 +29,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.experiments.runs import run
 from recorder.world.oscillatory import OscillatorySource
+from replay.runs.writer import RunWriter
 from replay.view.bindings import viewer_client, viewer_program
 from replay.viewer import display, headless, live
 from replay.viewer.live import LiveView
@@ -243,6 +245,27 @@ def test_a_resumed_run_shows_what_went_before(tmp_path, monkeypatch):
     expected = [s.epsilon for s in read_signals(folder)]
     assert len(expected) == 50
     np.testing.assert_array_equal(np.concatenate(sent), expected)
+
+
+def test_what_went_before_has_a_picture_of_each_block(tmp_path, monkeypatch):
+    """Also where a block begins at no multiple of its length, as after a gap."""
+    sent, spec, tau = [], IMAGE, 15
+
+    def keep(self, times, values):
+        if self.path == "world/watched":
+            sent.extend(times[0].as_arrow_array().to_pylist())
+
+    writer, begins = RunWriter(tmp_path / "run.mcap", spec, MANIFEST, watched_every=2), []
+    for signals, block in run_of(spec, 30, tau=tau):
+        t = block.t + (37 if signals.iteration >= 10 else 0)
+        moved = replace(signals, t=t, log_time=spec.time_ns(t))
+        writer.block(replace(block, t=t), moved, having(np.ones((1, 192))))
+        begins.append(t)
+    writer.finish()
+    monkeypatch.setattr("replay.view.columns.ImageColumn.send", keep)
+    with LiveView(spec, MANIFEST, tau, 1) as view:
+        view.earlier(tmp_path)
+    assert sent == [t + t % 2 for t in begins]
 
 
 def test_rerun_switched_off_is_said(monkeypatch):

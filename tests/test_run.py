@@ -17,7 +17,8 @@ from run_data import parts_of, read_signals
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
-from cdmisfa.core.signals import SignalsHash
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.signals import BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import ENDINGS
 from cdmisfa.experiments.runs import RunResult
@@ -102,6 +103,21 @@ def test_the_end_of_a_recording_is_an_error_with_everything_saved(tmp_path: Path
     assert load_modules(out) == ()
     with pytest.raises(LogExhaustedError):
         run(None, OscillatorySource(length=50))
+
+
+@pytest.mark.parametrize(("n", "kept"), [(1, [0]), (8, [0, 7]), (51, [0, 50]), (53, [0, 50, 52])])
+def test_the_last_weights_are_in_the_log_once(n: int, kept: list[int], tmp_path: Path) -> None:
+    shown: list[Any] = []
+
+    class Last(Sink):
+        def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+            shown.append(learner.phi.copy())
+
+    run(tmp_path / "run", max_iterations=n, sinks=[Last()])
+    found = parts_of(tmp_path / "run", "phi")
+    assert [t for t, _ in found] == [CONFIG.tau * k for k in kept]
+    for (_, phi), k in zip(found, kept, strict=True):
+        np.testing.assert_array_equal(phi, shown[k])
 
 
 def test_every_ending_has_words() -> None:

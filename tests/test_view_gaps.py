@@ -97,6 +97,18 @@ def test_modules_stand_where_they_were_saved(shown):
         assert (weights["frame"], weights["iteration"]) == ([save.t], [save.iteration])
 
 
+@pytest.mark.parametrize("lane", ["attends", "novelty", "mostly/attends", "mostly/novelty"])
+def test_a_bar_ends_where_a_gap_begins(shown, lane):
+    _, records, rows = shown
+    frames, states = rows[f"/{lane}"]["frame"], rows[f"/{lane}"]["StateChange:state"]
+    none = [t for t, state in zip(frames, states, strict=True) if state == [""]]
+    assert none == [GAP_AFTER * TAU, records[-1].t + TAU]
+    begin = frames.index(GAP_AFTER * TAU + GAP)
+    assert begin == frames.index(none[0]) + 1
+    if lane == "attends":
+        assert states[begin] == [IMAGE.streams[records[GAP_AFTER].stream]]
+
+
 def test_pictures_hang_with_the_stream_that_they_are_of(shown):
     _, records, rows = shown
     for s, name in enumerate(IMAGE.streams):

@@ -11,7 +11,8 @@ import pytest
 import rerun.blueprint as rrb
 from conftest import Cdmisfa
 from rerun.chunk import RrdReader
-from run_data import IMAGE, VECTOR, write_run
+from run_data import IMAGE, VECTOR, parts_of, write_run
+from test_view_layout import Built
 
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from replay.runs.outline import read_outline
@@ -232,6 +233,19 @@ def test_no_view_of_any_learner_is_empty(
     words = ["learn", oscillatory_recording, "--loop", "--algorithm", algorithm, "-o", run]
     assert cdmisfa(*words, "--max-iterations", 60).code == 0
     assert check_no_view_is_empty(run, monkeypatch) > 25
+
+
+def test_a_short_run_shows_its_weights_and_says_why_there_is_no_interest(
+    cdmisfa: Cdmisfa, tmp_path, oscillatory_recording
+):
+    words = ["learn", oscillatory_recording, "--algorithm", "progress", "-o", tmp_path / "run"]
+    assert cdmisfa(*words, "--max-iterations", 8).code == 0
+    *_, (t, phi) = parts_of(tmp_path / "run", "phi")
+    assert (t, bool(phi.any())) == (7 * 40, True)
+    built = Built(tmp_path / "run" / "run.rrd")
+    assert max(n for b in built.rows["/abstraction/phi"] for n in b["frame"].to_pylist()) == t
+    titles = [name for name, *_ in built.views("TimeSeries")]
+    assert any(name.endswith("no line yet: none was watched long enough") for name in titles)
 
 
 def test_the_summary_says_what_became_of_each_stream(shown):

@@ -187,7 +187,7 @@ def run(
                 )
             )
             told += [
-                _Unfinished(log),
+                _Unfinished(log, learner),
                 Keyframes(log, source, learner, keyframes),
             ]
         elif resume:
@@ -244,8 +244,8 @@ def run(
 class _Unfinished(Sink):
     """A run's log that stays open when learning ends, for what is written after it."""
 
-    def __init__(self, log: RunWriter) -> None:
-        self._log = log
+    def __init__(self, log: RunWriter, learner: Learner) -> None:
+        self._log, self._learner = log, learner
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
@@ -256,7 +256,8 @@ class _Unfinished(Sink):
         self._log.event(t, iteration, text, level)
 
     def finish(self) -> None:
-        """Hand over what was written."""
+        """Write the last weights, and hand over what was written."""
+        self._log.weights(self._learner)
         self._log.flush()
 
 

@@ -26,6 +26,9 @@ TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
 KEYFRAME_TOPIC = "/keyframe"
 
+PHI_EVERY = 50
+"""Iterations between two weights that a log keeps."""
+
 
 @dataclass(frozen=True, slots=True)
 class RunHeader:

@@ -22,6 +22,7 @@ from replay.runs.folders import FINAL_METADATA, RUN_METADATA
 from replay.runs.log import (
     EVENT_TOPIC,
     KEYFRAME_TOPIC,
+    PHI_EVERY,
     PHI_TOPIC,
     SIGNALS_TOPIC,
     TRUTH_TOPIC,
@@ -60,8 +61,8 @@ class RunWriter(Sink):
         manifest: what the run was started with, see `RunHeader`, as JSON values.
         force: overwrite what is there.
         watched_every: keep every this many frames of images; vectors are all kept.
-        phi_every: keep the weights every this many iterations, on each save, and where a learner
-            that has weights of each stream goes on to another one.
+        phi_every: keep the weights every this many iterations, on each save, where a learner that
+            has weights of each stream goes on to another one, and at the end.
         fsync_every: see `LogFile`.
 
     Raises:
@@ -77,7 +78,7 @@ class RunWriter(Sink):
         *,
         force: bool = False,
         watched_every: int = 10,
-        phi_every: int = 50,
+        phi_every: int = PHI_EVERY,
         fsync_every: float | None = None,
     ) -> None:
         self.spec, self.path = spec, Path(path)
@@ -106,6 +107,7 @@ class RunWriter(Sink):
             },
         )
         self._last_keyframe = -1
+        self._unweighed: tuple[int, int, int] | None = None
         self._channels: dict[str, int] = {}
         self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA)
         self._add_channel(PHI_TOPIC, MATRIX_SCHEMA)
@@ -136,11 +138,20 @@ class RunWriter(Sink):
             frames = block.frames.reshape(len(block), -1)
             self._write(WATCHED_TOPIC, at, k, encode_matrix(block.t, frames))
         other = self._by_progress and signals.action == 1
+        self._unweighed = at, k, block.t
         if k % self._phi_every == 0 or signals.saved or other:
             phi = weights_after(signals, learner)
             self._write(PHI_TOPIC, at, k, encode_matrix(block.t, phi))
+            self._unweighed = None
         if time.monotonic() >= self._next_flush:
             self.flush()
+
+    def weights(self, learner: Learner) -> None:
+        """Write the weights that the run ended with, where they were not after its last block."""
+        if self._unweighed is not None:
+            at, k, t = self._unweighed
+            self._write(PHI_TOPIC, at, k, encode_matrix(t, learner.phi))
+            self._unweighed = None
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Write in words what happened at frame t; see `Sink`."""

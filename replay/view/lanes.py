@@ -97,9 +97,9 @@ class Lanes:
         self._iteration = int(columns.iterations[-1])
         codes = {ATTENDS: columns["stream"]} | self._codes(columns)
         for path, lane in self._lanes.items():
-            lane.add(columns.frames, columns.iterations, codes[path])
+            lane.add(columns.frames, columns.iterations, codes[path], columns.tau)
         for path, mostly in self._mostly.items():
-            mostly.add(columns.frames, columns.iterations, codes[path])
+            mostly.add(columns.frames, columns.iterations, codes[path], columns.tau)
 
     def _decided(self, columns: SignalColumns) -> dict[str, Codes]:
         """What CD-MISFA does and decides."""
@@ -154,10 +154,12 @@ class MostlyLane:
 
     def __init__(self, lane: Lane, piece: int | None) -> None:
         self.lane, self._piece = lane, piece
+        self._tau = 0
         self._waiting: list[tuple[Codes, Codes, Codes]] = []
 
-    def add(self, frames: Codes, iterations: Codes, codes: Codes) -> None:
-        """Take what was the case in consecutive blocks."""
+    def add(self, frames: Codes, iterations: Codes, codes: Codes, tau: int) -> None:
+        """Take what was the case in consecutive blocks of `tau` frames."""
+        self._tau = tau
         self._waiting.append((frames, iterations, codes))
         if self._piece is not None:
             self._say(self._piece, last=False)
@@ -175,7 +177,8 @@ class MostlyLane:
         starts = np.arange(0, stop, piece)
         said = np.array([_most(codes[i : i + piece]) for i in starts], dtype=np.int64)
         if len(starts):
-            self.lane.add(frames[starts], iterations[starts], said)
+            every = np.repeat(said, piece)[:stop]
+            self.lane.add(frames[:stop], iterations[:stop], every, self._tau)
         self._waiting = [(frames[stop:], iterations[stop:], codes[stop:])]
 
 
@@ -188,6 +191,8 @@ def _most(codes: Codes) -> int:
 
 class Lane:
     """A row of the view: changes of state, waiting to be handed over.
+
+    Where nothing was watched, nothing is the case: a bar ends where a gap begins.
 
     Args:
         recording: where they go.
@@ -204,20 +209,24 @@ class Lane:
         self._path = path
         self._name = name
         self._state: str | None = None
+        self._stop: int | None = None
         self._changes: list[tuple[int, int, str]] = []
         self._colours: dict[str, Rgb] = {}
         self._declared = 0
 
-    def add(self, frames: Codes, iterations: Codes, codes: Codes) -> None:
-        """Keep the places where what the codes stand for changes."""
-        begins = np.flatnonzero(np.diff(codes.astype(np.int64), prepend=int(codes[0]) + 1))
-        rows = zip(codes[begins], frames[begins], iterations[begins], strict=True)
-        for code, t, iteration in rows:
-            state, rgb = self._name(int(code))
+    def add(self, frames: Codes, iterations: Codes, codes: Codes, tau: int) -> None:
+        """Keep the places where what the codes of blocks of `tau` frames stand for changes."""
+        stops = np.concatenate([frames[:1] if self._stop is None else [self._stop], frames + tau])
+        begins = np.diff(codes.astype(np.int64), prepend=int(codes[0]) + 1) != 0
+        gaps, self._stop = frames != stops[:-1], int(stops[-1])
+        for i in np.flatnonzero(begins | gaps).tolist():
+            state, rgb = self._name(int(codes[i]))
             self._colours.setdefault(state, rgb)
-            if state != self._state:
+            if gaps[i]:
+                self._changes.append((int(stops[i]), int(iterations[i]), ""))
+            if gaps[i] or state != self._state:
                 self._state = state
-                self._changes.append((int(t), int(iteration), state))
+                self._changes.append((int(frames[i]), int(iterations[i]), state))
 
     def end(self, frames: int, iteration: int) -> None:
         """Nothing is the case any longer."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -23,7 +24,7 @@ from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import RunHeader
 from replay.runs.outline import LINES, Outline
-from replay.runs.stretches import Stretch, read_stretches
+from replay.runs.stretches import Frames, Stretch, read_stretches
 from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
@@ -89,7 +90,6 @@ class LiveView(Sink):
         self._view = RunView(self._recording, outline.header, streams, every=1, piece=PIECE)
         for note in self._world.notes:
             self._view.event(0, 0, note, "WARN")
-        self._tau = tau
         self._images = spec.images
         self._next = time.monotonic() + EVERY_SECONDS
         self._broadcast.hand_over()
@@ -119,7 +119,9 @@ class LiveView(Sink):
             UsageError: there is no such run.
             LogDamagedError: its log cannot be read.
         """
-        for stretch in read_stretches(run, every=self._tau):
+        for stretch in read_stretches(run):
+            if self._images:
+                stretch = replace(stretch, watched=_first_of_blocks(stretch))
             self._show(stretch)
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
@@ -180,6 +182,12 @@ class LiveView(Sink):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _first_of_blocks(stretch: Stretch) -> tuple[Frames, ...]:
+    """Of each block's pictures the first one that its log has, wherever the block begins."""
+    pieces = ((np.diff(stretch.blocks.places(at), prepend=-1), at, p) for at, p in stretch.watched)
+    return tuple((at[begins != 0], pictures[begins != 0]) for begins, at, pictures in pieces)
 
 
 def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:

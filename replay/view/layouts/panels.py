@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS
+from replay.runs.log import PHI_EVERY
 from replay.runs.outline import Outline
 from replay.view.columns import FRAME, ITERATION, TIMELINE_SIGNALS
 from replay.view.heads import gaze
@@ -202,13 +203,15 @@ class Panels:
         """What a view of weights is called, and what its colours mean."""
         return "weights φ (blue below 0, red above)" if self.spec.images else "weights φ"
 
-    def now(self, weights: str) -> rrb.Container:
+    def now(self) -> rrb.Container:
         """Input, output and weights."""
         output = self.near("Output y", ["/signals/y"])
+        kept = f", every {PHI_EVERY} blocks" if self.outline.iterations else ""
+        colours = " (blue < 0 < red)" if self.spec.images else ""
         return rrb.Vertical(
             self.watched("Input x"),
             *output,
-            self.weights("/abstraction/phi", weights),
+            self.weights("/abstraction/phi", f"Weights φ{kept}{colours}"),
             row_shares=[3, 2, 3] if output else [3, 3],
         )
 

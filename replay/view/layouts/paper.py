@@ -62,9 +62,7 @@ def _abstraction(panels: Panels) -> rrb.Container:
         *panels.lines(f"Change of weights ξ, {POWERS_OF_TEN}", ["/abstraction/log_xi"], xi),
         *panels.lines("Recent variance of the output", ["/signals/variance"]),
     )
-    return rrb.Horizontal(
-        panels.now(panels.of_phi().capitalize()), curves, column_shares=[2, 5], name="Abstraction"
-    )
+    return rrb.Horizontal(panels.now(), curves, column_shares=[2, 5], name="Abstraction")
 
 
 def _gate(panels: Panels) -> rrb.Container:

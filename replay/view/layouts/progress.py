@@ -34,11 +34,10 @@ def _overview(panels: Panels) -> rrb.Container:
         ["/streams/learning_error/**", "/streams/threshold", "/streams/saved"],
         holding(tested_only(panels, "learning_error"), low=0.0),
     )
-    interest = panels.values("interest")
     promises = panels.lines(
-        "What each stream promises: interest; no line where it was hardly watched",
+        f"What each stream promises: interest; {_promised(panels)}",
         ["/streams/interest/**"],
-        holding(interest[interest < HARDLY_WATCHED], low=0.0),
+        holding(_watched_enough(panels), low=0.0),
     )
     story = stacked(
         ([lanes], heights(1 + streams)),
@@ -49,6 +48,19 @@ def _overview(panels: Panels) -> rrb.Container:
     )
     sees = panels.sees(_looks_for(panels))
     return rrb.Horizontal(sees, story, column_shares=[2, 5], name="Overview")
+
+
+def _watched_enough(panels: Panels) -> NDArray[np.float64]:
+    """Interest, where that is no number for a stream that was hardly watched."""
+    interest = panels.values("interest")
+    return interest[interest < HARDLY_WATCHED]
+
+
+def _promised(panels: Panels) -> str:
+    """Why there may be no line."""
+    if panels.outline.iterations and not len(_watched_enough(panels)):
+        return "no line yet: none was watched long enough"
+    return "no line where it was hardly watched"
 
 
 def tested_only(panels: Panels, name: str) -> NDArray[np.float64]:
@@ -101,9 +113,4 @@ def _candidate(panels: Panels) -> rrb.Container:
         ),
         (panels.lines("Variance of the output on new frames", ["/signals/variance"]), 130),
     )
-    return rrb.Horizontal(
-        panels.now("Weights φ of its candidate (blue below 0, red above); white: it has none"),
-        curves,
-        column_shares=[2, 5],
-        name="Candidate",
-    )
+    return rrb.Horizontal(panels.now(), curves, column_shares=[2, 5], name="Candidate")
