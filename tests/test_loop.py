@@ -70,7 +70,7 @@ class TestRunWriter(SinkContract):
 class TestKeyframes(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
         self.log = RunWriter(folder / "run.mcap", source.spec, {})
-        return Keyframes(self.log, source, learner, 7)
+        return Keyframes(self.log, source, learner, {}, 7)
 
     @pytest.fixture(autouse=True)
     def abandoned(self) -> Iterator[None]:

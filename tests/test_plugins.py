@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -18,12 +19,15 @@ from PIL import Image
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
+from cdmisfa.experiments.sweep import plan
 from recorder.cameras.words import CAMERAS
 from recorder.world.scenes import SCENES
 from replay.export.forms import FORMS
+from replay.runs.log import read_keyframe
 
 ROOT = Path(__file__).parents[1]
 TOY = ROOT / "tests" / "toy_plugin"
+LEFT, RIGHT = (ROOT / "sample_logs" / "icub" / f"{name}.mcap" for name in ("left", "right"))
 NAMES: tuple[tuple[Registry[object], tuple[str, ...]], ...] = (
     (SCENES, ("swings",)),
     (CAMERAS, ("bars",)),
@@ -53,7 +57,6 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     project = tomllib.loads((TOY / "pyproject.toml").read_text())["project"]
     install(folder, project["name"], project["version"], project["entry-points"])
     monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr("cdmisfa.core.plugins._LOADED", {})
     before = [dict(registry) for registry, _ in NAMES]
     yield folder
     for (registry, _), known in zip(NAMES, before, strict=True):
@@ -110,6 +113,33 @@ def test_a_plugins_learner_learns_and_goes_on_where_it_was(
 
 
 @pytest.mark.usefixtures("environment")
+def test_what_is_loaded_but_not_used_changes_nothing(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    def packages(name: str, *words: object) -> set[str]:
+        out = tmp_path / name
+        done = cdmisfa("learn", *words, "--max-iterations", 2, "--no-rerun", "-o", out)
+        assert done.code == 0, done.err
+        keyframe = read_keyframe(out / "run.mcap")
+        versions = json.loads((out / "run.json").read_text())["versions"]
+        assert keyframe is not None
+        assert keyframe.versions == versions
+        return set(versions)
+
+    def names(*words: str) -> list[str]:
+        return [trial.id for trial in plan(["oscillatory"], grid={}, seeds=[0], settings=words)]
+
+    before, own = names(), packages("own", "oscillatory")
+    others = {name: registry[name] for registry, known in NAMES for name in known[:1]}
+    assert "cdmisfa_toy.camera" in sys.modules
+    assert len(others) == 4
+    assert names() == before != names("learner.algorithm=watcher")
+    assert packages("still own", "oscillatory") == own
+    assert packages("learner", "oscillatory", "--algorithm", "watcher") == {*own, "cdmisfa-toy"}
+    assert packages("scene", "swings") == {*own, "cdmisfa-toy"}
+    cameras = ("bars:60", "--set", "learner.tau=10")
+    assert packages("cameras", *cameras) == {*own, "cdmisfa-toy"}
+
+
+@pytest.mark.usefixtures("environment")
 def test_plugins_exports_are_written(
     cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
 ) -> None:
@@ -118,8 +148,7 @@ def test_plugins_exports_are_written(
     assert done.out == f"15 rewards written to {out}\n"
     assert len(out.read_text().splitlines()) == 15
     picture = tmp_path / "all.png"
-    icub = [ROOT / "sample_logs" / "icub" / f"{name}.mcap" for name in ("left", "right")]
-    done = cdmisfa("export", *icub, "--to", "contact", "-o", picture)
+    done = cdmisfa("export", LEFT, RIGHT, "--to", "contact", "-o", picture)
     assert (done.code, done.out) == (0, f"2 views written to {picture}\n")
     with Image.open(picture) as shown:
         width, height = shown.size

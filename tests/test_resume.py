@@ -391,7 +391,7 @@ def test_keyframes_wait_until_the_log_has_room_for_them(
     source = OscillatorySource()
     learner = CuriousLearner(CONFIG, source.spec, 0)
     log = RoomyLog(block, size)
-    keep = Keyframes(log, source, learner, every)
+    keep = Keyframes(log, source, learner, {}, every)
     for _ in range(300):
         shown = source.take(learner.stream, learner.tau)
         signals = learner.step(shown)

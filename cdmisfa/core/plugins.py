@@ -63,16 +63,7 @@ class Plugin:
                 f"{self.name} is {self}, which is a {type(loaded).__name__}: a {needed} is needed "
                 "here"
             )
-        _LOADED[self.package] = self.version
         return loaded
-
-
-_LOADED: dict[str, str] = {}
-
-
-def loaded_versions() -> dict[str, str]:
-    """Versions of the packages of which something was loaded in this process."""
-    return dict(sorted(_LOADED.items()))
 
 
 def plugins(group: str) -> tuple[Plugin, ...]:

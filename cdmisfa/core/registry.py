@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Generic, TypeVar
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.plugins import find, plugins
+from cdmisfa.core.plugins import Plugin, find, plugins
 
 Entry = TypeVar("Entry")
 
@@ -38,6 +38,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     ) -> None:
         self._kind, self._group = kind, group
         self._entries = dict(entries or {})
+        self._loaded: dict[str, Plugin] = {}
         self.first = tuple(self._entries)
 
     def add(self, name: str, entry: Entry) -> None:
@@ -53,6 +54,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def remove(self, name: str) -> None:
         """Take an entry out again."""
         del self._entries[name]
+        self._loaded.pop(name, None)
 
     def __getitem__(self, name: str) -> Entry:
         """The entry of a name.
@@ -67,7 +69,13 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 hint = did_you_mean(name, self.names())
                 raise UsageError(f"no {self._kind} {name!r}: {hint}")
             self._entries[name] = found.load(self.entry_class)
+            self._loaded[name] = found
         return self._entries[name]
+
+    def versions(self, *names: str) -> dict[str, str]:
+        """The packages whose plugins entries are that were asked for, with their versions."""
+        used = (self._loaded[name] for name in names if name in self._loaded)
+        return {plugin.package: plugin.version for plugin in used}
 
     @property
     def entry_class(self) -> type[Entry]:

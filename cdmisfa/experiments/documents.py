@@ -12,7 +12,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.plugins import loaded_versions
 from recorder.log.whole import whole
 
 PACKAGES = ("cdmisfa", "numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
@@ -43,12 +42,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages a result may depend on, plugins that were used too."""
-    return {**_versions(), **loaded_versions()}
-
-
-@functools.cache
-def _versions() -> dict[str, str]:
+    """Versions of Python and of the packages every result may depend on."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):

@@ -20,7 +20,6 @@ from cdmisfa.core.config import differences
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
-from cdmisfa.experiments.documents import versions
 from recorder.cameras.words import is_live
 from recorder.log.begun import Begun, found_path, relative_path
 from recorder.log.whole import partial_path
@@ -123,14 +122,21 @@ class Keyframes(Sink):
         log: of the run.
         source: what it learns from.
         learner: what learns.
+        versions: of the packages that compute it.
         every: iterations between two, 0 writes one at the end only; None for as often as
             `EVERY` iterations, where they stay below a part in `SHARE` of the log before them.
     """
 
     def __init__(
-        self, log: RunWriter, source: FrameSource, learner: Learner, every: int | None = None
+        self,
+        log: RunWriter,
+        source: FrameSource,
+        learner: Learner,
+        versions: Mapping[str, str],
+        every: int | None = None,
     ) -> None:
         self._log, self._source, self._learner = log, source, learner
+        self._versions = versions
         self._every = EVERY if every is None else every
         self._share = SHARE if every is None else 0
         self._due = 0
@@ -162,7 +168,7 @@ class Keyframes(Sink):
         learner, taken = self._learner, getattr(self._source, "taken", None)
         # Cameras have moved on, where they ended or were stopped within the next block.
         t = self._source.t if self._t is None else self._t
-        return Keyframe(learner.iteration, t, learner.state, versions(), taken)
+        return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
 
 
 def restore(learner: Learner, keyframe: Keyframe) -> None:
@@ -219,8 +225,14 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> None:
     source.seek(keyframe.t)
 
 
-def bring_back(log: RunWriter, digest: SignalsHash) -> None:
-    """Write what a run that is resumed keeps: all until its newest keyframe."""
+def bring_back(log: RunWriter, digest: SignalsHash, versions: Mapping[str, str]) -> None:
+    """Write what a run that is resumed keeps: all until its newest keyframe.
+
+    Args:
+        log: of the run.
+        digest: of its signals, at their beginning.
+        versions: of the packages that go on computing it.
+    """
     from replay.runs.log import read_keyframe
 
     before = log.path.parent / SET_ASIDE
@@ -234,7 +246,7 @@ def bring_back(log: RunWriter, digest: SignalsHash) -> None:
         log.event(keyframe.t, last, f"resumed at iteration {keyframe.iteration}")
         changed = [
             f"{name} is {now}, was {keyframe.versions.get(name)}"
-            for name, now in versions().items()
+            for name, now in versions.items()
             if keyframe.versions.get(name) != now
         ]
         if changed:

@@ -19,7 +19,7 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Learner, Sink, arithmetic_of
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
-from cdmisfa.experiments.documents import machine, versions, write_json
+from cdmisfa.experiments.documents import machine, write_json
 from cdmisfa.experiments.loop import Digest, learn
 from cdmisfa.experiments.resume import (
     COMMAND,
@@ -33,6 +33,7 @@ from cdmisfa.experiments.resume import (
     set_aside,
     take_over,
 )
+from cdmisfa.experiments.sources import versions_used
 from recorder.log.folder import folder_here, held, logs_in, refuse_existing
 from recorder.log.whole import make_folder, partial_path, refuse_special
 
@@ -152,6 +153,7 @@ def run(
     digest = Digest()
     tables = {**(sections or {}), "learner": as_table(config)}
     described = description(source)
+    versions = versions_used(config, source, described)
     manifest: dict[str, Any] = {
         "config": tables,
         "seed": seed,
@@ -188,7 +190,7 @@ def run(
             )
             told += [
                 _Unfinished(log, learner),
-                Keyframes(log, source, learner, keyframes),
+                Keyframes(log, source, learner, versions, keyframes),
             ]
         elif resume:
             raise UsageError("which run to resume? name its folder")
@@ -202,7 +204,7 @@ def run(
             if announce is not None:
                 announce(shown.address)
         if log is not None and resume:
-            bring_back(log, digest)
+            bring_back(log, digest, versions)
         elif log is not None and fork is not None:
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):
@@ -231,7 +233,7 @@ def run(
             ended=ended,
         )
         if folder is not None and log is not None:
-            begun[ARITHMETIC] = manifest[ARITHMETIC]
+            begun |= {ARITHMETIC: manifest[ARITHMETIC], "versions": versions}
             _write_run(folder, result, tables, begun, log, rerun=rerun)
     if exhausted is not None:
         kept = f"; {len(learner.modules)} modules of {learner.iteration} iterations are in {folder}"
@@ -343,7 +345,6 @@ def _write_run(
         "seed": result.seed,
         "source": dict(result.source),
         "streams": list(result.streams),
-        "versions": versions(),
         "platform": machine(),
         "result": result.as_json(),
         **begun,

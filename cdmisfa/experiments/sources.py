@@ -13,8 +13,9 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import did_you_mean
+from cdmisfa.experiments.documents import versions
 from recorder.config import RecordConfig, SceneConfig
-from recorder.world.scenes import SCENES
+from recorder.world.scenes import SCENES, scene_of
 from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
@@ -124,6 +125,27 @@ def _refuse_keys_of_others(algorithm: str, keys: Iterable[str]) -> None:
                     f"learner.{key} is of the learner {name}, and this is {algorithm}: leave it "
                     f"out, or choose the other with --algorithm {name}"
                 )
+
+
+def versions_used(
+    config: Any, source: FrameSource, described: Mapping[str, Any] | None = None
+) -> dict[str, str]:
+    """Versions of the packages that a run depends on, those of its plugins, too.
+
+    Args:
+        config: of the learner.
+        source: what it learns from.
+        described: what the source says of itself, where it may be of cameras.
+    """
+    from recorder.cameras.words import PACKAGES
+
+    scene = scene_of(source)
+    return {
+        **versions(),
+        **LEARNERS.versions(config.algorithm),
+        **(SCENES.versions(scene.name) if scene is not None else {}),
+        **(described or {}).get(PACKAGES, {}),
+    }
 
 
 def scene_kind_for(

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
+from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.plugins import loaded_versions
 from cdmisfa.core.untrusted.memory import MAX_LIST
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.runs import module_table, run
@@ -171,9 +171,11 @@ def plan(
         for seed in each:
             configuration = seeded(seed)
             depends: list[Any] = [as_table(configuration.learner)]
+            used = LEARNERS.versions(configuration.learner.algorithm)
             if recorded is None:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
-            if used := loaded_versions():
+                used |= SCENES.versions(configuration.scene.kind)
+            if used:
                 depends.append(used)
             name = identity(depends, seed, recorded, ends, code())
             trial = SweepTrial(

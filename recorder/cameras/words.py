@@ -21,6 +21,9 @@ from recorder.images.framing import Fit, Size
 from recorder.images.pixels import RECIPE, Depth
 from recorder.images.reading import IMAGES, Reading
 
+PACKAGES: Final = "packages"
+"""Key of what cameras of plugins say of themselves: the versions of their packages."""
+
 _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp", "udp")
 
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
@@ -167,6 +170,8 @@ def open_live(
         about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
     if options.color:
         about["recipe"] = COLOR_RECIPE
+    if packages := CAMERAS.versions(*(word.partition(":")[0].lower() for word in words)):
+        about[PACKAGES] = packages
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
     return LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)

@@ -49,9 +49,7 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
         after(ViewParts, "write", lambda log, block: (log._view, log.t))
         after(RunWriter, "block", lambda log, block, signals, learner: ("run", learner.iteration))
         kept = runs.Keyframes
-        runs.Keyframes = lambda log, source, learner, every: kept(  # type: ignore
-            log, source, learner, KEYFRAMES
-        )
+        runs.Keyframes = lambda *given: kept(*given[:-1], KEYFRAMES)  # type: ignore
 
     return tweak
 

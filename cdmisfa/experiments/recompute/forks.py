@@ -12,11 +12,11 @@ from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.config import as_table, build, differences, parse_settings
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Keyframe, arithmetic_of
-from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.recompute.again import Era, source_of, told_anew
 from cdmisfa.experiments.recompute.check import learner_after
 from cdmisfa.experiments.resume import FORK, Fork, command_of, read_command
 from cdmisfa.experiments.runs import RunResult, run
+from cdmisfa.experiments.sources import versions_used
 from recorder.log.folder import folder_here
 from replay.runs.folders import run_log
 from replay.runs.log import read_header
@@ -94,6 +94,7 @@ def fork_run(
         **(limits or {}),
     }
     with contextlib.closing(source_of(log.parent, source)) as frames:
+        keyframe = Keyframe(at, t, told.state, versions_used(era.config, frames))
         return run(
             frames,
             era.config,
@@ -102,7 +103,7 @@ def fork_run(
             sections=sections,
             max_iterations=options.get("max_iterations"),
             max_modules=options.get("max_modules"),
-            fork=Fork(log, Keyframe(at, t, told.state, versions()), ancestry),
+            fork=Fork(log, keyframe, ancestry),
             command=command_of(words, options, out) if words else None,
             **how,
         )
