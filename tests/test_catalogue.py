@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from PIL import Image
 from rerun.chunk import Chunk, ChunkStore, RrdReader
 from rerun_bindings import CatalogClientInternal
 from run_data import VECTOR, write_run
+from waiting import wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import runs_in
@@ -124,10 +124,8 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
         (dataset,) = CatalogClientInternal(found[1]).datasets(include_hidden=False)
         assert str(dataset.entry_details().id) == found[2]
         assert set(dataset.segment_ids()) == {run_identity(run) for run in runs_in(sweep)}
-        end = time.monotonic() + 60
-        while dict(dataset.info().layers).get(LAYER) != 3:  # the views follow the table
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        # the views follow the table
+        wait_for(lambda: dict(dataset.info().layers).get(LAYER) == 3, 60, process)
         assert set(dataset.segment_ids()) == {_identity(run / "run.rrd") for run in runs_in(sweep)}
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) == 130

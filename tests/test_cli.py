@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa, Outcome
 from run_data import VECTOR, write_run
+from waiting import wait_for
 
 SHORT = ("--max-iterations", "5", "--json")
 
@@ -401,7 +402,7 @@ class TestInterrupts:
         run = tmp_path / "run"
         words = ["learn", "oscillatory", "-o", str(run), "--no-rerun", "--json"]
         with start(*words, "--set", "learner.delta=1e-12") as process:
-            wait_for(run / "run.mcap.partial", process)
+            wait_for_bytes(run / "run.mcap.partial", process)
             process.send_signal(number)
             out, err = process.communicate(timeout=60)
         assert process.returncode == code, err
@@ -414,7 +415,7 @@ class TestInterrupts:
         recording = tmp_path / "recording"
         words = ["record", "oscillatory", "-o", str(recording), "--frames", "100000000"]
         with start(*words) as process:
-            wait_for(recording / "x3.mcap.partial", process)
+            wait_for_bytes(recording / "x3.mcap.partial", process)
             time.sleep(0.3)
             process.send_signal(signal.SIGTERM)
             out, err = process.communicate(timeout=60)
@@ -435,9 +436,5 @@ class TestInterrupts:
             assert process.stderr.read() == ""
 
 
-def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 60
-    while not (path.exists() and path.stat().st_size > 0):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+def wait_for_bytes(path: Path, process: subprocess.Popen[str]) -> None:
+    wait_for(lambda: path.exists() and path.stat().st_size > 0, 60, process)

@@ -10,9 +10,11 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
+from waiting import wait_for
 
 from cdmisfa.experiments.convert import convert
 from recorder.log.split import Split
@@ -33,11 +35,7 @@ def test_a_signal_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> N
         [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
     )
     try:
-        deadline = time.monotonic() + 60
-        while not list(folder.glob("x3.mcap.partial")):
-            assert time.monotonic() < deadline
-            assert recorder.poll() is None
-            time.sleep(0.02)
+        wait_for((folder / "x3.mcap.partial").exists, 60, recorder)
         time.sleep(0.2)
         recorder.send_signal(number)
         error = recorder.communicate(timeout=60)[1]
@@ -56,18 +54,14 @@ def test_a_terminal_that_is_closed_ends_it_like_a_signal(tmp_path: Path, jobs: i
     pid, terminal = pty.fork()
     if pid == 0:
         os.execv(sys.executable, [sys.executable, "-m", "cdmisfa", *words, "--jobs", str(jobs)])
-    deadline = time.monotonic() + 60
-    while sum(path.stat().st_size for path in folder.glob("*.partial")) < 1 << 17:
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    os.close(terminal)
-    ended = 0, 0
-    while not ended[0] and time.monotonic() < deadline:
-        ended = os.waitpid(pid, os.WNOHANG)
-        time.sleep(0.02)
-    if not ended[0]:
-        os.kill(pid, signal.SIGKILL)
-    assert os.waitstatus_to_exitcode(ended[1]) == 129
+    recorder = psutil.Process(pid)
+    try:
+        wait_for(lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60)
+        os.close(terminal)
+        assert recorder.wait(60) == 129
+    finally:
+        if recorder.is_running():
+            recorder.kill()
     with pytest.raises(RecordingStoppedError):
         record_scene("oscillatory", folder, frames=100000000, resume=True, stop=lambda: True)
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from waiting import wait_for
 
 from cdmisfa.core.blocks import Block, ClockedSource, FrameSource, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
@@ -290,11 +291,7 @@ def test_a_signal_ends_the_waiting(tmp_path: Path) -> None:
             stderr=subprocess.DEVNULL,
         )
         try:
-            deadline = time.monotonic() + 60
-            while not (tmp_path / "run" / "run.mcap.partial").exists():
-                assert time.monotonic() < deadline
-                assert learner.poll() is None
-                time.sleep(0.05)
+            wait_for((tmp_path / "run" / "run.mcap.partial").exists, 60, learner)
             time.sleep(0.3)
             learner.send_signal(signal.SIGINT)
             assert learner.wait(30) == 130

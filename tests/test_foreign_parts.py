@@ -6,8 +6,8 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from camera_files import HEIGHT, WIDTH, pictures, write_cameras
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
+from waiting import wait_for
 
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.source import ForeignSource
@@ -108,7 +109,7 @@ def test_a_killed_conversion_goes_on(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cdmisfa", *map(str, words), str(folder)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     try:
-        _wait_for(folder / "left.mcap.partial", 20_000)
+        _wait_for_bytes(folder / "left.mcap.partial", 20_000, process)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
@@ -129,15 +130,12 @@ def test_a_stopped_conversion_says_how_to_go_on(tmp_path: Path) -> None:
     words = ["convert", tmp_path / "a.mcap", *BOTH, "-o", tmp_path / "rec"]
     command = [sys.executable, "-m", "cdmisfa", *map(str, words)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    _wait_for(tmp_path / "rec" / "left.mcap.partial", 20_000)
+    _wait_for_bytes(tmp_path / "rec" / "left.mcap.partial", 20_000, process)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 143, said
     assert said.rstrip().endswith("rec is not finished: go on with --resume")
 
 
-def _wait_for(path: Path, size: int) -> None:
-    end = time.monotonic() + 60
-    while not path.exists() or path.stat().st_size < size:
-        assert time.monotonic() < end, f"{path} did not come"
-        time.sleep(0.01)
+def _wait_for_bytes(path: Path, size: int, process: subprocess.Popen[Any]) -> None:
+    wait_for(lambda: path.exists() and path.stat().st_size >= size, 60, process)

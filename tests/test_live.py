@@ -88,7 +88,6 @@ def test_the_progress_learner_is_shown_by_its_streams(monkeypatch):
     assert not any(path.startswith("policy/") for path in sent)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_the_robot_turns_to_what_is_watched(tmp_path, monkeypatch):
     """As in the view of a finished run, whose first tab a live view has, too."""
     without_models(monkeypatch)
@@ -106,6 +105,7 @@ def test_the_robot_turns_to_what_is_watched(tmp_path, monkeypatch):
     assert {"wall/frame", *(f"wall/{s + 1}_{n}" for s, n in enumerate(IMAGE.streams))} <= set(sent)
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads Linux's table of sockets")
 def test_it_listens_on_this_machine_only():
     with LiveView(VECTOR, MANIFEST, 40, 1) as view:
         port = urlsplit(view.address).port

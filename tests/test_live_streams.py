@@ -23,6 +23,7 @@ from conftest import Cdmisfa
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from PIL import Image
+from waiting import wait_for
 
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
@@ -461,10 +462,7 @@ def test_what_cannot_be_is_refused_in_one_line(
 def test_ctrl_c_finishes_a_recording_of_cameras(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(tmp_path / "rec")]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    until = time.monotonic() + 60
-    while not list(tmp_path.glob("rec/*.partial")):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_for(lambda: list(tmp_path.glob("rec/*.partial")), 60, process)
     time.sleep(0.5)
     process.send_signal(2)
     _, said = process.communicate(timeout=60)
@@ -479,10 +477,8 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
 ) -> None:
     command = [sys.executable, "-m", "cdmisfa", "record", TEST, "-o", str(tmp_path / "rec")]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    until = time.monotonic() + 60
-    while not any(path.stat().st_size > 8000 for path in tmp_path.glob("rec/*.partial")):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    partial = tmp_path / "rec" / "lavfi_testsrc.mcap.partial"
+    wait_for(lambda: partial.exists() and partial.stat().st_size > 8000, 60, process)
     process.kill()
     process.wait()
     assert cdmisfa("info", str(tmp_path / "rec"), "--json").json["complete"] is False

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
+from waiting import wait_for
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import RecordConfig
@@ -422,12 +423,10 @@ def recorder(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "cdmisfa", *words], stderr=subprocess.PIPE, text=True
     )
-    deadline = time.monotonic() + 60
+    wait_for(
+        lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60, process
+    )
     listed = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while sum(path.stat().st_size for path in folder.glob("*.partial")) < 1 << 17:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
     commands = {int(w): Path(f"/proc/{w}/cmdline").read_text() for w in listed.read_text().split()}
     with process:
         yield process, [pid for pid, command in commands.items() if "spawn_main" in command]
@@ -477,10 +476,7 @@ def test_rendering_processes_end_with_their_killed_parent(tmp_path):
     assert len(children) >= 2
     process.kill()
     process.communicate()
-    deadline = time.monotonic() + 20
-    while any(running(child) for child in children) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(running(child) for child in children)
+    wait_for(lambda: not any(running(child) for child in children), 20)
 
 
 def running(pid: int) -> bool:

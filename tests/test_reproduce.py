@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from waiting import wait_for
 
 from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.core.errors import NotReproducedError, UsageError
@@ -101,10 +101,7 @@ def test_a_killed_reproduction_goes_on_where_it_stopped(tmp_path: Path) -> None:
     trials = tmp_path / "oscillatory" / "trials"
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
-        deadline = time.monotonic() + 120
-        while len(list(trials.glob("*.npz"))) < 3 and time.monotonic() < deadline:
-            assert process.poll() is None
-            time.sleep(0.02)
+        wait_for(lambda: len(list(trials.glob("*.npz"))) >= 3, 120, process)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()

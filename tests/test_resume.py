@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from run_data import parts_of, read_signals
+from waiting import wait_for
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
@@ -155,7 +155,6 @@ def test_a_simulator_goes_on(tmp_path: Path) -> None:
 SLOW = """
 import sys, time
 from pathlib import Path
-from typing import Any
 import test_resume as case
 from recorder.world.oscillatory import OscillatorySource
 case.go(OscillatorySource(), Path(sys.argv[1]), case.LENGTH, resume=sys.argv[2] == "resume",
@@ -168,11 +167,7 @@ def killed_when(out: Path, resume: bool, ready: Callable[[], bool]) -> None:
     mode = "resume" if resume else "new"
     here = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     process = subprocess.Popen([sys.executable, "-c", SLOW, str(out), mode], env=here)
-    deadline = time.monotonic() + 60
-    while not ready():
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+    wait_for(ready, 60, process)
     os.kill(process.pid, signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
 

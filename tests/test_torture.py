@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from waiting import wait_for
 
 from tests.torture import harness, page
 from tests.torture.campaigns import CAMPAIGNS, campaign
@@ -98,10 +99,8 @@ def test_a_case_that_hangs_is_ended_with_all_that_it_started(tmp_path: Path) -> 
     harness.run(hung, results, time.monotonic() + 0.05, 1, io.StringIO())
     assert [line["kind"] for line in results.lines] == [HANG]
     state = Path("/proc", (tmp_path / "child").read_text(), "stat")
-    patience = time.monotonic() + 30  # a killed process dies when it is scheduled next
-    while state.exists() and state.read_text().split()[2] != "Z" and time.monotonic() < patience:
-        time.sleep(0.01)
-    assert not state.exists() or state.read_text().split()[2] == "Z"
+    # a killed process dies when it is scheduled next
+    wait_for(lambda: not state.exists() or state.read_text().split()[2] == "Z", 30)
 
 
 def test_results_are_gone_on_with(tmp_path: Path) -> None:
