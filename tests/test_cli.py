@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa, Outcome
+from folders import contents
 from run_data import VECTOR, write_run
 from waiting import wait_for
 
@@ -368,9 +369,9 @@ class TestErrors:
         learn = ("learn", "oscillatory", "--no-rerun", "--max-iterations", 2, "-o", run)
         for words, folder in ((record, recording), (learn, run)):
             assert cdmisfa(*words).code == 0
-            before = {file: file.read_bytes() for file in folder.iterdir()}
+            before = contents(folder)
             assert_one_line(cdmisfa(*words, "--seed", 8), 2, str(folder), "--force")
-            assert {file: file.read_bytes() for file in folder.iterdir()} == before
+            assert contents(folder) == before
             assert cdmisfa(*words, "--seed", 8, "--force").code == 0
 
     def test_a_folder_that_cannot_be_made(self, cdmisfa: Cdmisfa, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import psutil
 import pytest
 from camera_files import write_cameras
 from conftest import Cdmisfa
+from folders import contents
 from waiting import wait_for
 
 from cdmisfa.experiments.convert import convert
@@ -106,8 +107,7 @@ def test_going_on_needs_neither_scene_nor_seed_nor_split(cdmisfa: Cdmisfa, tmp_p
         assert (refused.code, what in refused.err) == (2, True), refused.err
     done = cdmisfa(*again)
     assert done.code == 0, done.err
-    contents = [{p.name: p.read_bytes() for p in f.iterdir()} for f in (folder, tmp_path / "whole")]
-    assert contents[0] == contents[1]
+    assert contents(folder) == contents(tmp_path / "whole")
     complete = cdmisfa(*again, "--json")
     assert (complete.code, complete.json["frames"]) == (0, 400)
     assert complete.err == f"{folder} is complete: nothing was left to record\n"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import contents
 
 from cdmisfa.core.blocks import (
     Block,
@@ -75,10 +76,6 @@ def pendulum(tmp_path: Path) -> Iterator[None]:
 class TestPendulums(SourceContract):
     def open(self) -> SeekableSource:
         return open_scene("pendulum", PendulumConfig(seed=4))
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_it_is_recorded_and_learned_from_with_the_same_signals(

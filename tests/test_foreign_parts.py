@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_cameras
 from conftest import Cdmisfa
+from folders import contents
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 from waiting import wait_for
@@ -97,10 +98,6 @@ def test_a_part_may_lack_a_topic(parts: list[Path]) -> None:
         ForeignSource(parts[0].parent, size=SIZE)
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
 def test_a_killed_conversion_goes_on(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     write_cameras(tmp_path / "a.mcap", {"/left": (6000, 20), "/right": (6000, 20)})
     words = ("convert", tmp_path / "a.mcap", *BOTH, "-o")
@@ -120,9 +117,9 @@ def test_a_killed_conversion_goes_on(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     assert (other.code, "cannot be continued" in other.err) == (2, True), other.err
     done = cdmisfa(*words, folder, "--resume")
     assert done.code == 0, done.err
-    assert files_of(folder) == files_of(tmp_path / "whole")
+    assert contents(folder) == contents(tmp_path / "whole")
     assert cdmisfa(*words, folder, "--resume").code == 0
-    assert files_of(folder) == files_of(tmp_path / "whole")
+    assert contents(folder) == contents(tmp_path / "whole")
 
 
 def test_a_stopped_conversion_says_how_to_go_on(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import contents
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
@@ -90,10 +91,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("webcams") / "rec"
     record(Webcams(), folder, frames=FRAMES)
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_what_was_recorded_is_what_the_cameras_showed(cdmisfa: Cdmisfa, recording: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
+from folders import contents, coverage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
@@ -162,11 +163,6 @@ def test_a_run_across_a_gap_is_checked_and_resumed(cdmisfa: Cdmisfa, tmp_path: P
     assert other != whole
 
 
-def coverage(folder: Path) -> dict[str, list[tuple[int, int]]]:
-    with contextlib.closing(RecordedSource(folder)) as source:
-        return source.coverage()
-
-
 def test_a_conversion_keeps_its_clock_and_has_the_gaps_of_its_logs(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
@@ -221,9 +217,7 @@ def test_a_conversion_with_gaps_is_resumed(tmp_path: Path, split: Split | None) 
         assert list(part.glob("*.partial"))
         converted(part.name, 999, resume=True)
         for _ in range(2):
-            names = sorted(path.name for path in whole.iterdir())
-            assert sorted(path.name for path in part.iterdir()) == names
-            assert all((part / n).read_bytes() == (whole / n).read_bytes() for n in names)
+            assert contents(part) == contents(whole)
             converted(part.name, 999, resume=True)
 
 

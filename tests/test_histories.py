@@ -6,6 +6,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from folders import contents
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
@@ -80,9 +81,9 @@ def test_a_whole_run_stays_as_it_is_where_it_cannot_be_gone_back_to(tmp_path: Pa
     history = History(tmp_path)
     history.record(world, MOST, None, force=False)
     history.learn(18, how="new", follow=True)
-    before = {path.name: path.read_bytes() for path in history.run.iterdir()}
+    before = contents(history.run)
     history.record(world, MOST - 80, None, force=True)
     history.learn(19, how="resume", follow=True)
     assert history.errors == 1
-    assert {path.name: path.read_bytes() for path in history.run.iterdir()} == before
+    assert contents(history.run) == before
     history.verify()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import coverage
 from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedInbox, bar
 from waiting import wait_for
 
@@ -221,11 +222,6 @@ def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(
     )
 
 
-def shown(path: Path) -> dict[str, list[tuple[int, int]]]:
-    with contextlib.closing(RecordedSource(path)) as source:
-        return source.coverage()
-
-
 class Cameras:
     """Real threads that read cameras handed pictures by the test."""
 
@@ -396,7 +392,7 @@ def test_recording_goes_on_until_it_is_stopped(tmp_path: Path) -> None:
     seen: list[float] = []
     record_watched(recorded, stop=lambda: len(seen) == 80, progress=seen.append)
     assert seen == list(range(1, 81))
-    assert shown(tmp_path / "rec") == {"left": [(0, 38), (60, 80)], "right": [(0, 80)]}
+    assert coverage(tmp_path / "rec") == {"left": [(0, 38), (60, 80)], "right": [(0, 80)]}
     assert [file.frames for file in recorded.files] == [58, 80]
     assert not list((tmp_path / "rec").glob("*.partial"))
 
@@ -405,7 +401,7 @@ def test_recording_ends_with_the_cameras_and_says_why(tmp_path: Path) -> None:
     recorded = RecordedWhileWatched(opened(steady(0, 0, 20)), tmp_path / "rec")
     record_watched(recorded)
     assert recorded.ended == "camera 0 ended"
-    assert shown(tmp_path / "rec") == {"left": [(0, 20)]}
+    assert coverage(tmp_path / "rec") == {"left": [(0, 20)]}
 
 
 def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Path) -> None:

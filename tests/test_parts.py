@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import contents
 from waiting import wait_for
 
 from cdmisfa.core.blocks import FrameSource
@@ -35,10 +36,6 @@ def parts(split: Split, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("parts") / "rec"
     record_scene("oscillatory", folder, frames=FRAMES, split=split)
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 class TestParts(SourceContract):

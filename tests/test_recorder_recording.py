@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folders import contents
 from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
 from waiting import wait_for
@@ -41,10 +42,6 @@ def sha256(path: Path) -> str:
 
 def whole_frames(path: Path, view: str) -> int:
     return frames_held(path, view).whole(0)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 @pytest.fixture(scope="module")

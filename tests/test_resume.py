@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import contents
 from run_data import parts_of, read_signals
 from waiting import wait_for
 
@@ -255,11 +256,11 @@ def test_a_changed_run_is_refused_and_left_alone(
     out = tmp_path / "run"
     config = LearnerConfig(tau=40)
     go(OscillatorySource(), out, 20, config)
-    before = {path: path.read_bytes() for path in out.iterdir()}
+    before = contents(out)
     changed = {"source": OscillatorySource(), "config": config} | change
     with pytest.raises(UsageError, match=named):
         go(out=out, iterations=30, resume=True, **changed)
-    assert {path: path.read_bytes() for path in out.iterdir()} == before
+    assert contents(out) == before
 
 
 def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
@@ -272,12 +273,12 @@ def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
 def test_a_source_that_cannot_go_back_is_refused_and_the_run_left_alone(tmp_path: Path) -> None:
     out = tmp_path / "run"
     go(OscillatorySource(), out, 30)
-    before = {path: path.read_bytes() for path in out.iterdir()}
+    before = contents(out)
     with pytest.raises(
         UsageError, match=r"oscillatory cannot go back .* resume from its recording"
     ):
         go(ForwardOnly(), out, 40, resume=True)
-    assert {path: path.read_bytes() for path in out.iterdir()} == before
+    assert contents(out) == before
 
 
 def test_a_run_that_is_still_going_is_left_alone(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Cdmisfa
+from folders import contents
 from s3_server import buckets, serving_s3
 
 from cdmisfa.cli import run
@@ -44,14 +45,6 @@ def s3(server: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator
 
 def stored(files: Any, below: str) -> dict[str, bytes]:
     return {key.removeprefix(f"{below}/"): files.cat(key) for key in files.find(below)}
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 @pytest.fixture
@@ -88,7 +81,7 @@ def test_each_command_uploads_what_it_wrote(
     assert done.code == 0, done.err
     local = Path(name).name
     assert f"written to {local}, and uploaded to s3://lab/{name} when it is finished" in done.err
-    files = contents(Path(local)) or {p.name: p.read_bytes() for p in Path().iterdir()}
+    files = contents(Path(local)) or contents(Path())
     assert files
     there = stored(s3, f"lab/{name}" if Path(local).is_dir() else "lab")
     assert there == files
