@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,10 @@ FREQUENCIES = 12
 
 LAST_BLOCKS = 40
 """Blocks before the save whose output is shown with what the frozen module says later."""
+
+
+MOST_HEARD = 64 * 1024 * 1024
+"""Most bytes of a run's outputs that are kept; of a longer run they are read again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +70,34 @@ class Output:
             if (fit := follow(truth[:, column], y, column, name, angle=column in round_))
         ]
         return max(found, key=lambda fit: fit.r, default=None)
+
+
+class Heard:
+    """What of a run's records `read_outputs` needs, kept while they are read for something else.
+
+    Args:
+        modules: how many modules may be asked for, at most.
+    """
+
+    def __init__(self, modules: int) -> None:
+        self._modules = modules
+        self._pieces: list[SignalColumns] = []
+        self._bytes = 0
+
+    def add(self, columns: SignalColumns) -> None:
+        """Take the records that follow."""
+        if self._bytes > MOST_HEARD:
+            self._pieces = []
+            return
+        kept = {name: columns[name] for name in ("t", "stream", "module", "saved", "y")}
+        kept["y_frozen"] = columns["y_frozen"][:, : self._modules, :, :1]
+        self._pieces.append(SignalColumns({name: part.copy() for name, part in kept.items()}))
+        self._bytes += sum(part.nbytes for part in kept.values())
+
+    @property
+    def pieces(self) -> Sequence[SignalColumns] | None:
+        """The records of the whole run; None where they are too many to be kept."""
+        return None if self._bytes > MOST_HEARD else self._pieces
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +182,7 @@ def read_outputs(
     most: int = KEPT,
     *,
     truth: Frames | None = None,
+    records: Iterable[SignalColumns] | None = None,
 ) -> tuple[Output, ...]:
     """What the first modules of a run say about their own streams; see `read_stretches`.
 
@@ -163,13 +196,16 @@ def read_outputs(
         modules: how many, at most.
         most: last frames of each.
         truth: what the world knew at each frame, where that was read already.
+        records: of the run, where they were; see `Heard`.
     """
     header = outline.header
     heard = [
         _OutputCollector(save.module, save.stream, alone=header.by_progress)
         for save in outline.saved[:modules]
     ]
-    for columns in read_columns(path, header) if heard else ():
+    if heard and records is None:
+        records = read_columns(path, header)
+    for columns in records or ():
         for module in heard:
             module.add(columns)
     if heard and truth is None:

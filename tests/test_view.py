@@ -23,7 +23,7 @@ from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
 from replay.view import run as run_view
 from replay.view.build import build_view
-from replay.view.columns import TensorBatch
+from replay.view.columns import ImageBatch, TensorBatch
 from replay.view.layouts.panels import Panels
 from replay.view.layouts.paper import feels
 from replay.view.summary import summary_text
@@ -278,6 +278,14 @@ def test_tensors_are_encoded_as_rerun_does():
     for row, tensor in zip(found.to_pylist(), block, strict=True):
         batch = rr.Tensor(tensor, dim_names=names).as_component_batches()[0]
         assert row == batch.as_arrow_array().to_pylist()
+
+
+def test_images_are_encoded_as_rerun_does():
+    images = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    (theirs,) = rr.Image.columns(buffer=images)
+    found = ImageBatch(images)
+    assert found.component_descriptor() == theirs.component_descriptor()
+    assert found.as_arrow_array().equals(theirs.as_arrow_array())
 
 
 def test_private_names_of_rerun_are_taken_in_one_place():

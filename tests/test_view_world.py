@@ -143,8 +143,13 @@ def test_the_recording_says_what_stood_where(tmp_path):
     assert world_of_run(header, tmp_path, sample) == (scenery_of(CONFIG), None)
 
 
-def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
-    """Of a module whose stream is not watched after its save, it is what the module says."""
+@pytest.mark.parametrize("most_heard", [10**6, 0])
+def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path, monkeypatch, most_heard):
+    """Of a module whose stream is not watched after its save, it is what the module says.
+
+    A run that is too long to be kept is read again.
+    """
+    monkeypatch.setattr("replay.following.MOST_HEARD", most_heard)
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
     outline = read_outline(tmp_path)
     build_view(tmp_path, tmp_path / "run.rrd")

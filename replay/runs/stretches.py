@@ -131,17 +131,23 @@ class Stretches:
 
     def take(self, table: MessageTable) -> Iterator[Stretch]:
         """Take the messages of the next chunk, and give the stretches that end with them."""
-        spec, data = self._header.spec, memoryview(table.data.data)
+        spec = self._header.spec
+        wanted = np.isin(table.channel, list(self._wanted))
+        frames = spec.frames_at(table.log_time)
+        if spec.images and self._every > 1:
+            shown = [n for n, topic in self._wanted.items() if topic == WATCHED_TOPIC]
+            wanted &= ~np.isin(table.channel, shown) | (frames % self._every == 0)
+        if not wanted.all():
+            table, frames = table.select(wanted), frames[wanted]
+        data = memoryview(table.data.data)
         for number, t, at, size in zip(
             table.channel.tolist(),
-            spec.frames_at(table.log_time).tolist(),
+            frames.tolist(),
             table.at.tolist(),
             table.size.tolist(),
             strict=True,
         ):
-            topic = self._wanted.get(number)
-            if topic is None or (topic == WATCHED_TOPIC and spec.images and t % self._every):
-                continue
+            topic = self._wanted[number]
             if self._waiting.full(topic):
                 yield self.rest()
             self._waiting.add(topic, t, bytes(data[at : at + size]))

@@ -16,6 +16,7 @@ from rerun.chunk import Chunk
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, whole
 from replay.camera_logs.options import CameraOptions
+from replay.following import Heard
 from replay.inputs.opening import holds_run
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_header
@@ -30,7 +31,7 @@ from replay.view.recording import write_recording, write_unwatched
 from replay.view.run import RunView
 from replay.view.summary import summary_text
 from replay.view.world.first import WorldView
-from replay.view.world.learned import write_learned
+from replay.view.world.learned import MOST, write_learned
 
 FLUSH_SECONDS = 60.0
 
@@ -152,12 +153,14 @@ def _write_run(
     tally, view = Tally(header), RunView(recording, header, streams, every)
     world = WorldView(recording, header, folder, streams, every, all_views, body=body)
     truth: list[Frames] = []
+    heard = Heard(MOST)
     for note in world.notes:
         view.event(0, 0, note, "WARN")
     events: list[str] = []
     for stretch in read_stretches(log, header, every=every):
         for columns in stretch.signals:
             tally.add(columns)
+            heard.add(columns)
         view.take(stretch)
         world.take(stretch)
         truth += stretch.truth
@@ -170,7 +173,7 @@ def _write_run(
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, all_views, outline, every)
     world.flush()
-    first = world.first(write_learned(recording, log, outline, truth))
+    first = world.first(write_learned(recording, log, outline, truth, heard))
     recording.send_blueprint(
         run_layout(outline, first, all_views=all_views is not None, head=head, tab=tab)
     )

@@ -156,7 +156,8 @@ class RunView:
         """Take (n, *frame_shape) of what the learner saw at n frames."""
         if self._spec.images:
             kept = at % self._every == 0
-            at, frames = at[kept], frames[kept]
+            if not kept.all():
+                at, frames = at[kept], frames[kept]
         if len(at):
             column = self._column("world/watched", frames_column, WIDTH)
             column.add(at, self._blocks.iteration(at), frames)

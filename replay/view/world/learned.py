@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from replay.following import Following, read_outputs
+from replay.following import Following, Heard, read_outputs
 from replay.palette import GREY, colour
 from replay.runs.outline import Outline
 from replay.runs.stretches import Frames
@@ -47,7 +47,11 @@ class Lesson:
 
 
 def write_learned(
-    recording: rr.RecordingStream, log: Path, outline: Outline, truth: Sequence[Frames]
+    recording: rr.RecordingStream,
+    log: Path,
+    outline: Outline,
+    truth: Sequence[Frames],
+    heard: Heard,
 ) -> list[Lesson]:
     """Write each module's output where its stream was watched, and what it follows, everywhere.
 
@@ -56,13 +60,16 @@ def write_learned(
         log: of the run.
         outline: the run in short.
         truth: what the world knew at each frame, piece after piece.
+        heard: the run's records.
     """
     names, spec = outline.names(), outline.header.spec
     if not truth or not outline.saved:
         return []
     frames, values = (np.concatenate(part)[-MOST_FRAMES:] for part in zip(*truth, strict=True))
     iterations, lessons = outline.blocks.iteration(frames), []
-    for output in read_outputs(log, outline, MOST, MOST_FRAMES, truth=(frames, values)):
+    for output in read_outputs(
+        log, outline, MOST, MOST_FRAMES, truth=(frames, values), records=heard.pieces
+    ):
         found = output.follows(spec.truth)
         if found is None:
             continue
