@@ -12,7 +12,8 @@ import numba
 import pytest
 
 from cdmisfa.cli.progress import Bar, compiling_said
-from cdmisfa.core.arithmetic.compiled import MARKS, before_compiling, compiled
+from cdmisfa.core.arithmetic.compiled import before_compiling, compiled
+from cdmisfa.core.arithmetic.kept import MARKS
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -56,6 +57,35 @@ def test_compiling_is_told_only_where_nothing_is_on_disk(tmp_path: Path) -> None
 
     assert said() == "compiling\n"
     assert said() == ""
+
+
+def test_what_is_kept_is_loaded_without_the_compiler(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import sys\n"
+        "import numba\n"
+        "import numpy as np\n"
+        "from cdmisfa.core.arithmetic.compiled import compiled\n"
+        "@compiled\n"
+        "def least(x):\n"
+        "    if len(x) > 3:\n"
+        "        raise ValueError('too long', len(x))\n"
+        "    return np.min(x)\n"
+        "assert least(np.array([2.0, 1.0])) == 1.0\n"
+        "try:\n"
+        "    least(np.zeros(4))\n"
+        "except ValueError as error:\n"
+        "    assert error.args == ('too long', 4)\n"
+        "print('numba.np.arraymath' in sys.modules, 'scipy.linalg' in sys.modules)\n"
+        "assert numba.njit(lambda x: np.min(x) + 1.0)(np.array([2.0, 1.0])) == 2.0\n"
+    )
+    kept = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    for imported in ("True", "False"):
+        done = subprocess.run(
+            [sys.executable, str(program)], env=kept, capture_output=True, text=True, check=False
+        )
+        assert (done.stdout.split()[:1], done.stderr) == ([imported], "")
+    assert done.stdout == "False False\n"
 
 
 def test_what_was_kept_before_a_class_moved_is_made_again(tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return type(self._entries[self.first[0]])
 
     def __contains__(self, name: object) -> bool:
-        return name in self.names()
+        return name in self._entries or name in self.names()
 
     def get(self, name: str, default: Entry | None = None) -> Entry | None:  # type: ignore[override]
         """The entry of a name, or the default."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache, partial
-from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
@@ -15,19 +12,9 @@ from numba.core import event
 from numba.extending import overload
 
 from cdmisfa.core.arithmetic.choice import Either
+from cdmisfa.core.arithmetic.kept import kept_while_sources_last
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-MARKS = (
-    b"@compiled",
-    b"@inlined",
-    b"spliced(",
-    b"@reordered",
-    b"@in_compiled_code",
-    b"@_intrinsic",
-    b"Either",
-)
-"""What files that hold compiled functions contain."""
 
 
 def compiled(function: Function) -> Function:
@@ -89,44 +76,6 @@ def _under_another_name(function: Callable[..., Any]) -> Callable[..., Any]:
     copy.__qualname__ = f"{function.__qualname__}_portable"
     copy.__module__ = function.__module__
     return copy
-
-
-def kept_while_sources_last(dispatcher: Any) -> Any:
-    """Let a result on disk count only as long as no compiled function has changed.
-
-    A compiled function holds what it calls in other files; numba by itself compiles it again
-    only when its own file has changed.
-    """
-    kept: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if hasattr(kept, "_source_stamp"):
-        kept._source_stamp = (kept._source_stamp, _sources())
-        kept._load_index = partial(_index_or_none, kept._load_index)
-    return dispatcher
-
-
-def _index_or_none(load: Callable[[], Any]) -> Any:
-    """What is on disk, or nothing where it cannot be read.
-
-    Numba unpickles the names of classes before it looks at the stamp: after a move they may lead
-    to modules that are no longer there.
-    """
-    try:
-        return load()
-    except Exception:
-        return {}
-
-
-@cache
-def _sources() -> str:
-    """Hash of the sources of all packages that hold compiled functions."""
-    root = Path(__file__).parents[3]
-    digest = hashlib.sha256()
-    for package in ("cdmisfa", "recorder", "replay"):
-        for path in sorted((root / package).rglob("*.py")):
-            source = path.read_bytes()
-            if any(word in source for word in MARKS):
-                digest.update(source)
-    return digest.hexdigest()
 
 
 class _OnFirst(event.Listener):
