@@ -60,6 +60,14 @@ class TestParquet(FormContract):
     form = FORMS["parquet"]
 
 
+class TestImages(FormContract):
+    form = FORMS["images"]
+
+
+class TestFilms(FormContract):
+    form = FORMS["mp4"]
+
+
 class TestLerobot(FormContract):
     form = FORMS["lerobot"]
     options: ClassVar = {"name": "robot"}

@@ -43,17 +43,13 @@ def _table(form: str) -> Form:
     return Form("run", partial(export_signals, form=form), "iterations")
 
 
-_RECORDINGS = {
-    "images": Form("recording", write_images, "images"),
-    "mp4": Form("recording", write_films, "frames", lossy=True),
-    "lerobot": Form("recording", write_lerobot, "frames", lossy=True),
-}
-
 FORMS: Registry[Form] = Registry(
     "form",
     {
         **{form: _table(form) for form in TABLES},
-        **_RECORDINGS,
+        "images": Form("recording", write_images, "images"),
+        "mp4": Form("recording", write_films, "frames", lossy=True),
+        "lerobot": Form("recording", write_lerobot, "frames", lossy=True),
     },
     group="cdmisfa.exports",
 )
@@ -130,11 +126,9 @@ def _export_recording(
             return source.frames
         _refuse_others(out)
         options: dict[str, Any] = {"lossless": lossless} if FORMS[form].lossy else {}
+        if form == "lerobot":
+            options["name"] = out.name
         with whole(out) as place:
-            if form in _RECORDINGS:
-                place.mkdir()
-            if form == "lerobot":
-                options["name"] = out.name
             return FORMS[form].write(source, place, **options)
 
 

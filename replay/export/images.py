@@ -59,7 +59,7 @@ def file_names(spec: SourceSpec) -> tuple[str, ...]:
 def write_images(source: Logged, folder: Path) -> int:
     """Write every frame of every view as VIEW/FRAME.png, and return how many there are."""
     for stream, name in enumerate(file_names(source.spec)):
-        (folder / name).mkdir()
+        (folder / name).mkdir(parents=True)
         for block in pieces(source, stream):
             for i, frame in enumerate(block.frames):
                 Image.fromarray(frame).save(folder / name / f"{block.t + i:08d}.png")

@@ -36,6 +36,7 @@ FULL_RANGE = 2
 
 def write_films(source: Logged, folder: Path, *, lossless: bool) -> int:
     """Write each view as VIEW.mp4, see `write_film`, and return how many frames they have."""
+    folder.mkdir()
     for stream, name in enumerate(file_names(source.spec)):
         write_film(source, stream, folder / f"{name}.mp4", lossless=lossless)
     return count(source)
