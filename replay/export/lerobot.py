@@ -8,7 +8,7 @@ installed beside it. `LeRobotDataset("name", root=FOLDER)` and Rerun open the fo
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from replay.export.episodes import Stitched, shared_spans
 from replay.export.images import file_names, pieces
 from replay.export.videos import pixel_format, write_film
 from replay.inputs.opening import Logged
-from replay.stored import Span, StoredSource
+from replay.stored import StoredSource
 
 VERSION = "v3.0"
 FILE = "chunk-000/file-000"
@@ -76,6 +76,7 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
     lengths = [high - low for low, high in spans]
     columns, features = _columns(whole, lengths, fps)
     stats = {key: _number_stats(column) for key, column in columns.items()}
+    own = _stats_of_episodes(columns, lengths)
     videos = []
     if source.spec.images:
         for stream, view in enumerate(file_names(source.spec)):
@@ -83,12 +84,12 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
             file = _place(folder / "videos" / key, "mp4")
             write_film(whole, stream, file, lossless=lossless, key_every=KEY_EVERY)
             features[key] = _video_feature(source.spec.frame_shape, fps)
-            stats[key] = _image_stats(whole, stream)
+            values = [_values_shown(Stitched(source, [span]), stream) for span in spans]
+            stats[key] = _image_stats(np.sum(values, axis=0), whole.frames)
+            for episode, counts, length in zip(own, values, lengths, strict=True):
+                episode[key] = _image_stats(counts, length)
     task = f"what {source.scene().get('scene', 'a recording')} shows"
     pq.write_table(_table(columns, features), _place(folder / "data", "parquet"))
-    own = [stats]
-    if len(spans) > 1:
-        own = [_stats_of(source, span, rows, videos) for span, rows in _cut(spans, columns)]
     episodes = _episodes(lengths, fps, task, videos, own)
     pq.write_table(episodes, _place(folder / "meta" / "episodes", "parquet"))
     pq.write_table(_tasks(task), folder / "meta" / "tasks.parquet")
@@ -165,11 +166,26 @@ def _number_stats(values: NDArray[Any]) -> Stats:
     return {key: value.tolist() for key, value in stats.items()}
 
 
-def _image_stats(source: StoredSource, stream: int) -> Stats:
-    """Statistics of a view's pixels from 0 to 1, (3, 1, 1) each, from how often each value is."""
+def _stats_of_episodes(
+    columns: Mapping[str, NDArray[Any]], lengths: Sequence[int]
+) -> list[dict[str, Stats]]:
+    """The statistics of the numbers of each episode."""
+    ends = np.cumsum(lengths)[:-1]
+    parts = {key: np.split(column, ends) for key, column in columns.items()}
+    each = range(len(lengths))
+    return [{key: _number_stats(part[i]) for key, part in parts.items()} for i in each]
+
+
+def _values_shown(source: StoredSource, stream: int) -> NDArray[np.int64]:
+    """How often each value is a pixel of a view, (256,)."""
     counts = np.zeros(256, dtype=np.int64)
     for block in pieces(source, stream):
         counts += np.bincount(block.frames.reshape(-1), minlength=256)
+    return counts
+
+
+def _image_stats(counts: NDArray[np.int64], frames: int) -> Stats:
+    """Statistics of pixels from 0 to 1, (3, 1, 1) each, from how often each value is."""
     levels, total = np.arange(256) / 255, counts.sum()
     seen, below = levels[counts > 0], np.cumsum(counts)
     mean = (levels * counts).sum() / total
@@ -181,7 +197,7 @@ def _image_stats(source: StoredSource, stream: int) -> Stats:
         **{key: levels[np.searchsorted(below, q * total)] for key, q in QUANTILES.items()},
     }
     stats = {key: np.full((3, 1, 1), value).tolist() for key, value in found.items()}
-    return {**stats, "count": [source.frames]}
+    return {**stats, "count": [frames]}
 
 
 def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature]) -> pa.Table:
@@ -191,26 +207,6 @@ def _table(columns: Mapping[str, NDArray[Any]], features: Mapping[str, Feature])
         width = features[key]["shape"][0]
         arrays[key] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
     return pa.table(arrays)
-
-
-def _cut(
-    spans: Sequence[Span], columns: Mapping[str, NDArray[Any]]
-) -> Iterator[tuple[Span, dict[str, NDArray[Any]]]]:
-    """Each episode's stretch of the source, and its rows of the columns."""
-    start = 0
-    for low, high in spans:
-        stop = start + high - low
-        yield (low, high), {key: column[start:stop] for key, column in columns.items()}
-        start = stop
-
-
-def _stats_of(
-    source: Logged, span: Span, rows: Mapping[str, NDArray[Any]], videos: Sequence[str]
-) -> dict[str, Stats]:
-    """The statistics of one episode."""
-    episode = Stitched(source, [span])
-    stats = {key: _number_stats(column) for key, column in rows.items()}
-    return stats | {key: _image_stats(episode, stream) for stream, key in enumerate(videos)}
 
 
 def _episodes(
