@@ -35,6 +35,9 @@ COMMAND = "command"
 FORK = "fork"
 """Key of a manifest: from which run and iteration a fork went on, and what it was told before."""
 
+CAMERAS = tuple(field.name for field in dataclasses.fields(CameraOptions))
+"""Options of a command that say how images of others become frames."""
+
 OPTIONS = (
     "seed",
     "preset",
@@ -44,7 +47,7 @@ OPTIONS = (
     "loop",
     "salvage",
     "follow",
-    *(field.name for field in dataclasses.fields(CameraOptions)),
+    *CAMERAS,
     "max_iterations",
     "max_modules",
     "keyframes",
@@ -195,7 +198,7 @@ def take_over(
     log.sync()
 
 
-def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> None:
+def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> Keyframe | None:
     """Bring learner and source to where the newest keyframe of a log stands; writes nothing.
 
     Args:
@@ -203,6 +206,9 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> None:
         learner: of its configuration.
         source: what it learns from.
         forked_at: the iteration from which on a fork is itself; 0 where it is none.
+
+    Returns:
+        The keyframe; None where the log has none, and all begins anew.
     """
     from replay.runs.log import read_keyframe
     from replay.runs.stretches import read_columns
@@ -211,7 +217,7 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> None:
     if forked_at and (keyframe is None or keyframe.iteration < forked_at):
         raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
     if keyframe is None:
-        return
+        return None
     restore(learner, keyframe)
     if keyframe.taken is not None:
         records = (signals for columns in read_columns(log) for signals in columns.records())
@@ -223,22 +229,23 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> None:
                 "--force, or choose another folder"
             )
     source.seek(keyframe.t)
+    return keyframe
 
 
-def bring_back(log: RunWriter, digest: SignalsHash, versions: Mapping[str, str]) -> None:
-    """Write what a run that is resumed keeps: all until its newest keyframe.
+def bring_back(
+    log: RunWriter, keyframe: Keyframe | None, digest: SignalsHash, versions: Mapping[str, str]
+) -> None:
+    """Write what a run that is resumed keeps: all until the keyframe that it went back to.
 
     Args:
         log: of the run.
+        keyframe: see `go_back`.
         digest: of its signals, at their beginning.
         versions: of the packages that go on computing it.
     """
-    from replay.runs.log import read_keyframe
-
     before = log.path.parent / SET_ASIDE
     if not before.exists():
         return
-    keyframe = read_keyframe(before)
     if keyframe is not None:
         for signals in log.take_over(before, keyframe.iteration):
             digest.add(signals)

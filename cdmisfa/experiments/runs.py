@@ -16,7 +16,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.core.learning import ARITHMETIC, Learner, Sink, arithmetic_of
+from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import machine, write_json
@@ -172,8 +172,11 @@ def run(
             "stopped: resume from its recording, or begin another run"
         )
 
+    stood: Keyframe | None = None
+
     def going_back(found: Path) -> None:
-        go_back(found, learner, source, 0 if ancestry is None else ancestry["at"])
+        nonlocal stood
+        stood = go_back(found, learner, source, 0 if ancestry is None else ancestry["at"])
 
     with contextlib.ExitStack() as opened:
         log = shown = None
@@ -204,7 +207,7 @@ def run(
             if announce is not None:
                 announce(shown.address)
         if log is not None and resume:
-            bring_back(log, digest, versions)
+            bring_back(log, stood, digest, versions)
         elif log is not None and fork is not None:
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,17 +13,13 @@ from cdmisfa.core.config import build
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, LearnerState
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.resume import FORK, read_command, restore
+from cdmisfa.experiments.resume import CAMERAS, FORK, read_command, restore
 from cdmisfa.experiments.sources import open_logs, open_source
 from recorder.cameras.words import is_live
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
 from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_keyframe
-
-CAMERAS = tuple(field.name for field in fields(CameraOptions))
-"""Options of a command that say how images of others become frames."""
-
 
 LEARNERS_OWN = ("algorithm", "portable")
 """Options of a command that are short for a key of the learner."""
