@@ -19,7 +19,7 @@ from cdmisfa.core.errors import CdmisfaError
 from replay.storage.location import Url
 from replay.storage.tries import UnreachableError
 from replay.uploads import objects
-from replay.uploads.results import fetch, objects_of, upload
+from replay.uploads.results import fetch, upload
 
 LEARN = ("learn", "oscillatory", "--no-rerun", "--json")
 
@@ -202,7 +202,7 @@ def test_large_files_go_in_parts_and_come_back(
     assert s3.cat("lab/big/logs/big.mcap") == data
     assert upload(tmp_path / "run", url)[0] == 2
     assert len(sent) == 4
-    fetch(url, tmp_path / "back", objects_of(url), lambda done, total: None)
+    fetch(url, tmp_path / "back", objects.objects_below(url), lambda done, total: None)
     assert contents(tmp_path / "back") == contents(tmp_path / "run")
 
 

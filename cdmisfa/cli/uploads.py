@@ -94,12 +94,13 @@ def uploaded(address: str, local: Path | None, *, force: bool, resume: bool) -> 
         CdmisfaError: it cannot be uploaded.
     """
     from replay.storage.location import Url, location
-    from replay.uploads.results import fetch, objects_of
+    from replay.uploads.objects import objects_below
+    from replay.uploads.results import fetch
 
     url = location(address)
     assert isinstance(url, Url)
     place = local or Path(url.name)
-    there = objects_of(url)
+    there = objects_below(url)
     if there and not (force or resume):
         go_on = "go on with --resume or " if "resume" in click.get_current_context().params else ""
         raise UsageError(f"{url} exists: choose another name, {go_on}overwrite with --force")

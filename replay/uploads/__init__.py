@@ -3,5 +3,6 @@
 from cdmisfa.core.faces import face
 
 __getattr__, __dir__, __all__ = face(
-    __name__, {"replay.uploads.results": "fetch objects_of upload"}
+    __name__,
+    {"replay.uploads.objects": "objects_below", "replay.uploads.results": "fetch upload"},
 )

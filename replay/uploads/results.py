@@ -15,11 +15,6 @@ Progress = Callable[[float, float | None], None]
 """Told how many bytes are done, and how many there are."""
 
 
-def objects_of(url: Url) -> dict[str, Stored]:
-    """What of a result is there already; see `objects_below`."""
-    return objects_below(url)
-
-
 def upload(
     local: Path, url: Url, progress: Progress = lambda done, total: None
 ) -> tuple[int, int, list[str]]:
