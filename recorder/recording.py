@@ -158,10 +158,12 @@ def record(
         stale = other_recordings(folder, identity) if force else []
         open_logs.enter_context(prepared_folder(folder, chosen if force else (), stale))
         earlier: Earlier = {view: {} for view in chosen}
+        wanted: Mapping[str, int] = {}
         if resume:
-            earlier, split, frames = _as_begun(folder, identity, chosen, split, frames)
+            begun = read_recording(folder)
+            wanted = begun.options["frames"]
+            earlier, split, frames = _as_begun(folder, begun, identity, chosen, split, frames)
         frames = frames or length or DEFAULT_FRAMES
-        begun = read_recording(folder).options["frames"] if resume else {}
         places = {
             view: resume_view(
                 folder,
@@ -170,7 +172,7 @@ def record(
                 split,
                 there,
                 frames,
-                ended=identity.gaps and view not in begun,
+                ended=identity.gaps and view not in wanted,
             )
             for view, there in earlier.items()
         }
@@ -321,14 +323,18 @@ def identity_of(
 
 
 def _as_begun(
-    folder: Path, identity: Identity, views: Sequence[str], split: Split | None, frames: int | None
+    folder: Path,
+    begun: Begun,
+    identity: Identity,
+    views: Sequence[str],
+    split: Split | None,
+    frames: int | None,
 ) -> tuple[Earlier, Split | None, int]:
     """What there is of a recording that is resumed, where its parts end, and its frames.
 
     Raises:
         UsageError: it was begun with another scene, seed or split, or has more frames.
     """
-    begun = read_recording(folder)
     limits, lengths = (
         [begun.options[name][view] for view in views if view in begun.options[name]]
         for name in ("split", "frames")
