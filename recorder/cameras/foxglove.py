@@ -100,6 +100,7 @@ class FoxgloveCamera:
     def _find(self, connection: Any) -> tuple[int, Taken]:
         """The channel of the topic, waited for, and how its messages are decoded."""
         channels: dict[str, Mapping[str, Any]] = {}
+        images: dict[str, Taken] = {}
         end = time.monotonic() + self._timeout
         while (left := end - time.monotonic()) > 0:
             try:
@@ -108,7 +109,7 @@ class FoxgloveCamera:
                 break
             if told.get("op") == "advertise":
                 channels |= {str(c.get("topic")): c for c in told.get("channels", ())}
-            images = {t: d for t, c in channels.items() if (d := self._decoder(c)) is not None}
+                images = {t: d for t, c in channels.items() if (d := self._decoder(c)) is not None}
             found = self._topic or (next(iter(images)) if len(images) == 1 else "")
             if found in images:
                 return int(channels[found]["id"]), images[found]
@@ -117,9 +118,9 @@ class FoxgloveCamera:
                 lacks = "has no fields" if self._reading.fields else "is no image"
                 raise CdmisfaError(f"{self._where}{found} holds {kind}, which {lacks}")
         wanted = "messages with fields" if self._reading.fields else "images"
-        known = ", ".join(sorted(t for t, c in channels.items() if self._decoder(c))) or "nothing"
+        known = ", ".join(sorted(images)) or "nothing"
         what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
-        remedy = f"; name one as {self._where}/TOPIC" if known != "nothing" else ""
+        remedy = f"; name one as {self._where}/TOPIC" if images else ""
         raise CdmisfaError(f"{self._where} {what}: it has {wanted} on {known}{remedy}")
 
     def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
