@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import rerun as rr
 
+from cdmisfa.core.clock import NANOSECONDS
 from replay.playing.feed import frames_of, opened_source
 from replay.playing.pace import Played, paced, rounds
 from replay.view.columns import frames_column, line_column
@@ -66,10 +67,11 @@ def play_in_rerun(
         recording.send_blueprint(recording_layout(spec, first + count))
         columns = [frames_column(recording, spec, entity) for entity in view_entities(spec)]
         truth = line_column(recording, spec, "world/truth", spec.truth) if spec.truth else None
+        every = [*columns, *([truth] if truth is not None else [])]
         broadcast.hand_over()
         announce(broadcast.address)
         start, last = spec.time_ns(first), spec.time_ns(first + count - 1)
-        total = None if loop else (last - start) / 1e9
+        total = None if loop else (last - start) / NANOSECONDS
         next_time = 0.0
         items = rounds(lambda: frames_of(source, first), start, last, loop=loop)
         for number, (_, frame) in enumerate(paced(items, rate, played, stop=stop)):
@@ -81,10 +83,10 @@ def play_in_rerun(
                 truth.add(t, None, frame.truth[None])
             if (now := time.monotonic()) >= next_time:
                 next_time = now + 1 / PER_SECOND
-                for column in (*columns, *(() if truth is None else (truth,))):
+                for column in every:
                     column.flush()
                 broadcast.hand_over()
                 progress(played.seconds, total)
-        for column in (*columns, *(() if truth is None else (truth,))):
+        for column in every:
             column.flush()
     return played

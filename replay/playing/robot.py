@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from replay.playing.feed import Feed, opened_feed
 from replay.playing.pace import SLICE, Played, paced, rounds
@@ -61,7 +62,7 @@ def play_as_robot(
         say(f"playing at ws://{HOST}:{robot.port}{', once watched' if wait else ''}")
         while robot.watched < wait and not stop():
             time.sleep(SLICE / 10)
-        total = None if loop else (feed.stop - feed.start) / 1e9
+        total = None if loop else (feed.stop - feed.start) / NANOSECONDS
         items = rounds(feed.messages, feed.start, feed.stop, loop=loop)
         for since, message in paced(items, rate, played, stop=stop):
             robot.publish(message.topic, message.data, feed.start + round(since / rate))
