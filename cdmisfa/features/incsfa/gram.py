@@ -225,6 +225,8 @@ def update(state: State, params: Params, frames: NDArray[Any], gap: bool, xi: Fl
         scatter(columns.v, columns.cells, state.v)
         settle_still(still, state.mean, state.v)
         if shown:
+            # Nothing but phi: no frame is applied, none follows, none is settled. Written as 0 and
+            # False the arguments would have all that is called compiled for them alone.
             whole, none = all_columns(state), following
             run_pass(
                 state,
