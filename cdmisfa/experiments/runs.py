@@ -208,6 +208,7 @@ def run(
                 announce(shown.address)
         if log is not None and resume:
             bring_back(log, stood, digest, versions)
+            stood = None  # it is as large as what the learner holds
         elif log is not None and fork is not None:
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):
