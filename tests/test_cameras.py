@@ -133,3 +133,4 @@ def test_topics_become_names_of_files() -> None:
     topics = ("/a/image", "/a,image", "../../etc", "/")
     assert view_names(topics) == ("a_image", "a_image-2", "etc", "stream")
     assert view_names(("é", "ü", "l/cam", "左")) == ("e", "u", "l_cam", "左")
+    assert view_names(("/cam-2", "/cam", "/cam")) == ("cam-2", "cam-3", "cam-4")

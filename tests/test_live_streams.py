@@ -70,6 +70,8 @@ def test_streams_are_named_after_what_they_are() -> None:
         "foxglove://robot:8765/cam/left": "cam_left",
         "camera:/dev/video1": "video1",
         "av:/data/video0": "video0-2",
+        "foxglove://robot:8765/front-2": "front-2",
+        "foxglove://robot:8765/front": "front-3",
     }
     assert stream_names(list(words)) == tuple(words.values())
 

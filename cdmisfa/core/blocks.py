@@ -6,7 +6,8 @@ whichever is watched, as the channels of a television do.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -233,6 +234,19 @@ def description(source: FrameSource) -> dict[str, Any]:
             f"{type(source).__name__} does not state what it is: give its describe() a kind, a text"
         )
     return described
+
+
+def told_apart(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of streams, those like an earlier one with a number behind: cam, cam-2.
+
+    One with which an earlier one begins, as cam after cam-left, counts as like it.
+    """
+    found: list[str] = []
+    for name in names:
+        like = sum(other == name or other.startswith(f"{name}-") for other in found)
+        numbered = (f"{name}-{number}" for number in itertools.count(like + 1))
+        found.append(next(n for n in numbered if n not in found) if like else name)
+    return tuple(found)
 
 
 def check_request(spec: SourceSpec, stream: int, n: int) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.blocks import FrameSource, told_apart
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.cameras.camera import Camera
@@ -190,7 +190,5 @@ def stream_names(words: Sequence[str]) -> tuple[str, ...]:
             last = last.strip("/") or place.netloc.rpartition("@")[2]
         else:
             last = re.sub(r"\.\w{2,4}$", "", re.split(r"[=,]", rest)[0].rpartition("/")[2])
-        plain = re.sub(r"[^A-Za-z0-9_-]+", "_", last).strip("_-") or "stream"
-        taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
-        names.append(f"{plain}-{taken + 1}" if taken else plain)
-    return tuple(names)
+        names.append(re.sub(r"[^A-Za-z0-9_-]+", "_", last).strip("_-") or "stream")
+    return told_apart(names)

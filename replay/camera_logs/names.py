@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
+from cdmisfa.core.blocks import told_apart
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.stream import ImageStream
 from replay.storage.location import Url
@@ -39,10 +40,8 @@ def view_names(topics: Sequence[str]) -> tuple[str, ...]:
     for topic in topics:
         letters = unicodedata.normalize("NFKD", topic)
         bare = "".join(c for c in letters if not unicodedata.combining(c))
-        plain = re.sub(r"[^\w.-]+", "_", bare).strip("._") or "stream"
-        taken = sum(name == plain or name.startswith(f"{plain}-") for name in names)
-        names.append(f"{plain}-{taken + 1}" if taken else plain)
-    return tuple(names)
+        names.append(re.sub(r"[^\w.-]+", "_", bare).strip("._") or "stream")
+    return told_apart(names)
 
 
 def _in_folders(stream: ImageStream, folders: int) -> str:
