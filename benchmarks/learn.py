@@ -110,8 +110,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "with opening and finishing the files, as the preset icub learns and with "
         "K = 32, J = 5. The view is built after the run, in one pass over its log. From runs of "
         f"{short} iterations in the same round: what a further iteration takes, and what a run "
-        "takes however short it is. Importing Rerun (about 0.6 s of CPU, once a process) is not "
-        "in it.",
+        "takes however short it is. Importing Rerun, once a process, is not in it.",
         tables,
         contradictions=wrong,
     )
