@@ -63,7 +63,7 @@ def test_export_writes_no_file_named_dash(
     ids=lambda words: f"{words[0]} {words[-1]}",
 )
 @pytest.mark.parametrize("url", ["gs://bucket/there", "https://there.org/x"])
-def test_what_is_written_goes_nowhere_but_to_this_machine(
+def test_what_is_written_goes_to_no_url_but_those_of_s3(
     cdmisfa: Cdmisfa,
     oscillatory_run: Path,
     tmp_path: Path,

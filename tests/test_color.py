@@ -11,8 +11,8 @@ import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from message_files import STEP, every, write_mcap
 from PIL import Image
-from test_numbers import STEP, write_mcap
 
 from cdmisfa import GymSource
 from cdmisfa.core.errors import UsageError
@@ -111,7 +111,7 @@ def test_colours_are_learned_from_recorded_and_replayed_alike(
 
     kind = MessageKind("foxglove.CompressedImage", "protobuf")
     messages = (packed(image) for image in colors())
-    log = write_mcap(tmp_path / "a.mcap", kind, {"/cam": (STEP, messages)})
+    log = write_mcap(tmp_path / "a.mcap", kind, {"/cam": every(STEP, messages)})
     options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
     out = tmp_path / "run"
     run = cdmisfa("learn", log, "--color", *options, "-o", out, "--no-rerun").json

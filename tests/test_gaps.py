@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,14 @@ from folders import contents, coverage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer
+from message_files import write_mcap
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.experiments.convert import convert
 from cdmisfa.testing.sources import SourceContract
 from recorder.images.framing import FRAME_PIXELS, Fit, default_size, fitted
+from recorder.images.reading import MessageKind
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError, recorded
 from replay.camera_logs.options import Align
@@ -41,18 +42,15 @@ def write_log(
     path: Path, times_ms: Sequence[int], shapes: Sequence[tuple[int, int]] = ((12, 16),)
 ) -> Path:
     """A log whose i-th image has the value i % 256 and the i-th shape, the last for the rest."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=4096)
-        writer.start()
-        schema = writer.register_schema("foxglove.RawImage", "protobuf", b"")
-        channel = writer.register_channel("/cam", "protobuf", schema)
+
+    def images() -> Iterator[tuple[int, bytes]]:
         for i, ms in enumerate(times_ms):
             height, width = shapes[min(i, len(shapes) - 1)]
             data = bytes([i % 256]) * (height * width)
             image = RawImage(height=height, width=width, step=width, encoding="mono8", data=data)
-            writer.add_message(channel, ms * 10**6, image.SerializeToString(), ms * 10**6)
-        writer.finish()
-    return path
+            yield ms * 10**6, image.SerializeToString()
+
+    return write_mcap(path, MessageKind("foxglove.RawImage", "protobuf"), {"/cam": images()})
 
 
 class TestWithoutGaps(SourceContract):

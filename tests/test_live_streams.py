@@ -23,7 +23,7 @@ from conftest import Cdmisfa
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
 from PIL import Image
-from waiting import wait_for
+from waiting import Clock, wait_for
 
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
@@ -154,19 +154,6 @@ def test_pictures_of_ffmpeg_are_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_
     assert gone.code == 2
     assert f"{TEST} was live: name what learn --record wrote of it" in gone.err
     assert cdmisfa("check", str(tmp_path / "run"), "--source", rec).code == 0
-
-
-class Clock:
-    """A clock that only sleeping moves."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
 
 
 def write_clip(clip: Path) -> Path:

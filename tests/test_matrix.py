@@ -10,14 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, START_MS, WIDTH, pictures, write_cameras, write_pictures
+from camera_files import HEIGHT, WIDTH, pictures, write_cameras, write_pictures
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from mcap.writer import Writer
+from message_files import STEP, every, write_mcap
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
 from test_foreign import raw_json, ros1
 from web_server import serving
+
+from recorder.images.reading import MessageKind
 
 COUNT = 60
 STEP_MS = 20
@@ -54,17 +56,8 @@ REFUSED = {
 """Cells that make no sense, and words of the line that says so."""
 
 
-def write_mcap(path: Path, schema: str, encoding: str, messages: Iterator[bytes]) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        kind = writer.register_schema(schema, "", b"")
-        channel = writer.register_channel("/cam", encoding, kind)
-        for i, message in enumerate(messages):
-            time = (START_MS + i * STEP_MS) * 1_000_000
-            writer.add_message(channel, time, message, time)
-        writer.finish()
-    return path
+def write_images(path: Path, schema: str, encoding: str, messages: Iterator[bytes]) -> Path:
+    return write_mcap(path, MessageKind(schema, encoding), {"/cam": every(STEP, messages)})
 
 
 def png(image: np.ndarray) -> bytes:
@@ -123,10 +116,10 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
             "run": [base / "run"],
             "foxglove mcap": [base / "a.mcap"],
             "compressed mcap": [
-                write_mcap(base / "c.mcap", "foxglove.CompressedImage", "protobuf", packed)
+                write_images(base / "c.mcap", "foxglove.CompressedImage", "protobuf", packed)
             ],
             "json mcap": [
-                write_mcap(
+                write_images(
                     base / "j.mcap",
                     "foxglove.RawImage",
                     "json",
@@ -134,7 +127,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
                 )
             ],
             "ros1 mcap": [
-                write_mcap(
+                write_images(
                     base / "r.mcap", "sensor_msgs/Image", "ros1", (ros1(**raw(i)) for i in images)
                 )
             ],
@@ -158,15 +151,8 @@ def write_numbers(table: Path, log: Path) -> None:
     rows = (f"{i / 50},{np.sin(i / 9)},{i % 7}" for i in range(200))
     table.write_text("\n".join(["stamp,a,b", *rows]))
     joints = ({"position": [i, i % 5, 1], "velocity": [0.5, i % 3]} for i in range(200))
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        kind = writer.register_schema("joints", "jsonschema", b"{}")
-        channel = writer.register_channel("/joint_states", "json", kind)
-        for i, joint in enumerate(joints):
-            time = (START_MS + i * STEP_MS) * 1_000_000
-            writer.add_message(channel, time, json.dumps(joint).encode(), time)
-        writer.finish()
+    kind = MessageKind("joints", "json", b"{}", "jsonschema")
+    write_mcap(log, kind, {"/joint_states": every(STEP, (json.dumps(j).encode() for j in joints))})
 
 
 def command_line(command: str, kind: str, words: list[object], out: Path) -> list[object]:

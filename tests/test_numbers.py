@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from mcap.writer import Writer
+from message_files import START, STEP, every, write_mcap
 
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
@@ -28,8 +28,6 @@ from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 
 COUNT = 90
-STEP = 20_000_000
-START = 10**18
 JOINTS = 3
 
 NESTED = {
@@ -108,22 +106,6 @@ def joint_state(store: Any, row: np.ndarray, *, ros1: bool) -> Any:
     return kind(header=header, name=names, position=row.copy(), velocity=-row, effort=none)
 
 
-def write_mcap(
-    path: Path, kind: MessageKind, topics: dict[str, tuple[int, Iterator[bytes]]]
-) -> Path:
-    """A log of messages of a kind: topic to nanoseconds between two, and they."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema(kind.schema, kind.language, kind.definition)
-        for topic, (step, messages) in topics.items():
-            channel = writer.register_channel(topic, kind.encoding, schema)
-            for i, message in enumerate(messages):
-                writer.add_message(channel, START + i * step, message, START + i * step)
-        writer.finish()
-    return path
-
-
 def ros_mcap(folder: Path, *, ros1: bool) -> Path:
     from rosbags.typesys import Stores, get_typestore
 
@@ -137,13 +119,13 @@ def ros_mcap(folder: Path, *, ros1: bool) -> Path:
         if ros1
         else MessageKind(name, "cdr", text.encode(), "ros2msg")
     )
-    return write_mcap(folder / "joints.mcap", kind, {"/joint_states": (STEP, rows)})
+    return write_mcap(folder / "joints.mcap", kind, {"/joint_states": every(STEP, rows)})
 
 
 def json_mcap(folder: Path) -> Path:
     rows = (json.dumps({"position": row.tolist()}).encode() for row in angles())
     kind = MessageKind("joints", "json", b"{}", "jsonschema")
-    return write_mcap(folder / "joints.mcap", kind, {"/joint_states": (STEP, rows)})
+    return write_mcap(folder / "joints.mcap", kind, {"/joint_states": every(STEP, rows)})
 
 
 def bag(folder: Path, *, ros1: bool) -> Path:
@@ -194,7 +176,7 @@ def test_fields_of_protobuf_are_found_by_their_definition(tmp_path: Path) -> Non
 
     definition = descriptor_set(PoseInFrame.DESCRIPTOR)
     kind = MessageKind("foxglove.PoseInFrame", "protobuf", definition, "protobuf")
-    path = write_mcap(tmp_path / "p.mcap", kind, {"/pose": (STEP, poses())})
+    path = write_mcap(tmp_path / "p.mcap", kind, {"/pose": every(STEP, poses())})
     fields = ["pose.position.x", "pose.orientation.w"]
     with contextlib.closing(ForeignSource(path, fields=fields)) as source:
         assert source.take(0, 5).frames.tolist() == [[i, -i] for i in range(5)]
@@ -229,7 +211,7 @@ def test_topics_of_other_rates_are_put_on_one_clock_and_pauses_are_gaps(tmp_path
     path = write_mcap(
         tmp_path / "a.mcap",
         kind,
-        {"/fast": (STEP, counted(0, 90)), "/slow": (2 * STEP, counted(1000, 45))},
+        {"/fast": every(STEP, counted(0, 90)), "/slow": every(2 * STEP, counted(1000, 45))},
     )
     with contextlib.closing(ForeignSource(path, ["/*"], fields=["k"], align="time")) as source:
         fast, slow = source.take_all(5)
@@ -330,7 +312,7 @@ def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> No
     with pytest.raises(UsageError, match="these show 2 numbers and a number: take as many"):
         ForeignSource([one, two], rate=5)
     ragged = (json.dumps({"p": [0] * (3 - i % 2)}).encode() for i in range(9))
-    path = write_mcap(tmp_path / "r.mcap", MessageKind("p", "json"), {"/p": (STEP, ragged)})
+    path = write_mcap(tmp_path / "r.mcap", MessageKind("p", "json"), {"/p": every(STEP, ragged)})
     with (
         contextlib.closing(ForeignSource(path, fields=["p"])) as source,
         pytest.raises(UsageError, match=r"holds 2 numbers, and the first 3.*position\[0:2\]"),

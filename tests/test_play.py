@@ -22,6 +22,7 @@ import pytest
 from camera_files import pictures, write_cameras
 from conftest import Cdmisfa
 from test_view import rows_of
+from waiting import Clock
 
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.foxglove import FoxgloveCamera
@@ -36,19 +37,6 @@ FRAMES, FPS = 50, 25.0
 TOPIC = Topic("/x", "json", "", "", b"")
 
 
-class Clock:
-    """Time that passes while it is slept, a little longer than was asked for."""
-
-    def __init__(self, over: float = 0.0) -> None:
-        self.time, self.over = 100.0, over
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.time += seconds + self.over
-
-
 def told(*seconds: float) -> list[Told]:
     return [Told(10**18 + round(s * 1e9), TOPIC, str(s).encode()) for s in seconds]
 
@@ -58,7 +46,8 @@ def played_at(
 ) -> tuple[list[float], Played]:
     clock, played = Clock(over), Played()
     since = [(item.time_ns - items[0].time_ns, item) for item in items]
-    times = [clock.time - 100 for _ in paced(since, rate, played, now=clock.now, sleep=clock.sleep)]
+    pace = paced(since, rate, played, now=clock.monotonic, sleep=clock.sleep)
+    times = [clock.now - 100 for _ in pace]
     return times, played
 
 

@@ -12,8 +12,9 @@ import pytest
 from camera_files import HEIGHT, WIDTH, pictures, write_cameras
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from message_files import START, STEP, every, write_mcap
 from test_foreign import raw_json
-from test_numbers import START, STEP, bag, joint_state, write_mcap
+from test_numbers import bag, joint_state
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -56,7 +57,7 @@ LOGS = {
 @pytest.mark.parametrize("kind", LOGS)
 def test_images_are_shown_at_the_times_of_their_headers(kind: str, tmp_path: Path) -> None:
     what, messages = LOGS[kind]
-    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": (STEP, messages())})
+    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
     images = list(pictures(COUNT))
     with contextlib.closing(ForeignSource(path)) as logged:
         assert (logged.spec.fps, logged.spec.start_ns) == (50, START)
@@ -100,7 +101,7 @@ def test_what_says_no_time_is_refused(tmp_path: Path) -> None:
         with pytest.raises(UsageError, match=why):
             ForeignSource(path, topics, stamp="header", **options)
     plain = write_mcap(
-        tmp_path / "j.mcap", MessageKind("k", "json"), {"/k": (STEP, iter([b'{"k": 1}'] * 2))}
+        tmp_path / "j.mcap", MessageKind("k", "json"), {"/k": every(STEP, [b'{"k": 1}'] * 2)}
     )
     with pytest.raises(LogDamagedError, match=r"no time of its own, as header.stamp or timestamp"):
         ForeignSource(plain, fields=["k"], stamp="header")
@@ -110,7 +111,7 @@ def test_learning_by_headers_is_the_same_from_the_conversion(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
     what, messages = LOGS["protobuf"]
-    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": (STEP, messages())})
+    path = write_mcap(tmp_path / "a.mcap", what, {"/cam": every(STEP, messages())})
     options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
     run = cdmisfa("learn", path, "--stamp", "header", *options, "-o", tmp_path / "run").json
     assert cdmisfa("convert", path, "--stamp", "header", "-o", tmp_path / "rec").code == 0

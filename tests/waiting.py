@@ -8,6 +8,21 @@ from collections.abc import Callable
 from typing import Any
 
 
+class Clock:
+    """A clock that only sleeping moves, by a little more than was asked for, where that is said."""
+
+    def __init__(self, over: float = 0.0) -> None:
+        self.now, self.over = 100.0, over
+
+    def monotonic(self) -> float:
+        """Its seconds."""
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let seconds pass."""
+        self.now += seconds + self.over
+
+
 def wait_for(
     ready: Callable[[], object], seconds: float, process: subprocess.Popen[Any] | None = None
 ) -> None:

@@ -1,0 +1,37 @@
+"""MCAP logs as others would write them, of messages of any kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from mcap.writer import Writer
+
+from recorder.images.reading import MessageKind
+
+START = 10**18
+"""The log time of what comes first, in nanoseconds."""
+
+STEP = 20_000_000
+"""Nanoseconds between two messages of 50 a second."""
+
+
+def every(step: int, messages: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
+    """Messages with their log times, so many nanoseconds apart."""
+    return ((START + i * step, message) for i, message in enumerate(messages))
+
+
+def write_mcap(
+    path: Path, kind: MessageKind, topics: Mapping[str, Iterable[tuple[int, bytes]]]
+) -> Path:
+    """A log of messages of a kind: each topic with log times and messages, one behind the other."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4096)
+        writer.start()
+        schema = writer.register_schema(kind.schema, kind.language, kind.definition)
+        for topic, messages in topics.items():
+            channel = writer.register_channel(topic, kind.encoding, schema)
+            for time, message in messages:
+                writer.add_message(channel, time, message, time)
+        writer.finish()
+    return path
