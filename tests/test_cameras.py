@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from camera_files import write_cameras, write_pictures
 from conftest import Cdmisfa
+from PIL import Image
+
+from recorder.config import view_names
 
 SMALL = ("--size", "16x12")
 QUICK = ("--max-iterations", "4", "--no-rerun", "--set", "learner.tau=10")
@@ -128,9 +131,104 @@ def test_a_converted_log_is_a_recording_with_the_same_signals(cdmisfa: Cdmisfa, 
 
 
 def test_topics_become_names_of_files() -> None:
-    from replay.camera_logs.names import view_names
-
     topics = ("/a/image", "/a,image", "../../etc", "/")
     assert view_names(topics) == ("a_image", "a_image-2", "etc", "stream")
     assert view_names(("é", "ü", "l/cam", "左")) == ("e", "u", "l_cam", "左")
     assert view_names(("/cam-2", "/cam", "/cam")) == ("cam-2", "cam-3", "cam-4")
+
+
+def test_a_run_on_cameras_says_of_what_its_streams_are(cdmisfa: Cdmisfa, logs: Path) -> None:
+    words = (logs / "a.mcap", *BOTH, "--seed", "3")
+    assert cdmisfa("learn", *words, *QUICK, "-o", logs / "run").code == 0
+    assert cdmisfa("convert", logs / "a.mcap", *BOTH, "-o", logs / "rec").code == 0
+    assert cdmisfa("learn", logs / "rec", *QUICK, "-o", logs / "again").code == 0
+    for run in ("run", "again"):
+        config = json.loads((logs / run / "run.json").read_text())["config"]
+        assert config["scene"] == {"kind": "foreign"}
+    sweep = ("--seeds", "0:1", "--set", "learner.algorithm=progress", "--keep-logs")
+    quick = (*QUICK[:2], "--set", "learner.tau=10")
+    done = cdmisfa("sweep", logs / "rec", *sweep, *quick, "-o", logs / "sweep")
+    assert done.code == 0, done.err
+    found = next((logs / "sweep").rglob("run.json")).read_text()
+    assert json.loads(found)["config"]["scene"] == {"kind": "foreign"}
+
+
+def test_a_run_that_called_its_cameras_a_scene_is_resumed(
+    cdmisfa: Cdmisfa, logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("learn", logs / "a.mcap", *BOTH, "--no-rerun", "--set", "learner.tau=10", "-o")
+    with monkeypatch.context() as before:
+        before.setattr("cdmisfa.experiments.sources.streams_of", lambda described: "icub")
+        assert cdmisfa(*words, logs / "run", "--max-iterations", "2").code == 0
+    found = json.loads((logs / "run" / "run.json").read_text())["config"]
+    assert found["scene"] == {"kind": "icub"}
+    assert cdmisfa(*words, logs / "run", "--max-iterations", "4", "--resume").code == 0
+
+
+def test_recordings_named_together_are_refused_with_what_would_work(
+    cdmisfa: Cdmisfa, logs: Path
+) -> None:
+    for name in ("one", "two"):
+        write_cameras(logs / f"{name}.mcap", {"/image": (60 if name == "one" else 50, 20)})
+        assert cdmisfa("convert", logs / f"{name}.mcap", "-o", logs / name).code == 0
+    both = (logs / "one", logs / "two")
+    refused = cdmisfa("learn", *both)
+    assert (refused.code, refused.err.count("\n")) == (2, 1)
+    assert f"{both[0]} and {both[1]} are recordings of their own" in refused.err
+    assert "--align index" in refused.err
+    done = cdmisfa("learn", *both, "--align", "index", *QUICK)
+    assert "two/image/view/image: 50 images" in done.err
+    assert done.code == 0, done.err
+    twice = cdmisfa("learn", both[0], both[0])
+    assert (twice.code, "is named twice" in twice.err) == (2, True)
+    assert cdmisfa("view", *both, "--save", logs / "both.rrd").code == 0
+    info = cdmisfa("info", *both, "--json").json
+    assert len(info["metadata"]) == 2
+
+
+def test_what_lies_in_no_part_of_a_log_is_refused(cdmisfa: Cdmisfa, logs: Path) -> None:
+    turned = cdmisfa("learn", logs / "a.mcap", *BOTH, "--from", "12", "--to", "5", "--dry-run")
+    assert turned.code == 2
+    assert "--from 12 is no earlier than --to 5" in turned.err
+
+
+def test_a_range_is_for_distances(cdmisfa: Cdmisfa, logs: Path) -> None:
+    refused = cdmisfa("learn", logs / "a.mcap", *BOTH, "--range", "0.3:5", "--dry-run")
+    assert refused.code == 2
+    assert "a.mcap: it holds no distances (16UC1, 32FC1): --range is for these" in refused.err
+
+
+def test_what_is_suggested_keeps_what_was_chosen(cdmisfa: Cdmisfa, logs: Path) -> None:
+    words = ("learn", logs / "uneven.mcap", *BOTH, "--gaps", "hold", "--from", "0.2", "--to", "1")
+    suggested = cdmisfa(*words).err.split("as with: ")[1]
+    assert "--from 0.2 --to 1 --gaps hold --align time --rate 50" in suggested
+
+
+def test_streams_with_gaps_are_not_put_together_by_number(cdmisfa: Cdmisfa, logs: Path) -> None:
+    """By number, images on both sides of a gap would be neighbours."""
+    for name, late in (("one", 0), ("two", 60)):
+        times = [late + i / 50 + (2 if i > 30 else 0) for i in range(60)]
+        rows = "\n".join(f"{time},{i}" for i, time in enumerate(times))
+        (logs / f"{name}.csv").write_text(f"stamp,{name}\n{rows}\n")
+    files = (logs / "one.csv", logs / "two.csv")
+    refused = cdmisfa("learn", *files, "--time", "stamp")
+    assert refused.code == 2
+    assert "no time in common, and gaps" in refused.err
+    assert "take each by itself" in refused.err
+    part = cdmisfa("learn", *files, "--time", "stamp", "--align", "index", "--dry-run")
+    assert part.code == 0
+
+
+def test_a_plan_says_whether_images_change_their_size(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    write_pictures(tmp_path / "pictures", 20)
+    words = ("learn", tmp_path / "pictures", "--rate", "50", "--dry-run")
+    assert cdmisfa(*words, "--json").json["streams"][0]["size_changes"] is False
+    Image.new("L", (32, 24)).save(tmp_path / "pictures" / "12.png")
+    plan = cdmisfa(*words, "--json").json
+    assert plan["streams"][0]["size_changes"] is True
+    assert "12.png: images change from 16x12 to 32x24" in plan["warnings"][0]
+    assert "12.png: images change" in cdmisfa(*words).err
+    write_cameras(tmp_path / "a.mcap", {"/cam": (20, 20)})
+    words = ("learn", tmp_path / "a.mcap", "--dry-run")
+    assert cdmisfa(*words, "--json").json["streams"][0]["size_changes"] is None
+    assert "shows when they are read: /cam" in cdmisfa(*words).out

@@ -176,3 +176,10 @@ def test_doctor_names_the_folders_of_the_compiled_kernels(tmp_path: Path) -> Non
     folders = [Path(folder) for folder in details["kernel cache"].split(", ")]
     assert {folder.parent for folder in folders} == {tmp_path}
     assert all(folder.is_dir() for folder in folders)
+
+
+@pytest.mark.parametrize("form", ["images", "mp4", "csv"])
+def test_what_is_missing_is_said_alike(cdmisfa: Cdmisfa, tmp_path: Path, form: str) -> None:
+    missing = tmp_path / "missing"
+    refused = cdmisfa("export", missing, "--to", form, "-o", tmp_path / "out")
+    assert (refused.code, refused.err) == (2, f"cdmisfa: {missing}: no such file or folder\n")

@@ -68,6 +68,9 @@ def test_streams_are_named_after_what_they_are() -> None:
         "av:lavfi:testsrc=size=160x120:rate=30": "lavfi_testsrc",
         "gym:Pendulum-v1": "Pendulum-v1",
         "foxglove://robot:8765/cam/left": "cam_left",
+        "rtsp://robot/Küche_vorne": "Kuche_vorne",
+        "rtsp://robot/K%C3%BCche": "Kuche",
+        "foxglove://robot:8765/küche/left": "kuche_left",
         "camera:/dev/video1": "video1",
         "av:/data/video0": "video0-2",
         "foxglove://robot:8765/front-2": "front-2",
@@ -213,6 +216,9 @@ class Motion(http.server.BaseHTTPRequestHandler):
     """
 
     def do_GET(self) -> None:
+        if self.path == "/gone.mjpg":
+            self.send_error(404)
+            return
         self.send_response(200)
         self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
         self.end_headers()
@@ -246,6 +252,13 @@ def test_a_web_camera_that_breaks_is_connected_to_anew(web_camera: str) -> None:
     assert said[0] == "stream is gone: Input/output error: connecting to it anew"
     assert len(blocks) >= 2
     assert source.alignment["stream"]["missing"] > 0  # type: ignore[attr-defined]
+
+
+def test_a_web_camera_that_is_not_there_is_one_line(web_camera: str) -> None:
+    word = web_camera.replace("stream", "gone")
+    with pytest.raises(UsageError) as refused:
+        open_live([word], LiveOptions())
+    assert str(refused.value) == f"{word} cannot be opened: Server returned 404 Not Found"
 
 
 def test_pictures_of_a_web_camera_were_taken_when_they_come(web_camera: str) -> None:
@@ -283,7 +296,7 @@ def test_a_stream_over_tcp_ends_where_that_is_asked_for(tmp_path: Path) -> None:
         options = LiveOptions(size=(48, 64), on_loss="end")
         with contextlib.closing(open_live([f"tcp://127.0.0.1:{port}"], options)) as source:
             assert source.take(0, 10).frames.shape == (10, 48, 64)
-            with pytest.raises(LogExhaustedError, match=f"127_0_0_1_{port}"):
+            with pytest.raises(LogExhaustedError, match=rf"127\.0\.0\.1_{port}"):
                 source.take(0, 10**4)
         thread.join()
 

@@ -89,6 +89,18 @@ def test_a_plugins_scene_is_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_path
     assert '"cdmisfa-toy": "1.2"' in (tmp_path / "live" / "run.json").read_text()
 
 
+def test_a_run_whose_plugin_is_gone_names_it(
+    cdmisfa: Cdmisfa, tmp_path: Path, environment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    assert cdmisfa("learn", "swings", "-o", run, "--max-iterations", 2, "--no-rerun").code == 0
+    SCENES.remove("swings")
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(environment)])
+    refused = cdmisfa("learn", "--resume", "-o", run, "--max-iterations", 4)
+    assert refused.code == 2
+    assert "learns from swings, which the plugin cdmisfa-toy 1.2 brought: install" in refused.err
+
+
 @pytest.mark.usefixtures("environment")
 def test_a_plugins_camera_is_recorded(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     done = cdmisfa("record", "bars:20", "bars:20", "-o", tmp_path / "rec", "--json")

@@ -262,10 +262,11 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     if not isinstance(source, ForeignSource):
         raise UsageError("--dry-run is for camera logs: cdmisfa info says what is in a recording")
     rows = source.plan()
+    warnings = [*source.warnings, *source.changes.values()]
     if as_json:
         size = list(source.spec.frame_shape)
         plan = {"frames": source.frames, "rate": source.spec.fps, "size": size, "streams": rows}
-        options.print_json({"schema": options.SCHEMA, **plan, "warnings": source.warnings})
+        options.print_json({"schema": options.SCHEMA, **plan, "warnings": warnings})
         return
     what = "images" if source.spec.images else "messages"
     head = ("stream", what, "rate", "size", "missing", "gaps", "repeated", "dropped")
@@ -277,7 +278,11 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
     options.print_table(head, cells)
     seconds = source.frames / source.spec.fps
     click.echo(f"{source.frames} frames at {source.spec.fps:g} a second, {seconds:.6g} s")
-    for warning in source.warnings:
+    unknown = [row["stream"] for row in rows if row["size_changes"] is None]
+    if unknown:
+        said = "whether images change their size shows when they are read"
+        click.echo(f"{said}: {' '.join(unknown)}")
+    for warning in warnings:
         click.echo(f"warning: {warning}", err=True)
 
 

@@ -61,7 +61,7 @@ settings = click.option(
 preset = click.option(
     "--preset",
     metavar="NAME",
-    help="Preset (icub, oscillatory) or a .toml file; by default the one of the source.",
+    help="Preset (icub, oscillatory, cameras) or a .toml file; by default the one of the source.",
 )
 
 keyframes = click.option(

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import UsageError
+from recorder.config import view_names
 from recorder.recording import ViewRecording, record
-from replay.camera_logs.names import view_names
 from replay.camera_logs.source import ForeignSource
 
 

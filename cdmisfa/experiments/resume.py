@@ -21,7 +21,7 @@ from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
 from recorder.cameras.words import is_live
-from recorder.log.begun import Begun, found_path, relative_path
+from recorder.log.begun import Begun, found_path, is_path, relative_path
 from recorder.log.whole import partial_path
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
@@ -81,14 +81,21 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """The command that began a run: its source and its options.
 
     Raises:
-        UsageError: there is no run, or it does not say.
+        UsageError: there is no run, it does not say, or its source is of a plugin that is gone.
         LogDamagedError: its log cannot be read.
     """
     from replay.runs.log import read_header
 
-    begun = Begun.from_json(read_header(log_to_resume(run)).manifest.get(COMMAND), run)
+    log = log_to_resume(run)
+    kept = read_header(log).manifest.get(COMMAND)
+    begun = Begun.from_json(kept, run)
     if begun is None:
         raise UsageError(f"{run} does not say what it learns from: name its source")
+    for word in map(str, dict(kept or {})["source"]):
+        if not (is_path(word) or word in SCENES or is_live(word)):
+            raise UsageError(
+                f"{run} learns from {word}, which {_packages_gone(log)} brought: install it again"
+            )
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in begun.options.items()
@@ -98,6 +105,16 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     if preset is not None and str(preset).endswith(".toml"):
         options["preset"] = found_path(str(preset), run)
     return begun.source, options
+
+
+def _packages_gone(log: Path) -> str:
+    """The packages of plugins that a run used and that are not installed any more."""
+    from replay.runs.log import read_keyframe
+
+    keyframe = read_keyframe(log)
+    used = {} if keyframe is None else keyframe.versions
+    gone = [f"{name} {used[name]}" for name in sorted(used.keys() - versions().keys())]
+    return f"the plugin {' or '.join(gone)}" if gone else "a plugin"
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,9 +353,12 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
         COMMAND: None,
     }
     now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec), COMMAND: None}
+    streams = manifest["config"].get("scene", {}).get("kind")
     for key, old, new in differences(_json(before), _json(now)):
         if (key, old, new) == ("config.learner.portable", None, False):
             continue  # begun when there was no choice
+        if key.startswith("config.scene.") and streams is not None and streams not in SCENES:
+            continue  # begun when every source was called a scene
         raise UsageError(
             f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: resume with "
             "what it was made with, or choose another folder"

@@ -36,11 +36,14 @@ class Configuration:
         learner: keys `learner.*`, of the class that the learner's entry in `LEARNERS` names.
         scene: keys `scene.*`; its seed is never None.
         record: keys `record.*`.
+        streams: of what kind the streams are where they are no scene's: "cameras", "gym",
+            "foreign"; "" of a scene.
     """
 
     learner: Any
     scene: SceneConfig
     record: RecordConfig
+    streams: str = ""
 
     def open_scene(self) -> SeekableSource:
         """The live scene; what it computes in the arithmetic that the learner is told to use."""
@@ -51,7 +54,8 @@ class Configuration:
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
-        return {"scene": as_table(self.scene), "record": as_table(self.record)}
+        scene = {"kind": self.streams} if self.streams else as_table(self.scene)
+        return {"scene": scene, "record": as_table(self.record)}
 
 
 def configure(
@@ -164,6 +168,12 @@ def scene_kind_for(
     return "icub" if len(spec.frame_shape) == 2 else "oscillatory"
 
 
+def streams_of(described: Mapping[str, Any]) -> str:
+    """Of what kind a source's streams are where they are no scene's; "" of a scene."""
+    scene = str(described.get("scene", ""))
+    return "" if scene in SCENES else scene or str(described["kind"])
+
+
 def open_source(
     words: Sequence[str | Path],
     *,
@@ -204,8 +214,10 @@ def open_source(
     try:
         described = source.describe()
         kind = scene_kind_for(source.spec, described, preset)
-        learner = None if described.get("scene") in SCENES else OF_CAMERAS
-        return source, configure(kind, preset, settings, seed, learner=learner)
+        streams = streams_of(described)
+        learner = OF_CAMERAS if streams else None
+        configuration = configure(kind, preset, settings, seed, learner=learner)
+        return source, replace(configuration, streams=streams)
     except BaseException:
         source.close()
         raise
@@ -297,8 +309,10 @@ def open_cameras_now(
     live = replace(live, **framing)
     source = open_live([str(word) for word in words], live, say=say, stop=stop)
     try:
-        kind = scene_kind_for(source.spec, source.describe(), preset)
-        return source, configure(kind, preset, settings, live.seed, learner=OF_CAMERAS)
+        described = source.describe()
+        kind = scene_kind_for(source.spec, described, preset)
+        configuration = configure(kind, preset, settings, live.seed, learner=OF_CAMERAS)
+        return source, replace(configuration, streams=streams_of(described))
     except BaseException:
         source.close()
         raise

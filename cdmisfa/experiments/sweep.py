@@ -20,7 +20,13 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.memory import MAX_LIST
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.runs import module_table, run
-from cdmisfa.experiments.sources import Configuration, configure, open_logs, scene_kind_for
+from cdmisfa.experiments.sources import (
+    Configuration,
+    configure,
+    open_logs,
+    scene_kind_for,
+    streams_of,
+)
 from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
 from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
@@ -156,6 +162,7 @@ def plan(
     """
     words = (source,) if isinstance(source, str | Path) else tuple(source)
     kind, recorded = _identify(words, preset, loop)
+    streams = "" if recorded is None else streams_of(recorded)
     points = [
         dict(zip(grid, map(str, values), strict=True))
         for values in itertools.product(*grid.values())
@@ -169,7 +176,7 @@ def plan(
         chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
         seeded = _seeded(kind, preset, chosen)
         for seed in each:
-            configuration = seeded(seed)
+            configuration = replace(seeded(seed), streams=streams)
             depends: list[Any] = [as_table(configuration.learner)]
             used = LEARNERS.versions(configuration.learner.algorithm)
             if recorded is None:  # the world's part counts only where it is live

@@ -75,7 +75,7 @@ class FramedCamera:
             framing = self._framing = self._framing or self._begun(image)
             if framing is None:
                 continue
-            if not self._changed and (change := framing.change(image)):
+            if not self._changed and (change := framing.change(image.shape)):
                 self._changed = True
                 self._say(f"{self.name}: {change}")
             try:

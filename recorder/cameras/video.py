@@ -78,7 +78,7 @@ class VideoCamera:
                 options=options,
                 timeout=self._timeout if self._remote else None,
             )
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, self._av.FFmpegError) as error:
             shown = _SECRET.sub("", self._word)
             raise CdmisfaError(f"{shown} cannot be opened: {_reason(error)}") from None
         with container:
@@ -94,7 +94,7 @@ class VideoCamera:
             self.rate = float(stated) if stated else None
             try:
                 yield from self._paced(container.decode(video), timed=timed)
-            except (OSError, ValueError) as error:
+            except (OSError, ValueError, self._av.FFmpegError) as error:
                 raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
 
     def _paced(self, frames: Iterator[Any], *, timed: bool) -> Iterator[tuple[int, Bytes]]:

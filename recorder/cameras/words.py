@@ -6,15 +6,16 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
-from cdmisfa.core.blocks import FrameSource, told_apart
+from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.cameras.camera import Camera
 from recorder.cameras.framed import framed
 from recorder.cameras.live import HOLD, LiveSource
 from recorder.cameras.readers import STALL, OnLoss, Readers
+from recorder.config import view_names
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
 from recorder.images.framing import Fit, Size
@@ -179,16 +180,16 @@ def open_live(
 
 def stream_names(words: Sequence[str]) -> tuple[str, ...]:
     """A name for each stream, that can be one of a file: rtsp://host/left is left."""
-    names: list[str] = []
-    for word in words:
-        scheme, _, rest = word.partition(":")
-        place = urlsplit(word)
-        if scheme == "foxglove":
-            last = place.path.strip("/")
-        elif place.netloc:
-            last = place.path.rstrip("/").rpartition("/")[2].rpartition(".")[0] or place.path
-            last = last.strip("/") or place.netloc.rpartition("@")[2]
-        else:
-            last = re.sub(r"\.\w{2,4}$", "", re.split(r"[=,]", rest)[0].rpartition("/")[2])
-        names.append(re.sub(r"[^A-Za-z0-9_-]+", "_", last).strip("_-") or "stream")
-    return told_apart(names)
+    return view_names([_stream_of(word) for word in words])
+
+
+def _stream_of(word: str) -> str:
+    """What of a word tells its stream from others."""
+    scheme, _, rest = word.partition(":")
+    place = urlsplit(word)
+    if scheme == "foxglove":
+        return unquote(place.path)
+    if place.netloc:
+        last = place.path.rstrip("/").rpartition("/")[2].rpartition(".")[0] or place.path
+        return unquote(last.strip("/")) or place.netloc.rpartition("@")[2]
+    return re.sub(r"\.\w{2,4}$", "", re.split(r"[=,]", rest)[0].rpartition("/")[2])

@@ -53,9 +53,9 @@ class Framing:
         shown = [fitted(plane, self.size, self.fit, enlarge=enlarge) for plane in planes]
         return np.hstack(shown if len(shown) == 3 else shown * 3)
 
-    def change(self, image: Bytes) -> str:
-        """What the user should know of an image of another size; "" of one like the first."""
-        size = size_of(image)
+    def change(self, image: tuple[int, ...]) -> str:
+        """What the user should know of an image of another shape; "" of one like the first."""
+        size = image[0], image[1]
         if size == self.first:
             return ""
         before, now, frame = map(_in_words, (self.first, size, self.size))
@@ -102,7 +102,7 @@ class Vector:
             )
         return numbers
 
-    def change(self, numbers: Shown) -> str:
+    def change(self, numbers: tuple[int, ...]) -> str:
         """Nothing: see `frame`."""
         return ""
 

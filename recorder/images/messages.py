@@ -8,17 +8,35 @@ import json
 import struct
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from cdmisfa.core.clock import NANOSECONDS
-from recorder.images.pixels import Bytes, Depth, MalformedImage, compressed_gray, gray
+from recorder.images.pixels import (
+    DISTANCES,
+    Bytes,
+    Depth,
+    MalformedImage,
+    compressed_gray,
+    gray,
+)
 
 Decoder = Callable[[bytes | memoryview], Bytes]
 """Turns a message into a gray image, (height, width) uint8; raises MalformedImage."""
+
+
+class Pixels(NamedTuple):
+    """What a message with pixels says; see `gray`."""
+
+    data: bytes | memoryview
+    height: int
+    width: int
+    encoding: str
+    step: int
+    big_endian: bool = False
 
 
 def image_decoder(
@@ -32,15 +50,21 @@ def image_decoder(
         depth: how distances are shown; see `gray`.
         color: give what has colours as they are; see `gray`.
     """
-    if (raw := _RAW.get((schema, encoding))) is not None:
-        return partial(raw, depth=depth, color=color)
+    if (pixels := _RAW.get((schema, encoding))) is not None:
+        return lambda data: gray(**pixels(data)._asdict(), depth=depth, color=color)
     packed = _COMPRESSED.get((schema, encoding))
     return None if packed is None else partial(packed, color=color)
 
 
-def _foxglove_raw(data: bytes | memoryview, **shown: Any) -> Bytes:
+def holds_distances(schema: str, encoding: str, data: bytes | memoryview) -> bool:
+    """Whether a message of such a kind holds distances; raises MalformedImage."""
+    pixels = _RAW.get((schema, encoding))
+    return pixels is not None and pixels(data).encoding in DISTANCES
+
+
+def _foxglove_raw(data: bytes | memoryview) -> Pixels:
     m = _parse(RawImage, data)
-    return gray(m.data, m.height, m.width, m.encoding, m.step, **shown)
+    return Pixels(m.data, m.height, m.width, m.encoding, m.step)
 
 
 def _foxglove_compressed(data: bytes | memoryview, *, color: bool) -> Bytes:
@@ -54,13 +78,13 @@ def _parse(kind: Any, data: bytes | memoryview) -> Any:
         raise MalformedImage(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
 
 
-def _json_raw(data: bytes | memoryview, **shown: Any) -> Bytes:
+def _json_raw(data: bytes | memoryview) -> Pixels:
     fields = _json(data)
     numbers = [fields.get(k) for k in ("height", "width", "step")]
     if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
         raise MalformedImage("a JSON image needs whole height, width and step")
     height, width, step = (int(n) for n in numbers if n is not None)
-    return gray(_base64(fields), height, width, str(fields.get("encoding")), step, **shown)
+    return Pixels(_base64(fields), height, width, str(fields.get("encoding")), step)
 
 
 def _json_compressed(data: bytes | memoryview, *, color: bool) -> Bytes:
@@ -132,11 +156,11 @@ def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
     return None if kind is None or encoding != "protobuf" else partial(_parse, kind)
 
 
-def _ros_raw(data: bytes | memoryview, *, ros1: bool, **shown: Any) -> Bytes:
+def _ros_raw(data: bytes | memoryview, *, ros1: bool) -> Pixels:
     fields = _RosFields(data, ros1=ros1)
     height, width, encoding = fields.u32(), fields.u32(), fields.text()
     big_endian, step = bool(fields.take(1)[0]), fields.u32()
-    return gray(fields.data(), height, width, encoding, step, big_endian=big_endian, **shown)
+    return Pixels(fields.data(), height, width, encoding, step, big_endian)
 
 
 def _ros_compressed(data: bytes | memoryview, *, ros1: bool, color: bool) -> Bytes:
@@ -145,13 +169,13 @@ def _ros_compressed(data: bytes | memoryview, *, ros1: bool, color: bool) -> Byt
     return compressed_gray(bytes(fields.data()), color=color)
 
 
-_RAW: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
+_RAW: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Pixels]]] = {
     ("foxglove.RawImage", "protobuf"): _foxglove_raw,
     ("foxglove.RawImage", "json"): _json_raw,
     ("sensor_msgs/msg/Image", "cdr"): partial(_ros_raw, ros1=False),
     ("sensor_msgs/Image", "ros1"): partial(_ros_raw, ros1=True),
 }
-"""Decoders of messages that hold pixels, which may be distances."""
+"""What messages say that hold pixels, which may be distances."""
 
 _COMPRESSED: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
     ("foxglove.CompressedImage", "protobuf"): _foxglove_compressed,

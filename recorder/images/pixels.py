@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,9 @@ _BAYER: Final[Mapping[str, str]] = {
 
 _DEPTHS: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 """Formats of distances: their numbers, and how many metres one is (REP 118)."""
+
+DISTANCES: Final = frozenset(_DEPTHS)
+"""Formats that hold distances."""
 
 ENCODINGS: Final = tuple(_LAYOUTS)
 """Pixel formats that are read as they are."""
@@ -242,6 +245,15 @@ def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
         ) from None
     except Exception as error:  # Pillow raises whatever its codecs raise
         raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
+
+
+def picture_size(file: BinaryIO) -> tuple[int, int] | None:
+    """The (height, width) that the head of a JPEG or PNG states; None where it is broken."""
+    try:
+        with budget(), Image.open(file, formats=["JPEG", "PNG"]) as image:
+            return image.height, image.width
+    except Exception:  # Pillow raises whatever its codecs raise
+        return None
 
 
 def _progressive_bytes(image: Image.Image) -> int:

@@ -73,6 +73,11 @@ def found_path(word: str, folder: Path) -> str:
     return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
 
 
+def is_path(word: str) -> bool:
+    """Whether a word of `relative_path` is a path or a URL, and no name."""
+    return word.startswith(os.curdir) or "://" in word
+
+
 def read_recording(folder: Path) -> Begun:
     """How an unfinished recording was begun, as far as its folder readably says so.
 

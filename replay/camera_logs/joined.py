@@ -9,6 +9,7 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.framing import Size
 from recorder.images.pixels import MalformedImage, Shown
 from replay.camera_logs.alignment import Times, even_times
 from replay.camera_logs.stream import ImageStream, sorted_times
@@ -39,6 +40,12 @@ class JoinedImages(ImageStream):
 
     def stamp(self, row: int) -> int:
         return self.parts[int(self._part_of[row])].stamp(int(self._row_in[row]))
+
+    def distances(self) -> bool:
+        return any(part.distances() for part in self.parts)
+
+    def stated_size(self, row: int) -> Size | None:
+        return self.parts[int(self._part_of[row])].stated_size(int(self._row_in[row]))
 
     def where(self, row: int) -> str:
         return self.parts[int(self._part_of[row])].where(int(self._row_in[row]))
@@ -80,6 +87,12 @@ class Stamped(ImageStream):
     def image(self, row: int) -> Shown:
         return self._images.image(int(self._order[row]))
 
+    def distances(self) -> bool:
+        return self._images.distances()
+
+    def stated_size(self, row: int) -> Size | None:
+        return self._images.stated_size(int(self._order[row]))
+
     def where(self, row: int) -> str:
         return self._images.where(int(self._order[row]))
 
@@ -103,6 +116,12 @@ class Excerpt(ImageStream):
 
     def image(self, row: int) -> Shown:
         return self._images.image(self._start + row)
+
+    def distances(self) -> bool:
+        return self._images.distances()
+
+    def stated_size(self, row: int) -> Size | None:
+        return self._images.stated_size(self._start + row)
 
     def where(self, row: int) -> str:
         return self._images.where(self._start + row)

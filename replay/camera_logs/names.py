@@ -1,14 +1,11 @@
-"""What streams are called: after their topics, as views and their files are."""
+"""What streams are called: after their topics."""
 
 from __future__ import annotations
 
 import os
-import re
-import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 
-from cdmisfa.core.blocks import told_apart
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.stream import ImageStream
 from replay.storage.location import Url
@@ -29,19 +26,6 @@ def stream_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
         if len(set(names)) == len(names):
             return tuple(names)
     return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
-
-
-def view_names(topics: Sequence[str]) -> tuple[str, ...]:
-    """Topics as names of views, which are names of files, too: "/cam/left" is cam_left.
-
-    Letters lose their accents, those of other scripts stay.
-    """
-    names: list[str] = []
-    for topic in topics:
-        letters = unicodedata.normalize("NFKD", topic)
-        bare = "".join(c for c in letters if not unicodedata.combining(c))
-        names.append(re.sub(r"[^\w.-]+", "_", bare).strip("._") or "stream")
-    return told_apart(names)
 
 
 def _in_folders(stream: ImageStream, folders: int) -> str:

@@ -26,6 +26,7 @@ from replay.camera_logs.alignment import (
     missing,
     of_other_rate,
     overlap,
+    pauses,
     step_of,
     unlike,
     with_gaps,
@@ -116,12 +117,17 @@ class ForeignSource(StoredSource):
             raise UsageError(f"--rate is {rate}: it must be in [{slowest:g}, {fastest:.0f}]")
         if size is not None and min(size) < 1:
             raise UsageError(f"--size is {size[1]}x{size[0]}: it must be above 0")
+        if stop is not None and not start < stop:
+            raise UsageError(
+                f"--from {start:g} is no earlier than --to {stop:g}, both in seconds after the "
+                "first image: no image lies between them"
+            )
         named = [paths] if isinstance(paths, str | Path | Url) else paths
         self._files = image_logs(named)
         self._loop = loop
         self._hashes: list[dict[str, Any]] | None = None
         self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp, color)
-        self._asked_size = size
+        self._asked_size, self._asked_gaps, self._part = size, gaps, (start, stop)
         self._goal = goal
         self._streams: list[ImageStream] = []
         self.changes: dict[int, str] = {}
@@ -140,6 +146,14 @@ class ForeignSource(StoredSource):
                 self._times = known_times(self._streams, self._fps)
             start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
+            if (
+                depth is not None
+                and firsts[0].ndim > 1
+                and not any(s.distances() for s in self._streams)
+            ):
+                raise UsageError(
+                    f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
+                )
             self._framings = framings(firsts, size, fit, color=color)
             shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
@@ -194,15 +208,30 @@ class ForeignSource(StoredSource):
 
     def plan(self) -> list[dict[str, Any]]:
         """What would be read of each stream, as JSON values."""
-        rows = []
+        rows: list[dict[str, Any]] = []
         for name, images, times in zip(self._spec.streams, self._streams, self._times, strict=True):
             step = step_of(times)
             row: dict[str, Any] = {"stream": name, "log": str(images.path), "topic": images.topic}
             row |= {"images": images.count, "rate": 1 / step if step > 0 else None}
             row |= {"shape": self.shapes[name], "missing": missing(times)}
+            row |= {"size_changes": self._changes_size(len(rows))}
             row |= {"gaps": [list(gap) for gap in self.pauses[name]], **self.alignment[name]}
             rows.append(row)
         return rows
+
+    def _changes_size(self, stream: int) -> bool | None:
+        """Whether a stream's images change their size, as far as that is known unread."""
+        if not self._spec.images:
+            return False
+        images, framing = self._streams[stream], self._framings[stream]
+        for row in np.unique(self._rows[stream]).tolist():
+            size = images.stated_size(row)
+            if size is None:
+                return None
+            if change := framing.change(size):
+                self.changes.setdefault(stream, f"{images.where(row)}: {change}")
+                return True
+        return False
 
     def _chosen(self) -> dict[str, Any]:
         """What of the options changed the frames, as JSON values."""
@@ -247,7 +276,7 @@ class ForeignSource(StoredSource):
             return shown[1]
         image = self._image(stream, row)
         framing = self._framings[stream]
-        if stream not in self.changes and (change := framing.change(image)):
+        if stream not in self.changes and (change := framing.change(image.shape)):
             self.changes[stream] = f"{self._streams[stream].where(row)}: {change}"
         try:
             frame = framing.frame(image)
@@ -294,13 +323,25 @@ class ForeignSource(StoredSource):
     def _refuse_unequal(self) -> None:
         """Refuse streams that are not on one clock, or not of the rate asked for."""
         first = self._times[0]
+        begins, ends = overlap(self._times)
         for stream, times in zip(self._streams[1:], self._times[1:], strict=True):
-            reason = unlike(first, times)
-            if reason:
+            if not (reason := unlike(first, times)):
+                continue
+            two = f"{self._streams[0].topic} and {stream.topic}"
+            if begins < ends:
                 raise UnequalError(
-                    f"{self._streams[0].topic} and {stream.topic} have {reason}: put them on one "
-                    f"clock, as with: {self._command()}"
+                    f"{two} have {reason}: put them on one clock, as with: {self._command()}"
                 )
+            if any(len(pauses(own)) for own in self._times):
+                raise UnequalError(
+                    f"{two} have no time in common, and gaps, across which --align index takes "
+                    "images for neighbours: take each by itself, or a part without with --from "
+                    "and --to"
+                )
+            raise UnequalError(
+                f"{two} have no time in common: take the i-th image of each together, as with: "
+                f"{self._command('index')}"
+            )
         for stream, times in zip(self._streams, self._times, strict=True):
             if of_other_rate(times, self._fps):
                 raise UnequalError(
@@ -308,12 +349,11 @@ class ForeignSource(StoredSource):
                     f"{self._fps:g}: choose images by their times, as with: {self._command()}"
                 )
 
-    def _command(self) -> str:
+    def _command(self, align: Align = "time") -> str:
         """A command that takes these streams."""
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        start, stop = overlap(self._times)
         if self._asked_size is not None:
             words += ["--size", f"{self._asked_size[1]}x{self._asked_size[0]}"]
         if self._fit != "crop":
@@ -326,18 +366,23 @@ class ForeignSource(StoredSource):
             words += ["--stamp", self._reading.stamp]
         if self._reading.color:
             words += ["--color"]
-        words += ["--align", "time" if start < stop else "index", "--rate", f"{self._fps:g}"]
+        if self._reading.depth is not None:
+            words += ["--range", "{:g}:{:g}".format(*self._reading.depth)]
+        start, stop = self._part
+        words += ["--from", f"{start:g}"] if start else []
+        words += ["--to", f"{stop:g}"] if stop is not None else []
+        words += ["--gaps", "hold"] if self._asked_gaps == "hold" else []
+        words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
 
 
 def _rate(streams: Sequence[ImageStream]) -> float:
     """Images a second of the first stream that has times."""
-    timed = next((s for s in streams if len(s.times)), None)
-    if timed is None:
-        named = ", or name the column of its times with --time"
-        remedy = named if isinstance(streams[0], TableNumbers) else ""
-        raise UsageError(f"{streams[0].path} tells no rate: set one with --rate{remedy}")
+    timed = next((s for s in streams if len(s.times)), streams[0])
     step = step_of(timed.times)
     if not step > 0:
-        raise UsageError(f"{timed.path}: {timed.topic} tells no rate; set one with --rate")
+        what = f"{timed.path}: {timed.topic}" if len(timed.times) else timed.path
+        named = ", or name the column of its times with --time"
+        remedy = named if isinstance(timed, TableNumbers) and not len(timed.times) else ""
+        raise UsageError(f"{what} tells no rate: set one with --rate{remedy}")
     return float(f"{1 / step:.6g}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.decoding import Taken, decoder_of
+from recorder.images.framing import Size
 from recorder.images.messages import SCHEMAS
 from recorder.images.pixels import RECIPE, Shown
 from recorder.images.reading import MessageKind, Reading
@@ -92,6 +93,18 @@ class ImageStream(ABC):
             MalformedRecord, LogDamagedError: as for `image`.
         """
         raise UsageError(f"{self.path}: {self.topic} is no topic of messages: leave out --stamp")
+
+    def distances(self) -> bool:
+        """Whether its first image holds distances.
+
+        Raises:
+            MalformedRecord, LogDamagedError: as for `image`.
+        """
+        return False
+
+    def stated_size(self, row: int) -> Size | None:
+        """The size of an image where that is known without decoding it; of numbers, None."""
+        return None
 
     def where(self, row: int) -> str:
         """How an error names an image."""
@@ -174,11 +187,17 @@ def explained(path: Location, program: str, *, held: int = 0) -> Iterator[None]:
         yield
 
 
-def limit_arrow() -> None:
-    """Let PyArrow take memory of the system: what its own pool has in reserve has no budget."""
+@contextmanager
+def arrow_explained(path: Location, *, held: int = 0) -> Iterator[None]:
+    """Do as `explained` where PyArrow reads, which takes its memory of the system meanwhile.
+
+    What its own pool has in reserve has no budget.
+    """
     import pyarrow
 
     pyarrow.set_memory_pool(pyarrow.system_memory_pool())
+    with explained(path, "PyArrow", held=held):
+        yield
 
 
 @contextmanager

@@ -97,6 +97,9 @@ def export(
         raise UsageError(f"{out} exists: choose another name or overwrite with --force")
     refuse_special(out)
     paths = [path] if isinstance(path, Path) else list(path)
+    for named in paths:
+        if not named.exists():
+            raise UsageError(f"{named}: no such file or folder")
     if described.of == "recording":
         return _export_recording(paths, out, form, lossless, cameras)
     if out.is_dir():

@@ -15,7 +15,7 @@ from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import ForeignSource, UnequalError
 from replay.mcap.identity import starts_as_log
 from replay.mcap.reader import LogReader
-from replay.recordings.source import RecordedSource
+from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
 from replay.storage.location import Location, Url
@@ -72,7 +72,7 @@ def open_to_look(
     cameras = cameras or CameraOptions()
     chosen = bool(cameras.topics or cameras.fields)
     if not chosen and not any(map(only_foreign, paths)):
-        with contextlib.suppress(NoRecordingError):
+        with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
             return RecordedSource(paths, salvage=salvage)
     goal = ("convert", "REC")
     if not chosen:

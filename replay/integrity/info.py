@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -56,7 +57,8 @@ class LogInfo:
         chunks: how many there are.
         complete: no file is cut short.
         crc: what the checksums amount to.
-        metadata: of each file by its name, each record by its own.
+        metadata: of each file by its name, or its path where others share that, each record by
+            its own name.
         seed: the one that all files name, if they do.
         ended: why a run ended, where its folder says so.
         signals: of a run.
@@ -93,7 +95,12 @@ def describe(*words: str | Location) -> LogInfo:
     files = [found for place in named for found in _describe_place(place)]
     kinds, states = {f.kind for f in files}, {f.crc for f in files}
     worst: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
-    metadata = {name: records for f in files for name, records in f.metadata.items()}
+    named_alike = Counter(name for f in files for name in f.metadata)
+    metadata = {
+        name if named_alike[name] == 1 else f.path: records
+        for f in files
+        for name, records in f.metadata.items()
+    }
     records = [values for found in metadata.values() for values in found.values()]
     return LogInfo(
         path=" ".join(map(str, named)),

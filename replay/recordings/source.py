@@ -6,7 +6,7 @@ import bisect
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.core.blocks import Block, freeze
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.whole import PARTIAL
 from replay.mcap.identity import identity
 from replay.mcap.reader import LogReader
@@ -33,6 +33,10 @@ _SMALLEST: Final = 64
 """Bytes that no log of a recording has less of once its header is written."""
 _SCENE: Final = ("scene", "seed", "config_sha256")
 _SAME: Final = ("frame_shape", "dtype", "truth", "fps", "start_ns", "gaps", *_SCENE)
+
+
+class SeveralRecordingsError(UsageError):
+    """Recordings of images that were named together; they can be taken as camera logs are."""
 
 
 class RecordedSource(StoredSource):
@@ -63,8 +67,8 @@ class RecordedSource(StoredSource):
         """Open every view and check that they belong together.
 
         Raises:
-            UsageError: no such recording.
-            LogDamagedError: a file is damaged, or the files contradict each other.
+            UsageError: no such recording, or several.
+            LogDamagedError: a file is damaged, or the files of a folder contradict each other.
         """
         self._loop = loop
         self._paths = paths
@@ -249,7 +253,7 @@ def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
     indexes = [index for index, _ in by_view]
     names = [name for _, name in by_view]
     if len(set(indexes)) < len(indexes) or len(set(names)) < len(names):
-        raise LogDamagedError(
+        raise _of_several(opened) or LogDamagedError(
             f"{opened[0].path}: its files are not of one recording: two claim the same stream"
         )
     first = opened[0]
@@ -257,7 +261,7 @@ def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
         facts = [first.facts, view.facts]
         differ = [k for k in _SAME if getattr(facts[0], k) != getattr(facts[1], k)]
         if differ:
-            raise LogDamagedError(
+            raise _of_several(opened) or LogDamagedError(
                 f"{view.path}: not of the same recording as {first.path.name}: {differ[0]} differs"
             )
     arranged = []
@@ -266,9 +270,26 @@ def _arrange(opened: list[ViewFile], *, salvage: bool) -> list[list[ViewFile]]:
         for one, two in itertools.pairwise(parts):
             end = one.ranges[-1][1] if one.ranges else one.facts.first_frame
             if end > two.facts.first_frame or (end < two.facts.first_frame and not salvage):
-                raise LogDamagedError(
+                raise _of_several(opened) or LogDamagedError(
                     f"{two.path}: begins at frame {two.facts.first_frame}, {one.path.name} ends "
                     f"before {end}: a part is missing or doubled"
                 )
         arranged.append(parts)
     return arranged
+
+
+def _of_several(opened: Sequence[ViewFile]) -> UsageError | None:
+    """The refusal of files that do not belong together; None of different ones in one folder."""
+    paths = [str(view.path) for view in opened]
+    for number, path in enumerate(paths):
+        if path in paths[:number]:
+            return UsageError(f"{path} is named twice: leave one out")
+    folders = list(dict.fromkeys(str(view.path.parent) for view in opened))
+    if len(folders) < 2:
+        return None
+    refused = f"{folders[0]} and {folders[1]} are recordings of their own: name one of them"
+    if not opened[0].facts.spec.images:
+        return UsageError(refused)
+    return SeveralRecordingsError(
+        f"{refused}, or put their streams on one clock with --align index"
+    )

@@ -15,6 +15,7 @@ import numpy as np
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.images.decoding import Taken, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.messages import holds_distances
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
 from recorder.images.stamps import stamp_of
@@ -65,6 +66,9 @@ class BagImages(ImageStream):
     def image(self, row: int) -> Shown:
         return self._decode(self._message(row))
 
+    def distances(self) -> bool:
+        return holds_distances(self._kind.schema, self._kind.encoding, self._message(0))
+
     def stamp(self, row: int) -> int:
         if self._stamp is None:
             raise UsageError(
@@ -104,7 +108,8 @@ class BagImages(ImageStream):
         kinds = _kinds(self._reader, ros1=self._ros1)
         channels = [(name, kind, name) for name, kind in kinds.items()]
         chosen, decode = choose_images(self.path, topic, channels, reading)
-        self._stamp = stamp_of(kinds[chosen])
+        self._kind = kinds[chosen]
+        self._stamp = stamp_of(self._kind)
         return [c for c in self._reader.connections if c.topic == chosen], decode
 
 

@@ -14,9 +14,16 @@ import numpy as np
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
+from recorder.images.framing import Size
 from recorder.images.pixels import compressed_gray
 from replay.camera_logs.formats.video import VideoImages
-from replay.camera_logs.stream import ChannelFacts, ImageStream, explained, in_one_line, limit_arrow
+from replay.camera_logs.stream import (
+    ChannelFacts,
+    ImageStream,
+    arrow_explained,
+    explained,
+    in_one_line,
+)
 from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
 
 INFO: Final = "meta/info.json"
@@ -91,6 +98,12 @@ class LeRobotImages(ImageStream):
         found: Bytes = images.image(place)
         return found
 
+    def stated_size(self, row: int) -> Size | None:
+        shape = self._info["features"][self.topic].get("shape", ())
+        if len(shape) != 3 or not all(isinstance(n, int) and n > 0 for n in shape):
+            return None
+        return (shape[1], shape[2]) if shape[0] in (1, 3) else (shape[0], shape[1])
+
     def close(self) -> None:
         opened, self._open = self._open, None
         if opened is not None and self._video:
@@ -102,8 +115,7 @@ class LeRobotImages(ImageStream):
     def _table(self, file: Path) -> Any:
         import pyarrow.parquet as pq
 
-        limit_arrow()
-        with explained(file, "PyArrow", held=MAX_CHUNK):
+        with arrow_explained(file, held=MAX_CHUNK):
             return pq.read_table(file, columns=["index", self.topic], use_threads=False)
 
     def _picture(self, table: Any, index: int) -> Bytes:
@@ -172,14 +184,13 @@ def _episodes(path: Path, columns: list[str]) -> list[dict[str, Any]]:
     """The rows of the tables of episodes, in their order."""
     import pyarrow.parquet as pq
 
-    limit_arrow()
     rows: list[dict[str, Any]] = []
     files = sorted((path / "meta" / "episodes").rglob("*.parquet"))
     if not files:
         raise LogDamagedError(f"{path}: there is no table of its episodes")
     for file in files:
         check_regular(file)
-        with explained(file, "PyArrow"):
+        with arrow_explained(file):
             rows += pq.ParquetFile(file).read(columns=columns, use_threads=False).to_pylist()
     with explained(path, "LeRobot's layout"):
         return sorted(rows, key=lambda row: int(row["episode_index"]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.messages import holds_distances
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
 from recorder.images.stamps import stamp_of
@@ -60,6 +62,10 @@ class McapImages(ImageStream):
 
     def image(self, row: int) -> Shown:
         return self._taken(row, self._decode)
+
+    def distances(self) -> bool:
+        kind = _kind(self.reader, self._channel)
+        return self._taken(0, partial(holds_distances, kind.schema, kind.encoding))
 
     def stamp(self, row: int) -> int:
         if self._stamp is None:

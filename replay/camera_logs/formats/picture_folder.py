@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.untrusted.regular import check_regular, read_regular
-from recorder.images.pixels import compressed_gray
+from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
+from recorder.images.framing import Size
+from recorder.images.pixels import compressed_gray, picture_size
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 
@@ -42,6 +43,10 @@ class FolderImages(ImageStream):
 
     def image(self, row: int) -> Bytes:
         return compressed_gray(read_regular(self._files[row], MAX_BYTES), color=self._color)
+
+    def stated_size(self, row: int) -> Size | None:
+        with opened_regular(self._files[row], MAX_BYTES) as file:
+            return picture_size(file)
 
     def where(self, row: int) -> str:
         return str(self._files[row])

@@ -17,8 +17,7 @@ from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,
     ImageStream,
-    explained,
-    limit_arrow,
+    arrow_explained,
     sorted_times,
 )
 
@@ -59,7 +58,7 @@ class TableNumbers(ImageStream):
         names = reading.fields or numeric
         if not names:
             raise UsageError(f"{path}: it has no column of numbers")
-        with explained(path, "PyArrow"):
+        with arrow_explained(path):
             columns = [_column(path, table, name) for name in names]
         numbers = bounded(np.concatenate(columns, axis=1), reading.depth)
         whole = np.all(np.isfinite(numbers), axis=1)
@@ -121,8 +120,7 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 
 def _table(path: Path) -> Any:
     check_regular(path, MAX_BYTES)
-    limit_arrow()
-    with explained(path, "PyArrow"):
+    with arrow_explained(path):
         if path.suffix.lower() == ".csv":
             import pyarrow.csv
 
@@ -196,7 +194,7 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64]
 
     column = table[name]
     if kinds.is_timestamp(column.type):
-        with explained(path, "PyArrow"):
+        with arrow_explained(path):
             whole = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64())
         scale = 1
     elif _is_numeric(column):
