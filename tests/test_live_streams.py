@@ -415,9 +415,61 @@ def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
 def test_a_topic_that_is_no_image_is_refused(
     robot: Robot, topic: str, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recorder.cameras.words._TIMEOUT", 0.5)
+    monkeypatch.setattr("recorder.cameras.foxglove.TOPIC_SECONDS", 1.0)
+    monkeypatch.setattr("recorder.cameras.foxglove._QUIET", 0.2)
+    said: list[str] = []
     with pytest.raises(UsageError, match=why):
-        open_live([robot.address + topic], LiveOptions())
+        open_live([robot.address + topic], LiveOptions(), say=said.append)
+    waits = "it has images on /cam/left, /cam/right; waiting"
+    assert [waits in line for line in said] == ([True] if topic == "/cam/front" else [])
+
+
+def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
+    said: list[str] = []
+
+    def show() -> None:
+        while not said:
+            time.sleep(0.02)
+        late = RawImageChannel("/cam/late", context=robot.context)
+        image = RawImage(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
+        while not over.wait(0.02):
+            late.log(image)
+
+    over = threading.Event()
+    thread = threading.Thread(target=show)
+    thread.start()
+    try:
+        words = [f"{robot.address}/cam/late"]
+        with contextlib.closing(open_live(words, LiveOptions(), say=said.append)) as source:
+            assert source.take(0, 2).frames.shape == (2, 4, 5)
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    script = (
+        "import sys, threading\n"
+        "from pathlib import Path\n"
+        "from websockets.sync.client import connect\n"
+        "from replay.playing.robot import play_as_robot\n"
+        "left = []\n"
+        "def leave(line):\n"
+        "    client = connect(line.split()[2].strip(','), subprotocols=['foxglove.sdk.v1'])\n"
+        "    client.recv(), client.recv(), client.socket.close(), left.append(1)\n"
+        "def watch(line): threading.Thread(target=leave, args=[line]).start()\n"
+        "stop = lambda: bool(left)\n"
+        "play_as_robot([Path(sys.argv[1])], port=0, say=watch, stop=stop)\n"
+    )
+    assert cdmisfa("record", "oscillatory", "-o", tmp_path / "rec", "--frames", "20").code == 0
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script, str(tmp_path / "rec")],
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -427,6 +479,7 @@ def test_a_topic_that_is_no_image_is_refused(
         (["record", "rtsp://me:secret@127.0.0.1:9/x", "-o", "x"], "rtsp://127.0.0.1:9/x cannot"),
         (["record", "foxglove://127.0.0.1:9/x", "-o", "x"], "does not answer"),
         (["record", "camera:/dev/video99", "-o", "x"], "/dev/video99: there is no such device"),
+        (["learn", TEST, "--range", "0.3:5"], "shows no distances: --range is for those of"),
         (["learn", TEST, "icub"], "icub is no live stream, as the others are"),
         (["learn", TEST, "gym:CartPole-v1"], "record each apart"),
         (["learn", TEST, "--loop"], "live streams cannot go back"),

@@ -154,7 +154,7 @@ def test_files_may_be_named_in_any_order(vectors: Path) -> None:
 def test_what_does_not_belong_together_is_refused(vectors: Path, pictures: Path) -> None:
     with pytest.raises(UsageError, match="are recordings of their own: name one"):
         RecordedSource([vectors, pictures])
-    with pytest.raises(UsageError, match="x1.mcap is named twice"):
+    with pytest.raises(UsageError, match=r"x1\.mcap is named twice"):
         RecordedSource([vectors / "x1.mcap", vectors / "x1.mcap"])
     with pytest.raises(UsageError, match="no such"):
         RecordedSource(vectors / "nothing")

@@ -20,6 +20,7 @@ from cdmisfa.core.config import differences
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
+from cdmisfa.experiments.documents import versions
 from recorder.cameras.words import is_live
 from recorder.log.begun import Begun, found_path, is_path, relative_path
 from recorder.log.whole import partial_path

@@ -11,7 +11,7 @@ import contextlib
 import json
 import struct
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -28,6 +28,12 @@ PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 
 _SUBSCRIPTION: Final = 1
 _DATA: Final = 1
+TOPIC_SECONDS: Final = 5.0
+"""For which a topic is waited for that the server does not have yet."""
+
+_QUIET: Final = 0.5
+"""Seconds without a further topic after which the server is taken to have named those it has."""
+
 _HEADER: Final = struct.Struct("<BIQ")
 """Of a message: what it is, the subscription it is for, and its log time."""
 
@@ -38,8 +44,9 @@ class FoxgloveCamera:
     Args:
         word: foxglove://HOST:PORT/TOPIC; without a topic the only one of images.
         name: of the stream.
-        timeout: seconds in which the server must answer and name the topic.
+        timeout: seconds in which the server must answer.
         reading: what is taken of messages.
+        say: told in a line what is waited for, and what does not apply.
 
     Raises:
         UsageError: the word is no such address, or websockets is missing.
@@ -48,8 +55,16 @@ class FoxgloveCamera:
     finite = False
     rate: float | None = None
 
-    def __init__(self, word: str, name: str, *, timeout: float, reading: Reading = IMAGES) -> None:
-        self.name, self._reading = name, reading
+    def __init__(
+        self,
+        word: str,
+        name: str,
+        *,
+        timeout: float,
+        reading: Reading = IMAGES,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.name, self._reading, self._say = name, reading, say
         place = urlsplit(word)
         if not place.netloc:
             raise UsageError(f"{word} names no server: write foxglove://HOST:8765/TOPIC")
@@ -101,12 +116,18 @@ class FoxgloveCamera:
         """The channel of the topic, waited for, and how its messages are decoded."""
         channels: dict[str, Mapping[str, Any]] = {}
         images: dict[str, Taken] = {}
-        end = time.monotonic() + self._timeout
+        said = False
+        end = time.monotonic() + TOPIC_SECONDS
         while (left := end - time.monotonic()) > 0:
             try:
-                told = _told(connection.recv(timeout=left))
+                told = _told(connection.recv(timeout=left if said else min(left, _QUIET)))
             except TimeoutError:
-                break
+                if images and not self._topic:
+                    break  # several, of which a further one makes no single one
+                if not said:
+                    self._say(f"{self._lacking(images)}; waiting {left:.0f} s for it")
+                said = True
+                continue
             if told.get("op") == "advertise":
                 channels |= {str(c.get("topic")): c for c in told.get("channels", ())}
                 images = {t: d for t, c in channels.items() if (d := self._decoder(c)) is not None}
@@ -117,11 +138,15 @@ class FoxgloveCamera:
                 kind = channels[found].get("schemaName")
                 lacks = "has no fields" if self._reading.fields else "is no image"
                 raise CdmisfaError(f"{self._where}{found} holds {kind}, which {lacks}")
+        remedy = f"; name one as {self._where}/TOPIC" if images else ""
+        raise CdmisfaError(f"{self._lacking(images)}{remedy}")
+
+    def _lacking(self, images: Mapping[str, Taken]) -> str:
+        """That the topic is not there, and what is."""
         wanted = "messages with fields" if self._reading.fields else "images"
         known = ", ".join(sorted(images)) or "nothing"
         what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
-        remedy = f"; name one as {self._where}/TOPIC" if images else ""
-        raise CdmisfaError(f"{self._where} {what}: it has {wanted} on {known}{remedy}")
+        return f"{self._where} {what}: it has {wanted} on {known}"
 
     def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
         schema, language = channel.get("schema"), str(channel.get("schemaEncoding", ""))

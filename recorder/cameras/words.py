@@ -20,7 +20,7 @@ from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import RECIPE, Depth
-from recorder.images.reading import IMAGES, Reading
+from recorder.images.reading import Reading
 
 PACKAGES: Final = "packages"
 """Key of what cameras of plugins say of themselves: the versions of their packages."""
@@ -40,31 +40,32 @@ class CameraKind:
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
             cannot open is a UsageError.
-        reads: what of a `Reading` it can give; where any, `open` takes `reading`, too.
+        takes: what `open` takes besides, by name: of `LiveOptions` what it can heed ("depth",
+            "fields", "color"), and "say", to be told what the user should know, in a line.
         recipe: how what it shows becomes gray and small, for the record.
     """
 
     open: Callable[..., Camera]
-    reads: tuple[str, ...] = ()
+    takes: tuple[str, ...] = ()
     recipe: str = RECIPE
 
 
-def _foxglove(word: str, name: str, *, reading: Reading = IMAGES) -> Camera:
+def _foxglove(word: str, name: str, *, say: Callable[[str], None], **chosen: Any) -> Camera:
     from recorder.cameras.foxglove import FoxgloveCamera
 
-    return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=reading)
+    return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=Reading(**chosen), say=say)
 
 
-def _video(word: str, name: str, *, reading: Reading = IMAGES) -> Camera:
+def _video(word: str, name: str, *, color: bool) -> Camera:
     from recorder.cameras.video import video_camera
 
-    return video_camera(word, name, timeout=_TIMEOUT, color=reading.color)
+    return video_camera(word, name, timeout=_TIMEOUT, color=color)
 
 
 CAMERAS: Registry[CameraKind] = Registry(
     "kind of camera",
     {
-        "foxglove": CameraKind(_foxglove, ("depth", "fields", "color")),
+        "foxglove": CameraKind(_foxglove, ("depth", "fields", "color", "say")),
         **{kind: CameraKind(_video, ("color",), VIDEO_RECIPE) for kind in _VIDEO},
     },
     group="cdmisfa.sources",
@@ -139,6 +140,8 @@ def open_live(
             )
         if options.fields:
             raise UsageError(f"{words[0]} shows images: --field is for messages, of foxglove://")
+        if options.depth is not None:
+            raise UsageError(f"{words[0]} shows no distances: --range is for those of foxglove://")
         tasks = [word.removeprefix("gym:") for word in words]
         return GymSource(
             tasks,
@@ -150,14 +153,16 @@ def open_live(
             color=options.color,
         )
     kinds = [CAMERAS[word.partition(":")[0].lower()] for word in words]
-    reading = Reading(options.depth, options.fields, color=options.color)
     for kind, word in zip(kinds, words, strict=True):
-        if options.fields and "fields" not in kind.reads:
+        if options.fields and "fields" not in kind.takes:
             raise UsageError(f"{word} shows images: --field is for messages, of foxglove://")
-        if options.color and "color" not in kind.reads:
+        if options.color and "color" not in kind.takes:
             raise UsageError(f"{word} shows gray images: leave out --color")
+    if options.depth is not None and not any("depth" in kind.takes for kind in kinds):
+        raise UsageError(f"{words[0]} shows no distances: --range is for those of foxglove://")
+    told = {"depth": options.depth, "fields": options.fields, "color": options.color, "say": say}
     opened = [
-        kind.open(word, name, reading=reading) if kind.reads else kind.open(word, name)
+        kind.open(word, name, **{key: told[key] for key in kind.takes})
         for kind, word, name in zip(kinds, words, names, strict=True)
     ]
     cameras = framed(opened, options.size, options.fit, color=options.color, say=say)

@@ -81,6 +81,8 @@ class _Robot:
             raise UsageError(
                 "to play as a robot needs foxglove-sdk: pip install 'cdmisfa[foxglove]'"
             ) from None
+        # Else a line of its own about each client that leaves without a word.
+        foxglove.set_log_level("CRITICAL")
         subscribed: set[tuple[int, int]] = set()
 
         class Listener(ServerListener):
