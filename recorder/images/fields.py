@@ -84,7 +84,7 @@ class Field:
             if step not in names:
                 there = f"it has {', '.join(names)}" if names else "it is no message"
                 raise UsageError(f"--field {self.path}: there is no {step}, {there}")
-            return value[step] if isinstance(value, Mapping) else getattr(value, step)
+            return field_value(value, step)
         if not _is_list(value):
             raise UsageError(f"--field {self.path}: what the index is of is no list")
         if isinstance(step, int) and step >= len(value):
@@ -137,6 +137,11 @@ def members(value: Any) -> list[str]:
     if descriptor is not None:
         return [field.name for field in descriptor.fields]
     return [n for n in getattr(value, "__dataclass_fields__", ()) if not n.startswith("__")]
+
+
+def field_value(value: Any, name: str) -> Any:
+    """What a field of a message holds, one of its `members`."""
+    return value[name] if isinstance(value, Mapping) else getattr(value, name)
 
 
 def _is_list(value: Any) -> bool:

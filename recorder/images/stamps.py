@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.decoding import message_decoder
-from recorder.images.fields import members
+from recorder.images.fields import field_value, members
 from recorder.images.messages import SCHEMAS, foxglove_image, ros_stamp
 from recorder.images.pixels import MalformedImage
 from recorder.images.reading import MessageKind
@@ -54,6 +54,4 @@ def _stamp(message: Any) -> int:
 
 
 def _member(message: Any, name: str) -> Any:
-    if name not in members(message):
-        return None
-    return message[name] if isinstance(message, dict) else getattr(message, name)
+    return field_value(message, name) if name in members(message) else None
