@@ -165,10 +165,11 @@ class FullDisk:
         self.file.close()
 
 
-def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch):
+@pytest.mark.parametrize("aside", [False, True])
+def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch, aside):
     disk = FullDisk(tmp_path / "a.mcap.partial", 40_000)
     monkeypatch.setattr("recorder.log.appended.open", lambda *_: disk, raising=False)
-    log, channel = open_log(tmp_path / "a.mcap", force=True, compression="none")
+    log, channel = open_log(tmp_path / "a.mcap", force=True, compression="none", aside=aside)
 
     def fill() -> None:
         for i in range(1000):

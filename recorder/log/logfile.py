@@ -52,6 +52,7 @@ class LogFile:
         chunk_size: int = 1024 * 1024,
         flush_ns: int = FLUSH_NS,
         fsync_every: float | None = None,
+        aside: bool = False,
     ) -> None:
         """Open NAME.partial for writing.
 
@@ -65,6 +66,7 @@ class LogFile:
             flush_ns: log time after which it is flushed.
             fsync_every: seconds of wall time after which a flush lets the disk have everything,
                 too; None leaves that to the operating system until the end. The bytes are the same.
+            aside: compress in a thread of its own; the bytes are the same.
 
         Raises:
             UsageError: the file or its partial exists and `force` is not set, another process
@@ -97,6 +99,7 @@ class LogFile:
                 profile=profile,
                 compression=compression,
                 chunk_size=chunk_size,
+                aside=aside,
             )
         except BaseException:
             self._stream.close()
@@ -110,6 +113,7 @@ class LogFile:
     @property
     def size(self) -> int:
         """Bytes written so far; the chunk in progress is not among them."""
+        self._writer.settle()
         return self._stream.tell()
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -177,6 +181,7 @@ class LogFile:
         self._stream.check()
         self._chunk_start = None
         self._writer.end_chunk()
+        self._writer.settle()
         self._stream.flush()
         if time.monotonic() >= self._next_sync:
             self._sync()

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any, Final, Protocol
 
 import lz4.frame
@@ -38,7 +40,8 @@ _MAGIC: Final = b"\x89MCAP0\r\n"
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; the data follow."""
 _OF_MESSAGE: Final = int(Opcode.MESSAGE)
-_MESSAGE_FIELDS: Final = _MESSAGE.size - 9
+_MESSAGE_SIZE: Final = _MESSAGE.size
+_MESSAGE_FIELDS: Final = _MESSAGE_SIZE - 9
 _INDEX: Final = struct.Struct("<BQHI")
 """Opcode, length, channel, bytes of the pairs, which follow: log time and place in the chunk."""
 _CHUNK: Final = struct.Struct("<BQQQQI")
@@ -72,6 +75,7 @@ class McapWriter:
         profile: of the messages, as the header states.
         compression: of the chunks.
         chunk_size: bytes of records at which a chunk ends.
+        aside: compress and append chunks in a thread of their own; the bytes are the same.
     """
 
     def __init__(
@@ -82,6 +86,7 @@ class McapWriter:
         profile: str,
         compression: Compression,
         chunk_size: int,
+        aside: bool = False,
     ) -> None:
         self._out = out
         self._chunk_size = chunk_size
@@ -92,7 +97,12 @@ class McapWriter:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
-        self._records = bytearray()  # only grows: memory that is used again is in the cache
+        # Only grow: memory that is used again is in the cache. One takes the next chunk while the
+        # other is compressed.
+        self._records = bytearray()
+        self._spare = bytearray() if aside else self._records
+        self._aside = ThreadPoolExecutor(1) if aside else None
+        self._pending: Future[None] | None = None
         self._size = 0
         self._index: dict[int, list[int]] = {}
         self._crc = 0
@@ -125,19 +135,28 @@ class McapWriter:
         self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int
     ) -> None:
         """Add a message to the chunk; times in nanoseconds."""
-        length = _MESSAGE_FIELDS + len(data)
-        at = self._size
-        self._add(_MESSAGE.pack(_OF_MESSAGE, length, channel, sequence, log_time, publish_time))
-        self._add(data)
+        length, at = len(data), self._size
+        header = _MESSAGE.pack(
+            _OF_MESSAGE, _MESSAGE_FIELDS + length, channel, sequence, log_time, publish_time
+        )
+        start = at + _MESSAGE_SIZE
+        stop = start + length
+        records = self._records
+        if stop > len(records):
+            records.extend(bytes(stop - len(records)))
+        records[at:start] = header
+        records[start:stop] = data
+        self._size = stop
         pairs = self._index.get(channel)
         if pairs is None:
             pairs = self._index[channel] = []
         pairs += (log_time, at)
-        if self._size > self._chunk_size:
+        if stop > self._chunk_size:
             self.end_chunk()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a named map of texts, outside the chunks."""
+        self.settle()
         data = _encoded(Metadata(name=name, metadata=dict(values)))
         self._metadata.append(MetadataIndex(offset=self._out.tell(), length=len(data), name=name))
         self._append(data)
@@ -146,6 +165,7 @@ class McapWriter:
         self, name: str, media_type: str, data: bytes, *, log_time: int, create_time: int
     ) -> None:
         """Append a named file, outside the chunks; times in nanoseconds."""
+        self.settle()
         attachment = Attachment(
             create_time=create_time,
             log_time=log_time,
@@ -168,53 +188,28 @@ class McapWriter:
         self._append(stored)
 
     def end_chunk(self) -> None:
-        """Append the chunk in progress with its message indexes, where it holds a message."""
+        """End the chunk in progress, where it holds a message: it is appended, or will be."""
         if not self._index:
             return
-        records, index = memoryview(self._records)[: self._size], self._index
+        self.settle()
+        work = partial(self._append_chunk, self._records, self._size, self._index)
+        self._records, self._spare = self._spare, self._records
         self._size, self._index = 0, {}
-        times = [pairs[::2] for pairs in index.values()]
-        first, last = min(map(min, times)), max(map(max, times))
-        stored = self._compress(records)
-        name = self._compression.encode()
-        length = _CHUNK.size - 9 + 4 + len(name) + 8 + len(stored)
-        chunk = b"".join(
-            (
-                _CHUNK.pack(Opcode.CHUNK, length, first, last, len(records), crc32(records)),
-                len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little"),
-                stored,
-            )
-        )
-        offset = self._out.tell()
-        self._append(chunk)
-        offsets, parts, at = {}, [], offset + len(chunk)
-        for channel, pairs in index.items():
-            offsets[channel] = at
-            size = 8 * len(pairs)
-            parts += [
-                _INDEX.pack(Opcode.MESSAGE_INDEX, size + 6, channel, size),
-                struct.pack(f"<{len(pairs)}Q", *pairs),
-            ]
-            at += _INDEX.size + size
-            self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
-        self._append(b"".join(parts))
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=len(chunk),
-                chunk_start_offset=offset,
-                compression=self._compression,
-                compressed_size=len(stored),
-                message_end_time=last,
-                message_index_length=at - offset - len(chunk),
-                message_index_offsets=offsets,
-                message_start_time=first,
-                uncompressed_size=len(records),
-            )
-        )
+        if self._aside is None:
+            work()
+        else:
+            self._pending = self._aside.submit(work)
+
+    def settle(self) -> None:
+        """Wait until all chunks that ended are appended; what went wrong with one is raised."""
+        if self._pending is not None:
+            self._pending.result()
+            self._pending = None
 
     def finish(self) -> None:
         """End the chunk in progress and append the summary."""
         self.end_chunk()
+        self.settle()
         self._append(_encoded(DataEnd(self._crc)))
         start = at = self._out.tell()
         groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
@@ -235,6 +230,54 @@ class McapWriter:
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, at), crc32(summary))
         self._append(summary + _encoded(Footer(start, at, crc)) + _MAGIC)
 
+    def _append_chunk(self, buffer: bytearray, size: int, index: dict[int, list[int]]) -> None:
+        """Append a chunk with its message indexes.
+
+        Args:
+            buffer: its records first.
+            size: of the records.
+            index: by channel the times of its messages, each with its place.
+        """
+        times = [pairs[::2] for pairs in index.values()]
+        first, last = min(map(min, times)), max(map(max, times))
+        with memoryview(buffer) as whole, whole[:size] as records:
+            stored, crc = self._compress(records), crc32(records)
+        name = self._compression.encode()
+        length = _CHUNK.size - 9 + 4 + len(name) + 8 + len(stored)
+        chunk = b"".join(
+            (
+                _CHUNK.pack(Opcode.CHUNK, length, first, last, size, crc),
+                len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little"),
+                stored,
+            )
+        )
+        offset = self._out.tell()
+        self._append(chunk)
+        offsets, parts, at = {}, [], offset + len(chunk)
+        for channel, pairs in index.items():
+            offsets[channel] = at
+            length = 8 * len(pairs)
+            parts += [
+                _INDEX.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length),
+                struct.pack(f"<{len(pairs)}Q", *pairs),
+            ]
+            at += _INDEX.size + length
+            self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
+        self._append(b"".join(parts))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(chunk),
+                chunk_start_offset=offset,
+                compression=self._compression,
+                compressed_size=len(stored),
+                message_end_time=last,
+                message_index_length=at - offset - len(chunk),
+                message_index_offsets=offsets,
+                message_start_time=first,
+                uncompressed_size=size,
+            )
+        )
+
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachments),
@@ -249,17 +292,10 @@ class McapWriter:
         )
 
     def _define(self, record: McapRecord) -> None:
-        self._add(_encoded(record))
+        self._records[self._size :] = data = _encoded(record)
+        self._size += len(data)
         if self._size > self._chunk_size:
             self.end_chunk()
-
-    def _add(self, data: bytes) -> None:
-        """Add bytes to the records of the chunk."""
-        start, stop = self._size, self._size + len(data)
-        if stop > len(self._records):
-            self._records.extend(bytes(stop - len(self._records)))
-        self._records[start:stop] = data
-        self._size = stop
 
     def _append(self, data: bytes) -> None:
         self._crc = crc32(data, self._crc)

@@ -95,6 +95,7 @@ class RunWriter(Sink):
             chunk_size=CHUNK_BYTES,
             flush_ns=NEVER_NS,
             fsync_every=fsync_every,
+            aside=True,
         )
         self._next_flush = time.monotonic() + FLUSH_SECONDS
         self._log.add_metadata(
