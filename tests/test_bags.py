@@ -165,6 +165,23 @@ def test_a_bag_is_described_by_its_index(
     assert {(c["start_ns"], c["end_ns"]) for c in channels.values()} == {(10**18, last)}
 
 
+@pytest.mark.parametrize("make", [ros2_database, ros2_bag])
+def test_a_database_is_described_without_its_messages(
+    make: Callable[[Path], Path], cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make(tmp_path)
+    assert cdmisfa("verify", path, "--json").json["ok"]
+    with monkeypatch.context() as unread:
+        unread.setattr(rosbag2.Reader, "messages", lambda *_: pytest.fail("it was read"))
+        channels = {c["topic"]: c for c in cdmisfa("info", path, "--json").json["channels"]}
+        opened = open_images(path, "/cam_right")
+    assert {c["messages"] for c in channels.values()} == {COUNT}
+    last = 10**18 + (COUNT - 1) * 20_000_000
+    assert {(c["start_ns"], c["end_ns"]) for c in channels.values()} == {(10**18, last)}
+    assert (len(opened.times), opened.times[-1]) == (COUNT, last)
+    opened.close()
+
+
 @pytest.mark.parametrize("word", ["https://host/film.mp4", "s3://bucket/a.bag", "http://h/t.csv"])
 @pytest.mark.parametrize("command", ["info", "verify", "learn", "convert"])
 def test_urls_are_of_mcap_logs(command: str, word: str, cdmisfa: Cdmisfa, tmp_path: Path) -> None:
