@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from camera_files import write_cameras, write_pictures
 from conftest import Cdmisfa
+from mcap.writer import Writer
 from PIL import Image
 
 from recorder.config import view_names
@@ -232,3 +233,36 @@ def test_a_plan_says_whether_images_change_their_size(cdmisfa: Cdmisfa, tmp_path
     words = ("learn", tmp_path / "a.mcap", "--dry-run")
     assert cdmisfa(*words, "--json").json["streams"][0]["size_changes"] is None
     assert "shows when they are read: /cam" in cdmisfa(*words).out
+
+
+def test_a_log_without_images_says_how_numbers_are_taken(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/joints", "json", writer.register_schema("j", "", b""))
+        writer.add_message(channel, 1, b'{"position": [1]}', 1)
+        writer.finish()
+    for words in (("learn",), ("convert", "-o", tmp_path / "rec"), ("learn", "--topic", "/j*")):
+        refused = cdmisfa(words[0], tmp_path / "log.mcap", *words[1:])
+        assert refused.code == 2
+        assert refused.err.endswith("holds no images; numbers are taken with --field\n")
+    assert "it holds no images" in cdmisfa("view", tmp_path / "log.mcap", "--save", "v.rrd").err
+
+
+def test_images_and_numbers_are_refused_before_a_clock_is_suggested(
+    cdmisfa: Cdmisfa, logs: Path
+) -> None:
+    (logs / "t.csv").write_text("stamp,a\n0,1\n1,2\n2,3\n")
+    refused = cdmisfa(
+        "view", logs / "t.csv", logs / "uneven.mcap", "--time", "stamp", "--save", "v"
+    )
+    assert refused.code == 2
+    assert "these show a number and images" in refused.err
+
+
+def test_what_is_in_several_files_is_told_apart(cdmisfa: Cdmisfa, logs: Path) -> None:
+    both = cdmisfa("info", logs / "a.mcap", logs / "uneven.mcap").out.splitlines()
+    assert [line.split()[-1] for line in both[1:]] == [
+        *("file", "-----------", "a.mcap", "a.mcap", "uneven.mcap", "uneven.mcap"),
+    ]
+    assert cdmisfa("info", logs / "a.mcap").out.splitlines()[1].split()[-1] == "to"

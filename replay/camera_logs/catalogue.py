@@ -15,7 +15,7 @@ from replay.camera_logs.formats.picture_folder import FolderImages
 from replay.camera_logs.formats.table import is_table, table_channels
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.opening import is_bag, is_picture_folder, is_split, is_video
-from replay.camera_logs.stream import ChannelFacts
+from replay.camera_logs.stream import ChannelFacts, holds_none
 from replay.storage.location import Location
 
 ALL = ("*",)
@@ -93,7 +93,9 @@ def named_streams(
     for topic in topics:
         fits = [(file, name) for file, names in known for name in names if _fits(name, topic)]
         if not fits:
-            there = ", ".join(sorted({name for _, names in known for name in names})) or "none"
+            there = ", ".join(sorted({name for _, names in known for name in names}))
+            if not there:
+                raise UsageError(holds_none(files[0], reading))
             where = files[0] if len(files) == 1 else f"none of the {len(files)} logs"
             raise UsageError(f"{where}: no topic {topic}; there are: {there}")
         found += [pair for pair in fits if pair not in found]

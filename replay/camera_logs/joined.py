@@ -24,10 +24,9 @@ class JoinedImages(ImageStream):
         self.path = path
         self.recipe, self.fields = parts[0].recipe, parts[0].fields
         self.topic = parts[0].topic
-        self.warnings = [
-            f"{path}: {self.topic} is joined from {len(parts)} logs, by time",
-            *(warning for part in parts for warning in part.warnings),
-        ]
+        joined = f"{path}: {self.topic} is joined from {len(parts)} logs, by time"
+        self.warnings = [joined] if len(parts) > 1 else []
+        self.warnings += [warning for part in parts for warning in part.warnings]
         self.parts = list(parts)
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")

@@ -138,6 +138,8 @@ class ForeignSource(StoredSource):
                 self._streams.append(open_images(path, topic, salvage=salvage, reading=reading))
             if align != "index":
                 self._streams = join_parts(self._streams)
+            if len({bool(stream.fields) for stream in self._streams}) > 1:  # whatever the clock
+                framings([self._image(i, 0) for i in range(len(self._streams))], None, fit)
             self._align_by = align
             self._fps = rate or _rate(self._streams)
             self._times = known_times(self._streams, self._fps)
@@ -302,7 +304,8 @@ class ForeignSource(StoredSource):
             start, stop = overlap(self._times)
             if stop < start:
                 raise UsageError(
-                    f"{self._files[0]}: its streams have no time in common; use --align index"
+                    f"{self._streams[0].topic} and others have no time in common: take each by "
+                    "itself"
                 )
             rows = by_time(self._times, start, stop, self._fps)
             gaps = [gaps_by_time(t, start, len(rows[0]), self._fps) for t in self._times]

@@ -148,6 +148,8 @@ def choose_images(
         return found[0]
     known = ", ".join(sorted({name for name, _, _ in readable})) or "none"
     what = "messages with fields" if reading.fields else "images"
+    if not readable and topic is None:
+        raise UsageError(holds_none(path, reading))
     if topic is None:
         raise UsageError(f"{path}: name one --topic or more; it has {what} on: {known}")
     if len(found) > 1:
@@ -157,6 +159,13 @@ def choose_images(
     if topic in others:
         raise UsageError(f"{path}: {topic} holds {others[topic]}, images are {', '.join(SCHEMAS)}")
     raise UsageError(f"{path}: no topic {topic}; it has {what} on: {known}")
+
+
+def holds_none(path: Location, reading: Reading) -> str:
+    """That a log has no topic with what is wanted, in words."""
+    if reading.fields:
+        return f"{path}: it holds no messages whose fields are known"
+    return f"{path}: it holds no images; numbers are taken with --field"
 
 
 def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) -> NDArray[np.uint64]:

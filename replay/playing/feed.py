@@ -90,8 +90,9 @@ def opened_source(paths: Sequence[Path], fps: float | None) -> Iterator[Logged]:
     """
     try:
         source = open_to_look(paths, CameraOptions(rate=fps))
-    except UsageError as error:  # where --rate is how fast it is played
-        raise UsageError(str(error).replace("--rate", "--fps")) from None
+    except UsageError as error:  # where --rate is how fast it is played, and there is no --time
+        said = str(error).partition(", or name the column")[0]
+        raise UsageError(said.replace("--rate", "--fps")) from None
     with contextlib.closing(source):
         yield source
 

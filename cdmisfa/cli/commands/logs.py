@@ -48,13 +48,15 @@ def _print_info(found: LogInfo) -> None:
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
         click.echo(f"signals of version {version}: {lacks} are not in it, read as NaN")
-    options.print_table(
-        ("topic", "messages", "encoding", "schema", "from", "to"),
-        [
-            (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
-            for c in found.channels
-        ],
-    )
+    head: tuple[str, ...] = ("topic", "messages", "encoding", "schema", "from", "to")
+    rows: list[tuple[object, ...]] = [
+        (c.topic, c.messages, c.encoding, c.schema, _clock(c.start_ns), _clock(c.end_ns))
+        for c in found.channels
+    ]
+    files = [(c.file,) for c in found.channels]
+    if len(set(files)) > 1:
+        head, rows = (*head, "file"), [(*row, *file) for row, file in zip(rows, files, strict=True)]
+    options.print_table(head, rows)
 
 
 def _clock(ns: int | None) -> str:
