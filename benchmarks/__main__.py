@@ -7,13 +7,17 @@ import importlib
 import pkgutil
 
 import benchmarks
-from benchmarks.report import write_page
+from benchmarks.history import draw, keep
+from benchmarks.report import PAGE, PICTURE, write_page
 
 
 def main() -> None:
-    """Run benchmarks one after another; each writes results/NAME.json, `page` the page."""
+    """Run benchmarks one after another; each writes results/NAME.json, `page` the page.
+
+    The ratios of a run that is not quick are kept under the commit, too.
+    """
     modules = pkgutil.iter_modules(benchmarks.__path__)
-    names = sorted({m.name for m in modules} - {"__main__", "report"})
+    names = sorted({m.name for m in modules} - {"__main__", "history", "report"})
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
         "name", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}, or page"
@@ -23,6 +27,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for name in arguments.name or [*names, "page"]:
         if name == "page":
+            draw(PAGE.parent / PICTURE)
             print(write_page())
             continue
         if name not in names:
@@ -30,6 +35,8 @@ def main() -> None:
         importlib.import_module(f"benchmarks.{name}").main(
             quick=arguments.quick, full=arguments.full
         )
+        if not arguments.quick and keep(name) is None:
+            print("not kept for the history: the code is not that of a commit")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,8 @@ from cdmisfa.experiments.documents import markdown
 RESULTS = Path(__file__).parent / "results"
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 PAGE = Path(__file__).parent.parent / "docs" / "benchmarks.md"
+PICTURE = "images/benchmarks.png"
+"""The figure of the history, from the page's folder."""
 
 
 def interleaved(
@@ -124,5 +126,12 @@ def write_page() -> Path:
         "and what counts is the median of the ratios within each round: a slow spell of the "
         "machine hits all of them."
     )
-    PAGE.write_text("\n\n".join([head, *map(section, documents)]) + "\n", encoding="utf-8")
+    parts = [head, *map(section, documents)]
+    if (PAGE.parent / PICTURE).exists():
+        parts.insert(
+            1,
+            f"![Ratios over the commits]({PICTURE})\n\nRatios of `benchmarks/results/history`, "
+            "which holds those of each commit that was measured, by the day of the commit.",
+        )
+    PAGE.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return PAGE

@@ -18,6 +18,8 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Workers
+from cdmisfa.experiments.sources import configure
+from cdmisfa.experiments.sweep import compute, plan
 from recorder.world.oscillatory import OscillatorySource
 
 STREAMS = (10, 100, 1000, 10_000)
@@ -82,6 +84,24 @@ def trials(jobs: int, frames: int) -> Callable[[], int]:
     return call
 
 
+def sweeping(trials: int) -> dict[str, Callable[[], int]]:
+    """Calls that plan a sweep's trials, that fill each one's configuration alone, and compute."""
+
+    def planned() -> int:
+        return len(plan("oscillatory", grid={}, seeds=range(trials)))
+
+    def configured() -> int:
+        return len([configure("oscillatory", None, (), seed) for seed in range(trials)])
+
+    (trial,) = plan("oscillatory", grid={}, seeds=[0])
+
+    def computed() -> int:
+        compute(trial)
+        return 1
+
+    return {"planned": planned, "configured": configured, "computed": computed}
+
+
 def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/scaling.json."""
     rounds = 3 if quick else 9
@@ -101,15 +121,27 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     by_jobs = [
         [n, round(middle(t) / 1000), f"{ratio(walls['1'], t):.2f}x"] for n, t in walls.items()
     ]
+    parts = interleaved(sweeping(20 if quick else 200), rounds)
+    by_part = [
+        [name, middle(parts[which]), f"{100 / ratio(parts['computed'], parts[which]):.2f} %"]
+        for name, which in (
+            ("computing it", "computed"),
+            ("planning it", "planned"),
+            ("with the preset read for it alone", "configured"),
+        )
+    ]
     save(
         "scaling",
         "Scaling",
         "One iteration of the agent for n streams (every block novel, policy iteration "
         "included). CPU time a frame and peak memory of a process that learns from the "
-        "oscillatory streams in blocks of 100. Trials in processes, by the wall's clock.",
+        "oscillatory streams in blocks of 100. Trials in processes, by the wall's clock. What a "
+        "sweep takes for a trial of the oscillatory streams, from start to end, beyond computing "
+        "it: planning all trials reads the preset once.",
         [
             (["streams", "us a step", "of 10 streams"], by_streams),
             (["frames", "us a frame", "peak MB"], by_frames),
             (["jobs", f"ms a trial of {40 * lengths[0]} frames", "speed"], by_jobs),
+            (["of a trial", "us", "of computing it"], by_part),
         ],
     )

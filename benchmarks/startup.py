@@ -18,6 +18,8 @@ WARM = {
     "import of numba": ("-c", "import numba"),
     "import of numba and rerun": ("-c", "import numba, rerun"),
     "cdmisfa --help": ("-m", "cdmisfa", "--help"),
+    "cdmisfa signals": ("-m", "cdmisfa", "signals"),
+    "cdmisfa info of a recording": ("-m", "cdmisfa", "info", str(SAMPLE / "left.mcap")),
     "learn oscillatory --no-rerun": (*LEARN, "RUN", "oscillatory", "--no-rerun"),
     "learn oscillatory": (*LEARN, "RUN", "oscillatory"),
     "learn of two views --no-rerun": (*LEARN, "RUN", *VIEWS, "--no-rerun"),

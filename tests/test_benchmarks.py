@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks import (
+    history,
     kernels,
     learn,
     long_recordings,
+    many_views,
     modules,
     moments,
     reader,
@@ -76,6 +79,48 @@ def test_startup(tmp_path: Path) -> None:
     assert set(startup.COLD) <= set(startup.WARM)
 
 
+def test_many_views(tmp_path: Path) -> None:
+    found = many_views.record_and_learn(3, tmp_path / "rec")
+    assert found["record"] > 0 < found["learn"]
+    assert len(list((tmp_path / "rec").glob("*.mcap"))) == 3
+
+
+def test_the_ratios_of_each_commit_are_kept_and_drawn(results: Path, tmp_path: Path) -> None:
+    assert not history.draw(tmp_path / "none.png")
+    header = ["preset icub: CPU of", "logs", "us", "more than no log", "us", "more than no log"]
+    rows = [["all threads", "run.mcap", 110, "+10.0 %", 105, "+5.0 %"]]
+    report.save("learn", "Learning", "", [(["K"], [[1]]), (header, rows)])
+    document = json.loads((results / "learn.json").read_text())
+    name = "Iteration, preset icub, of none: run.mcap"
+    assert history.ratios(document) == {name: 1.1}
+    assert history.keep("learn", tmp_path) is None  # of no repository
+    history.add("b" * 40, "2026-02-01T00:00:00+00:00", {name: 1.1})
+    path = history.add("b" * 40, "2026-02-01T00:00:00+00:00", {"other": 2.0})
+    assert json.loads(path.read_text())["ratios"] == {name: 1.1, "other": 2.0}
+    assert history.draw(tmp_path / "some.png")
+    assert (tmp_path / "some.png").stat().st_size > 1000
+
+
+def test_results_are_kept_only_of_code_that_a_commit_holds(results: Path, tmp_path: Path) -> None:
+    def git(*words: str) -> None:
+        known = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        subprocess.run(["git", "-C", str(tmp_path), *known, *words], check=True)
+
+    (tmp_path / "cdmisfa").mkdir()
+    (tmp_path / "cdmisfa" / "code.py").write_text("1\n")
+    git("init", "-q")
+    git("add", "cdmisfa")
+    git("commit", "-qm", "Begin")
+    report.save("modules", "Modules", "", [(["modules", "of none"], [[10, "1.38x"]])])
+    path = history.keep("modules", tmp_path)
+    assert path is not None
+    told = json.loads(path.read_text())
+    assert told["commit"].startswith(path.stem)
+    assert told["ratios"] == {"Iteration with modules, of none: 10 modules": 1.38}
+    (tmp_path / "cdmisfa" / "code.py").write_text("2\n")
+    assert history.keep("modules", tmp_path) is None
+
+
 def test_modules(results: Path) -> None:
     modules.main(quick=True)
     rows = json.loads((results / "modules.json").read_text())["tables"][0]["rows"]
@@ -115,6 +160,7 @@ def test_recorder(tmp_path: Path) -> None:
 
 def test_scaling() -> None:
     assert scaling.agent_steps(300, 4)() == 4
+    assert [call() for call in scaling.sweeping(2).values()] == [2, 2, 1]
     cost, peak = scaling.learn_frames(200)
     assert cost > 0
     assert peak > 10
