@@ -59,6 +59,20 @@ def test_compiling_is_told_only_where_nothing_is_on_disk(tmp_path: Path) -> None
     assert said() == ""
 
 
+def test_what_only_compiled_code_calls_is_not_readied_for_python() -> None:
+    @compiled
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    @compiled
+    def quadruple(x: float) -> float:
+        return double(double(x))
+
+    assert quadruple(1.5) == 6.0
+    assert double.signatures == []  # type: ignore[attr-defined]
+    assert double(1.5) == 3.0
+
+
 def test_what_is_kept_is_loaded_without_the_compiler(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(

@@ -27,6 +27,11 @@ def portable_bits(wanted: bool = True) -> Iterator[None]:
         _PORTABLE.reset(before)
 
 
+def portable() -> bool:
+    """Whether portable arithmetic is meant at the moment."""
+    return _PORTABLE.get()
+
+
 def in_own_arithmetic(function: Function) -> Function:
     """Have a learner's method, or what takes its configuration first, do what `portable` says."""
 
@@ -54,7 +59,7 @@ class Either:
     @property
     def meant(self) -> Any:
         """The form for the arithmetic of the moment."""
-        return self._portable() if _PORTABLE.get() else self._fast
+        return self._portable() if portable() else self._fast
 
     @property
     def _numba_type_(self) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
@@ -11,7 +12,7 @@ import numba
 from numba.core import event
 from numba.extending import overload
 
-from cdmisfa.core.arithmetic.choice import Either
+from cdmisfa.core.arithmetic.choice import Either, portable
 from cdmisfa.core.arithmetic.kept import kept_while_sources_last
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -53,11 +54,30 @@ def in_compiled_code(function: Callable[..., Any]) -> Callable[[Function], Funct
 def _compile(function: Function, **options: Any) -> Function:
     options["error_model"] = "numpy"  # no test at every division whether an error is to be raised
     options["no_cfunc_wrapper"] = True  # for callers in C, of which there are none
-    strict = {name: value for name, value in options.items() if name != "fastmath"}
-    return cast(
-        Function,
-        Either(_jit(function, options), lambda: _jit(_under_another_name(function), strict)),
-    )
+    return cast(Function, _Compiled(function, options))
+
+
+class _Compiled(Either):
+    """A compiled function in both forms of arithmetic, for Python, and apart for compiled callers.
+
+    What Python needs to call it, and they do not, is a quarter of what compiling takes.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        strict = {name: value for name, value in options.items() if name != "fastmath"}
+        bare = {"no_cpython_wrapper": True}
+        super().__init__(
+            _jit(function, options), lambda: _jit(_named_apart(function, "portable"), strict)
+        )
+        self._within = (
+            cache(lambda: _jit(_named_apart(function, "within"), options | bare)),
+            cache(lambda: _jit(_named_apart(function, "portable_within"), strict | bare)),
+        )
+
+    @property
+    def _numba_type_(self) -> Any:
+        """The form for compiled code; see `Either`."""
+        return numba.typeof(self._within[portable()]())  # type: ignore[no-untyped-call]
 
 
 def _jit(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
@@ -67,13 +87,13 @@ def _jit(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
         return numba.njit(**options)(function)
 
 
-def _under_another_name(function: Callable[..., Any]) -> Callable[..., Any]:
+def _named_apart(function: Callable[..., Any], form: str) -> Callable[..., Any]:
     """The same function under a name that leads to files and symbols of its own."""
     code = function.__code__
     copy = FunctionType(
         code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
-    copy.__qualname__ = f"{function.__qualname__}_portable"
+    copy.__qualname__ = f"{function.__qualname__}_{form}"
     copy.__module__ = function.__module__
     return copy
 
