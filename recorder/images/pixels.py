@@ -135,8 +135,10 @@ def gray(
         return np.ascontiguousarray(rows[:, :, [kind.index(c) for c in "rgb"]])
     found = np.empty((height, width), np.uint8)
     for band in _bands(height, width):
-        red, green, blue = (rows[band, :, kind.index(c)].astype(np.uint32) for c in "rgb")
-        found[band] = (19595 * red + 38470 * green + 7471 * blue + 32768) >> 16
+        part, order = rows[band], kind.upper() + "X" * (size - 3)
+        pixels = part.tobytes()  # without what is between the rows
+        colors = Image.frombuffer("RGB", (width, len(part)), pixels, "raw", order, 0, 1)
+        found[band] = np.asarray(colors.convert("L"))  # as in `RECIPE`
     return found
 
 

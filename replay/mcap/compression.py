@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from typing import Final
 
 import lz4.frame
@@ -12,14 +14,51 @@ from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
 
 _WINDOW: Final = MAX_CHUNK // 2
 """Most memory that zstd may take for its window, in bytes."""
+_KEPT: Final = 6
+_KEPT_BYTES: Final = 8 * 1024 * 1024
+"""Buffers that are kept to be used again, and the size of the largest."""
 _BROKEN: Final = (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError)
 
 
-class Decompressor:
-    """Decompresses the chunks of a file, one after the other."""
+class Memory:
+    """Memory that is used again once nothing refers to it: new memory costs more than filling it.
+
+    Threads may share it.
+    """
 
     def __init__(self) -> None:
-        self._zstd = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
+        self._held: list[Bytes] = []
+        self._lock = threading.Lock()
+
+    def take(self, size: int) -> Bytes:
+        """Memory of some bytes, which hold anything."""
+        with self._lock:
+            held = self._held
+            for i in range(len(held)):
+                # Referred to by the list, and by the call that counts.
+                if len(held[i]) >= size and sys.getrefcount(held[i]) == 2:
+                    held.append(held.pop(i))
+                    return held[-1][:size]
+            if size > _KEPT_BYTES:
+                return np.empty(size, np.uint8)
+            del held[: -_KEPT + 1]
+            held.append(np.empty(size + size // 8, np.uint8))
+            return held[-1][:size]
+
+
+class Decompressor:
+    """Decompresses the chunks of a file; threads may share it."""
+
+    def __init__(self) -> None:
+        self._own = threading.local()
+
+    @property
+    def _zstd(self) -> zstandard.ZstdDecompressor:
+        """The decompressor of the calling thread."""
+        if not hasattr(self._own, "zstd"):
+            self._own.zstd = zstandard.ZstdDecompressor(max_window_size=_WINDOW)
+        found: zstandard.ZstdDecompressor = self._own.zstd
+        return found
 
     def decompress(self, stored: memoryview, compression: str, out: Bytes) -> None:
         """Write the records of a chunk into memory of the size that it states.

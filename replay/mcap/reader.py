@@ -6,7 +6,7 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -232,8 +232,7 @@ class LogReader:
             LogDamagedError: at the first damage, without `salvage`.
         """
         low, high = start or 0, 2**64 if stop is None else stop
-        segments = list(enumerate(self.segments))
-        chosen = [(i, s) for i, s in segments if s.end >= low and s.start < high]
+        chosen = [(i, s) for i, s in enumerate(self.segments) if s.end >= low and s.start < high]
         if self.by_index:
             numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
             chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
@@ -257,8 +256,9 @@ class LogReader:
             store.pass_to(self._structure.data_end)
         self._data.check(store.crc(0, self._structure.data_end))
 
-    def expect(self, segments: Iterable[Segment], *, indexes: bool = False) -> None:
+    def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""
+        self._chunks.expect(() if indexes else segments)
         spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
         self._file.expect(list(spans))
 
@@ -321,8 +321,8 @@ class LogReader:
 
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
+        self._chunks.close()
         self._file.close()
-        self._chunks.forget()
 
     def __enter__(self) -> Self:
         return self

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
@@ -22,6 +23,8 @@ OPEN_FILES = 24
 _PEEK: Final = 4096
 _PEEK_FAR: Final = 256
 """Bytes read ahead at a place that is far from the last."""
+_AHEAD: Final = 16 * 1024 * 1024
+"""Most bytes of a file that are read ahead at once."""
 
 
 class Store(ABC):
@@ -90,6 +93,12 @@ class Store(ABC):
             offset, count = offset + len(part), count - len(part)
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
+    def read_into(self, offset: int, out: memoryview) -> int:
+        """Fill memory with the bytes from `offset` on; how many, fewer only at the end."""
+        data = self.read(offset, len(out))
+        out[: len(data)] = data
+        return len(data)
+
     def blocks(self, offset: int, stop: int) -> Iterator[bytes]:
         """Give the bytes [offset, stop), 1 MiB at a time."""
         while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
@@ -131,6 +140,23 @@ class FileStore(Store):
             return os.pread(file.number, min(count, 1 << 30), offset)
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+
+    def read_into(self, offset: int, out: memoryview) -> int:
+        file, done = self._open(), 0
+        most = max(min(len(out), self.size - offset), 0)
+        try:
+            while done < most and (n := os.preadv(file.number, [out[done:most]], offset + done)):
+                done += n
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+        return done
+
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
+        """Let the system read spans, if they are few bytes, all at once and not one by one."""
+        if sys.platform == "linux" and sum(stop - start for start, stop in spans) <= _AHEAD:
+            number = self._open().number
+            for start, stop in spans:
+                os.posix_fadvise(number, start, stop - start, os.POSIX_FADV_WILLNEED)
 
     def is_at(self, path: Path) -> bool:
         try:

@@ -11,6 +11,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +25,7 @@ MAX_LIST: Final = 16 * 1024 * 1024
 """Longest JSON text of a list that grows with what was asked for, in bytes."""
 
 _STATM: Final = Path("/proc/self/statm")
+_PAGE: Final = os.sysconf("SC_PAGE_SIZE") if sys.platform == "linux" else 0
 _DATA: Final = 5
 """Which number of `_STATM` counts the pages that `RLIMIT_DATA` limits."""
 _LOCK: Final = threading.Lock()
@@ -59,7 +61,13 @@ def data_bytes() -> int:
     """What of this process's memory `budget` counts, in bytes; 0 where there is no budget."""
     if sys.platform != "linux":
         return 0
-    return int(_STATM.read_bytes().split()[_DATA]) * os.sysconf("SC_PAGE_SIZE")
+    return int(os.pread(_statm(os.getpid()), 200, 0).split()[_DATA]) * _PAGE
+
+
+@cache
+def _statm(process: int) -> int:
+    """`_STATM` of a process, open: it is read for every image."""
+    return os.open(_STATM, os.O_RDONLY)
 
 
 def parse_json(text: str | bytes, most: int = MAX_JSON) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, TypeVar
 
@@ -20,6 +20,7 @@ from replay.camera_logs.stream import ImageStream, choose_images, explained, sor
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel, MalformedRecord
 from replay.mcap.segments import Segment
+from replay.mcap.tables import MessageTable
 from replay.storage.location import Location
 
 CACHE_BYTES: Final = 1024 * 1024
@@ -27,6 +28,9 @@ CACHE_BYTES: Final = 1024 * 1024
 
 
 Found = TypeVar("Found")
+
+_Messages = tuple[list[Segment], Sequence[int], NDArray[np.uint64], NDArray[np.int64]]
+"""Chunks with messages of a topic, how many each has, their log times, and the row of each."""
 
 
 class McapImages(ImageStream):
@@ -46,6 +50,7 @@ class McapImages(ImageStream):
         reading: Reading = IMAGES,
     ) -> None:
         self.path = path
+        self._own: tuple[MessageTable | None, NDArray[np.intp]] = None, np.empty(0, np.intp)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
@@ -81,7 +86,9 @@ class McapImages(ImageStream):
             raise MalformedRecord("it is damaged")
         place = int(self._row_in[row])
         if self.reader.by_index:
-            own = np.flatnonzero(table.channel == self._channel.id)
+            if self._own[0] is not table:
+                self._own = table, np.flatnonzero(table.channel == self._channel.id)
+            own = self._own[1]
             if place >= len(own) or table.log_time[own[place]] != self.times[row]:
                 raise MalformedRecord("its chunk holds other messages than the summary names")
             place = int(own[place])
@@ -92,6 +99,7 @@ class McapImages(ImageStream):
         self.reader.confirm()
 
     def close(self) -> None:
+        self._own = None, self._own[1]
         self.reader.close()
 
     def _index(self) -> None:
@@ -100,38 +108,42 @@ class McapImages(ImageStream):
         One pass over a log checks all of it; of a URL only its message indexes are read, and
         each chunk is checked when its images are.
         """
-        self._segments: list[Segment] = []
-        times, members, rows = [], [], []
         found = self._by_index() if self.reader.by_index else self._by_pass()
-        for segment, log_times, places in found:
-            times.append(log_times)
-            members.append(np.full(len(places), len(self._segments), np.int32))
-            rows.append(places.astype(np.int32))
-            self._segments.append(segment)
-        if not times:
+        self._segments, counts, log_times, places = found
+        if not len(log_times):
             raise UsageError(f"{self.path}: there is no message on {self.topic}")
-        order = np.argsort(np.concatenate(times), kind="stable")
-        self.times = sorted_times(f"{self.path}: {self.topic}", np.concatenate(times)[order])
-        self._segment_of = np.concatenate(members)[order]
-        self._row_in = np.concatenate(rows)[order]
+        members = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        order = np.argsort(log_times, kind="stable")
+        self.times = sorted_times(f"{self.path}: {self.topic}", log_times[order])
+        self._segment_of, self._row_in = members[order], places[order]
         self.reader.expect(self._segments)
 
-    def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
-        """Log times of the topic's messages in each chunk, and their rows in its table."""
+    def _by_pass(self) -> _Messages:
+        """The topic's messages by their rows in the table of each chunk."""
+        segments, times, places = [], [np.empty(0, np.uint64)], [np.empty(0, np.int64)]
         for segment, table in self.reader.tables(ordered=False):
             own = np.flatnonzero(table.channel == self._channel.id)
             if len(own):
-                yield segment, table.log_time[own], own
+                segments.append(segment)
+                times.append(table.log_time[own])
+                places.append(own)
+        counts = [len(own) for own in times[1:]]
+        return segments, counts, np.concatenate(times), np.concatenate(places)
 
-    def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64], NDArray[np.intp]]]:
-        """As `_by_pass`, with their rows among the topic's own messages of the chunk."""
+    def _by_index(self) -> _Messages:
+        """The topic's messages by their rows among its own in each chunk."""
         number = self._channel.id
         segments = [s for s in self.reader.segments if (s.channel_counts() or {}).get(number)]
         self.reader.expect(segments, indexes=True)
+        found, counts = [np.empty((0, 2), np.uint64)], []
         for segment in segments:
-            pairs = np.concatenate([p for c, p in self.reader.index(segment) if c == number])
-            pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
-            yield segment, pairs[:, 0], np.arange(len(pairs))
+            own = [pairs for channel, pairs in self.reader.index(segment) if channel == number]
+            found += own
+            counts.append(sum(map(len, own)))
+        pairs, first = np.concatenate(found), np.cumsum(counts) - counts
+        # In each chunk they stand by their offsets.
+        order = np.lexsort((pairs[:, 1], np.repeat(np.arange(len(counts)), counts)))
+        return segments, counts, pairs[order, 0], np.arange(len(pairs)) - np.repeat(first, counts)
 
 
 def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
