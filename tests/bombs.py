@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sqlite3
 import struct
@@ -186,9 +187,13 @@ def endless_index(folder: Path) -> Path:
 
 def huge_frames(folder: Path) -> Path:
     """A video of 64x48 whose frames are pictures of 16,384x16,384."""
+    return pngs(folder, png(16_384))
+
+
+def pngs(folder: Path, picture: bytes) -> Path:
+    """A video of 64x48 whose frames are a PNG."""
     import av
 
-    picture = png(16_384)
     with av.open(str(folder / "a.mp4"), "w") as container:
         stream = container.add_stream("png", rate=25)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "rgb24"
@@ -200,6 +205,13 @@ def huge_frames(folder: Path) -> Path:
             packet.time_base = stream.codec_context.time_base
             container.mux(packet)
     return folder / "a.mp4"
+
+
+def huge_pictures(folder: Path) -> Path:
+    """A video of 64x48 whose frames are whole pictures of 10,000x10,000."""
+    file = io.BytesIO()
+    Image.new("1", (10_000, 10_000)).save(file, "PNG", compress_level=1)
+    return pngs(folder, file.getvalue())
 
 
 def says_huge(folder: Path) -> Path:
@@ -252,6 +264,7 @@ CAMERAS: dict[str, Writing] = {
     "progressive JPEG": progressive,
     "video's index": endless_index,
     "video's frames": huge_frames,
+    "video's pictures": huge_pictures,
     "video's size": says_huge,
     "dataset's pictures": table_of_pictures,
     "dataset's episodes": table_of_episodes,

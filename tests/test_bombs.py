@@ -8,6 +8,7 @@ import resource
 from collections.abc import Callable
 from pathlib import Path
 
+import av
 import pytest
 from bombs import CAMERAS, METADATA, write_all
 from test_modules import learned
@@ -19,6 +20,7 @@ from cdmisfa.core.untrusted.memory import BUDGET, budget
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS
 from cdmisfa.experiments.sweep import sweep
+from recorder.cameras.video import most_pixels, video_camera
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
 from recorder.log.logfile import LogFile
@@ -81,6 +83,43 @@ def test_camera_logs(kind: str, bombs: dict[str, Path]) -> None:
     assert resource.getrlimit(resource.RLIMIT_DATA) == before
     assert [(10 < len(x) < 400, "\n" in x) for x in said] in ([(True, False)], [])
     assert bool(said) == (kind != "video's size")
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CAMERAS if kind.startswith("video")])
+def test_live_video(kind: str, bombs: dict[str, Path]) -> None:
+    said, shapes = [], []
+
+    def watch() -> None:
+        try:
+            for _, image in video_camera(f"av:{bombs[kind]}", "cam", timeout=5).pictures():
+                shapes.append(image.shape)
+        except CdmisfaError as error:
+            said.append(str(error))
+
+    assert growth(watch) + OWN < 512
+    assert shapes == ([(48, 64)] * 3 if kind == "video's size" else [])
+    if kind == "video's pictures":
+        assert "cam: images of 0x0, live ones of this kind have 1 to " in said[0]
+
+
+@pytest.mark.parametrize(
+    ("form", "codec", "most"),
+    [
+        ("yuv420p", "h264", 13_816_530),
+        ("yuv420p10le", "hevc", 6_908_265),
+        ("yuvj422p", "mjpeg", 36_000_000),
+        ("gbrp16le", "rawvideo", 36_000_000),
+    ],
+)
+def test_pictures_of_live_video_fit_into_the_budget(form: str, codec: str, most: int) -> None:
+    kind = av.codec.Codec(codec, "r")
+    assert most_pixels(av.VideoFormat(form), kind) == most
+
+
+def test_live_pictures_that_are_too_large_are_refused() -> None:
+    camera = video_camera("av:lavfi:color=size=8000x5000:rate=25", "cam", timeout=5)
+    with pytest.raises(CdmisfaError, match="cam: images of"):
+        next(camera.pictures())
 
 
 LISTS = b"[" + b"[]," * (1 << 21) + b"[]]"

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.frames import frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS, Bytes
 
@@ -24,6 +25,9 @@ LATE: Final = 60
 
 _TIMELESS: Final = 0x80
 """FFmpeg's flag of formats that hold no times (AVFMT_NOTIMESTAMPS): it makes some up, at 25 Hz."""
+
+HELD: Final = 17
+"""Pictures that a decoder holds at most, where they are made from one another: 16 and its own."""
 
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
@@ -68,38 +72,59 @@ class VideoCamera:
 
     def pictures(self) -> Iterator[tuple[int, Bytes]]:
         """See `Camera`."""
-        options = {"rtsp_transport": "tcp"} if self._address.startswith("rtsp") else {}
-        if self._remote:
-            options["fflags"] = "nobuffer"
-        try:
-            container = self._av.open(
-                self._address,
-                format=self._form,
-                options=options,
-                timeout=self._timeout if self._remote else None,
-            )
-        except (OSError, ValueError, self._av.FFmpegError) as error:
-            shown = _SECRET.sub("", self._word)
-            raise CdmisfaError(f"{shown} cannot be opened: {_reason(error)}") from None
-        with container:
+        with self._open() as container:
             if not container.streams.video:
                 raise CdmisfaError(f"{_SECRET.sub('', self._word)}: there is no video in it")
             video = container.streams.video[0]
             context = video.codec_context
-            if not 0 < context.width * context.height <= MAX_PIXELS:
-                raise CdmisfaError(f"{self.name}: images of {context.width}x{context.height}")
+            self._check(context, context.codec)
+            context.options = {"max_pixels": str(most_pixels(context.format, context.codec))}
             context.thread_count = 1  # of several cameras, each has a thread
             timed = not (self._remote and container.format.flags & _TIMELESS)
             stated = timed and (video.average_rate or video.guessed_rate)
             self.rate = float(stated) if stated else None
             try:
-                yield from self._paced(container.decode(video), timed=timed)
+                yield from self._paced(container.decode(video), context.codec, timed=timed)
             except (OSError, ValueError, self._av.FFmpegError) as error:
                 raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
 
-    def _paced(self, frames: Iterator[Any], *, timed: bool) -> Iterator[tuple[int, Bytes]]:
+    def _open(self) -> Any:
+        """Open it within the budget; what decodes it later does so beside others, without one."""
+        options = {"max_pixels": str(MAX_PIXELS)}
+        if self._address.startswith("rtsp"):
+            options["rtsp_transport"] = "tcp"
+        if self._remote:
+            options["fflags"] = "nobuffer"
+        try:
+            with budget():
+                return self._av.open(
+                    self._address,
+                    format=self._form,
+                    options=options,
+                    timeout=self._timeout if self._remote else None,
+                )
+        except (OSError, ValueError, MemoryError, self._av.FFmpegError) as error:
+            reason = _reason(error)
+            if isinstance(error, MemoryError):
+                reason = f"it takes more than {BUDGET >> 20} MiB of memory, the limit"
+            shown = _SECRET.sub("", self._word)
+            raise CdmisfaError(f"{shown} cannot be opened: {reason}") from None
+
+    def _check(self, shown: Any, codec: Any) -> None:
+        """Refuse pictures, of what states a width, a height and a format, that take too much."""
+        most = most_pixels(shown.format, codec)
+        if not 0 < shown.width * shown.height <= most:
+            raise CdmisfaError(
+                f"{self.name}: images of {shown.width}x{shown.height}, live ones of this kind have "
+                f"1 to {most} pixels"
+            )
+
+    def _paced(
+        self, frames: Iterator[Any], codec: Any, *, timed: bool
+    ) -> Iterator[tuple[int, Bytes]]:
         steady = Steady()
         for frame in frames:
+            self._check(frame, codec)
             presented = frame.time if timed else None
             early = steady.early(time.monotonic(), presented)
             if early > 0 and not self._remote:
@@ -109,6 +134,18 @@ class VideoCamera:
     def describe(self) -> Mapping[str, Any]:
         """The word, without what may be a password."""
         return {"camera": _SECRET.sub("", self._word)}
+
+
+def most_pixels(form: Any, codec: Any) -> int:
+    """Most pixels of a live picture, so that those its decoder holds fit into the budget.
+
+    Args:
+        form: PyAV's format of its pixels; None where it is not known yet.
+        codec: PyAV's codec.
+    """
+    held = 1 if codec.intra_only else HELD
+    bits = form.padded_bits_per_pixel if form is not None else 8
+    return min(MAX_PIXELS, BUDGET * 8 // (held * bits))
 
 
 class Steady:
