@@ -40,12 +40,10 @@ size_option = click.option(
     "and no more pixels than 128x48.",
 )
 
-fit_option = click.option(
+fit_option = options.one_of(
     "--fit",
-    type=click.Choice(["crop", "pad", "stretch"]),
-    default="crop",
-    show_default=True,
-    help="Where images have another ratio of the sides than --size: cut two sides, put black "
+    ("crop", "pad", "stretch"),
+    "Where images have another ratio of the sides than --size: cut two sides, put black "
     "at them, or change the ratio.",
 )
 
@@ -144,12 +142,10 @@ camera_options = options.together(
         "last image at each time. By default they are refused.",
     ),
     rate_option,
-    click.option(
+    options.one_of(
         "--gaps",
-        type=click.Choice(["skip", "hold"]),
-        default="skip",
-        show_default=True,
-        help="Where a camera paused for more than ten of its steps: skip it, so that nothing is "
+        ("skip", "hold"),
+        "Where a camera paused for more than ten of its steps: skip it, so that nothing is "
         "learned across, or hold the last image.",
     ),
     click.option(
@@ -165,12 +161,10 @@ camera_options = options.together(
     ),
     range_option,
     color_option,
-    click.option(
+    options.one_of(
         "--stamp",
-        type=click.Choice(["log", "header"]),
-        default="log",
-        show_default=True,
-        help="When a message is of: when it was logged, or the time in its header.",
+        ("log", "header"),
+        "When a message is of: when it was logged, or the time in its header.",
     ),
     click.option(
         "--dry-run",
@@ -180,29 +174,18 @@ camera_options = options.together(
 )
 
 live_options = options.together(
-    click.option(
+    options.seconds(
         "--hold",
-        type=click.FloatRange(0, 1e6),
-        default=0.25,
-        show_default=True,
-        metavar="SECONDS",
-        help="How long a camera's picture stands for those that are missing; then it has a gap.",
+        0.25,
+        "How long a camera's picture stands for those that are missing; then it has a gap.",
+        least=0,
     ),
-    click.option(
+    options.one_of(
         "--lost",
-        type=click.Choice(["reconnect", "wait", "end"]),
-        default="reconnect",
-        show_default=True,
-        help="What to do about a camera that stalls or goes away.",
+        ("reconnect", "wait", "end"),
+        "What to do about a camera that stalls or goes away.",
     ),
-    click.option(
-        "--stall",
-        type=click.FloatRange(0.1, 1e6),
-        default=5.0,
-        show_default=True,
-        metavar="SECONDS",
-        help="A camera without a picture for so long has stalled.",
-    ),
+    options.seconds("--stall", 5.0, "A camera without a picture for so long has stalled."),
 )
 
 

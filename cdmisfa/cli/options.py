@@ -96,6 +96,30 @@ def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command
     return lambda command: functools.reduce(lambda c, option: option(c), reversed(each), command)
 
 
+def one_of(
+    name: str, values: Sequence[str], meaning: str, *, argument: str | None = None
+) -> Callable[[Command], Command]:
+    """An option that is one of some values, by default the first.
+
+    Args:
+        name: of the option.
+        values: all there are.
+        meaning: for --help.
+        argument: name of the command's argument; by default the option's.
+    """
+    kind, named = click.Choice(list(values)), (name,) if argument is None else (name, argument)
+    return click.option(*named, type=kind, default=values[0], show_default=True, help=meaning)
+
+
+def seconds(
+    name: str, default: float, meaning: str, *, least: float = 0.1, **how: Any
+) -> Callable[[Command], Command]:
+    """An option that is how long something may take."""
+    kind = click.FloatRange(least, 1e6)
+    told = {"metavar": "SECONDS", "help": meaning, **how}
+    return click.option(name, type=kind, default=default, show_default=True, **told)
+
+
 def _limit(option: str, name: str, default: float, meaning: str) -> Callable[[Command], Command]:
     """An option for one of the `Limits`, which hold while the command runs."""
 
@@ -104,17 +128,7 @@ def _limit(option: str, name: str, default: float, meaning: str) -> Callable[[Co
 
         ctx.with_resource(limited(dataclasses.replace(limits(), **{name: value})))
 
-    return click.option(
-        option,
-        type=click.FloatRange(0.1, 1e6),
-        default=default,
-        show_default=True,
-        metavar="SECONDS",
-        callback=hold,
-        is_eager=True,
-        expose_value=False,
-        help=meaning,
-    )
+    return seconds(option, default, meaning, callback=hold, is_eager=True, expose_value=False)
 
 
 server_limits = together(
@@ -130,12 +144,10 @@ server_limits = together(
 """How long the servers of URLs are waited for; a command with a URL among its arguments has it."""
 
 engine = together(
-    click.option(
+    one_of(
         "--engine",
-        type=click.Choice(["local", "dask"]),
-        default="local",
-        show_default=True,
-        help="Where to compute.",
+        ("local", "dask"),
+        "Where to compute.",
     ),
     click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler that runs."),
 )

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.catalogue import ALL
@@ -92,25 +93,8 @@ def open_cameras(
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> ForeignSource:
     """Open the camera logs of others as streams on one clock; see `ForeignSource`."""
-    return ForeignSource(
-        paths,
-        cameras.topics,
-        size=cameras.size,
-        fit=cameras.fit,
-        align=cameras.align,
-        gaps=cameras.gaps,
-        start=cameras.start,
-        stop=cameras.stop,
-        depth=cameras.depth,
-        fields=cameras.fields,
-        time=cameras.time,
-        stamp=cameras.stamp,
-        color=cameras.color,
-        rate=cameras.rate,
-        loop=loop,
-        salvage=salvage,
-        goal=goal,
-    )
+    chosen: dict[str, Any] = {each.name: getattr(cameras, each.name) for each in fields(cameras)}
+    return ForeignSource(paths, **chosen, loop=loop, salvage=salvage, goal=goal)
 
 
 def holds_run(path: Path) -> bool:

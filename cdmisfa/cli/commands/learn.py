@@ -66,14 +66,7 @@ TICK = 0.1
 @click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 @click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
-@click.option(
-    "--follow-timeout",
-    type=click.FloatRange(0.1, 1e6),
-    default=60.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="With --follow, give up when no frame came for so long.",
-)
+@options.seconds("--follow-timeout", 60.0, "With --follow, give up when no frame came for so long.")
 @click.option(
     "--record",
     "record_to",

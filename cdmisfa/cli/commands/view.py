@@ -147,13 +147,10 @@ def _view_sweep(
 
 @click.command("play")
 @options.fetched_argument("recording", nargs=-1)
-@click.option(
-    "--to",
-    "target",
-    type=click.Choice(["rerun", "foxglove"]),
-    default="rerun",
-    show_default=True,
-    help="To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
+@options.one_of(
+    *("--to", ("rerun", "foxglove")),
+    "To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
+    argument="target",
 )
 @click.option(
     "--rate",
