@@ -205,6 +205,54 @@ def test_what_is_learned_live_is_learned_again_from_the_recording(
     ]
 
 
+@pytest.mark.parametrize("config", CONFIGS, ids=["curious", "progress"])
+def test_a_recording_of_cameras_is_learned_from_while_it_is_written(
+    tmp_path: Path, config: Any
+) -> None:
+    folder, followed = tmp_path / "rec", []
+    recorded = RecordedWhileWatched(opened(rough(), 3), folder)
+
+    def follow() -> None:
+        with contextlib.closing(FollowedSource(folder, timeout=30)) as source:
+            grows.set()
+            followed.append((learned(source, config), source.finished))
+
+    grows, thread = threading.Event(), threading.Thread(target=follow)
+
+    def progress(done: float) -> None:
+        if done == 200:
+            thread.start()
+            assert grows.wait(30)  # frames come while it learns
+        elif done > 200:
+            time.sleep(2e-4)
+
+    record_watched(recorded, progress=progress)
+    thread.join()
+    with contextlib.closing(RecordedSource(folder)) as source:
+        again = learned(source, config)
+    assert followed[0][0].signals_sha256 == again.signals_sha256
+    assert again.iterations > 20
+
+
+def test_a_gap_of_a_followed_recording_is_known_once_a_later_frame_came(tmp_path: Path) -> None:
+    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
+    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+    record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
+    with contextlib.closing(FollowedSource(tmp_path / "rec")) as followed:
+        whole = RecordedSource(tmp_path / "rec")
+        for n in (20, 40, 30):
+            for one, two in zip(followed.take_all(n), whole.take_all(n), strict=True):
+                same(one, two)
+        followed.seek(20)
+        assert followed.take(0, 20).t == 60
+        followed.seek(0)
+        finished = tmp_path / "rec" / "left.mcap"
+        finished.rename(f"{finished}.partial")
+        followed._timeout = 0.2
+        with pytest.raises(LogExhaustedError, match="did not come within"):
+            followed.take_all(91)
+
+
 def test_a_live_run_that_ends_within_a_block_is_checked_by_its_recording(
     tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
@@ -413,8 +461,6 @@ def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Pat
     names = sorted(path.name for path in (tmp_path / "png" / "left").iterdir())
     assert (names[30], names[31]) == ("00000030.png", "00000060.png")
     assert export(tmp_path / "rec", tmp_path / "robot", "lerobot") == 90 - 29
-    with pytest.raises(UsageError, match="a recording of cameras cannot be followed"):
-        FollowedSource(tmp_path / "rec")
     with contextlib.closing(RecordedSource(tmp_path / "rec", loop=True)) as looped:
         looped.seek(85)
         block = looped.take(0, 10)

@@ -69,12 +69,8 @@ class FollowedSource(ClockedSource):
         self._seen: object = None
         self._source: RecordedSource | None = None
         self._identity: object = None
-        self._wait(0, "frame 0")
-        if self._now.gaps:
-            raise UsageError(
-                f"{path}: a recording of cameras cannot be followed: learn from the cameras with "
-                "--record, or from the recording when it is finished"
-            )
+        self._wait(lambda: self._reaches(0), "frame 0")
+        self.gaps = self._now.gaps
         self._t = self._now.t
         self._spec = replace(self._now.spec, length=None)
 
@@ -91,6 +87,9 @@ class FollowedSource(ClockedSource):
     def take(self, stream: int, n: int) -> Block:
         """The n frames that a view shows at t .. t+n-1, waited for; moves t by n.
 
+        With gaps the next n that follow one another; moves t behind them. Each file holds its
+        view's frames in their order, so that later ones change nothing about that.
+
         Raises:
             LogExhaustedError: the recording ended, or its recorder is gone; t stays.
             LogDamagedError: a chunk is damaged; t stays.
@@ -98,13 +97,35 @@ class FollowedSource(ClockedSource):
             ValueError: no such stream, or n < 1.
         """
         check_request(self._spec, stream, n)
-        self._wait(self._t + n, f"frame {self._t + n - 1}")
+        self._wait(lambda: self._shows(stream, n), f"frame {self._t + n - 1}")
         self._now.seek(self._t)
         block = self._now.take(stream, n)
-        self._blocks.append((stream, self._t, n))
-        _add(self._sha256, block)
-        self._t += n
+        self._note(block)
+        self._t = block.t + n
         return block
+
+    def take_all(self, n: int) -> tuple[Block, ...]:
+        """What every view shows in the next n frames, a block for each unbroken stretch.
+
+        A frame that a view lacks is known to be of a gap once it has a later one.
+
+        Raises:
+            As for `take`.
+        """
+        if not self.gaps:
+            return super().take_all(n)
+        check_request(self._spec, 0, n)
+        self._wait(lambda: self._all_reach(self._t + n), f"frame {self._t + n - 1}")
+        self._now.seek(self._t)
+        blocks = self._now.take_all(n)
+        for block in blocks:
+            self._note(block)
+        self._t += n
+        return blocks
+
+    def spans(self, stream: int, start: int, stop: int) -> list[tuple[int, int]]:
+        """See `SeekableSource`; of a view with gaps those that are there by now."""
+        return self._now.spans(stream, start, stop)
 
     def seek(self, t: int) -> None:
         """Move the clock to frame t, waiting until it is there.
@@ -114,7 +135,7 @@ class FollowedSource(ClockedSource):
             ReplacedError: another recording took its place.
             ValueError: t lies before the recording's first frame.
         """
-        self._wait(t, f"frame {t}")
+        self._wait(lambda: self._reaches(t), f"frame {t}")
         self._now.seek(t)
         self._t = t
 
@@ -143,16 +164,35 @@ class FollowedSource(ClockedSource):
         source = self._source
         return source is not None and source.first_frame + source.frames >= end
 
-    def _wait(self, end: int, what: str) -> None:
-        """Look at the files until an end is reached, they are finished or nothing comes."""
-        if self._reaches(end):
+    def _shows(self, stream: int, n: int) -> bool:
+        """Whether the next n frames of a view that follow one another are there."""
+        if not self.gaps:
+            return self._reaches(self._t + n)
+        source = self._now
+        end = source.first_frame + source.frames
+        there = source.spans(stream, self._t, end) if self._t < end else []
+        return any(high - low >= n for low, high in there)
+
+    def _all_reach(self, end: int) -> bool:
+        """Whether every view has a frame right before an end, or behind."""
+        source, views = self._now, range(len(self._spec.streams))
+        last = source.first_frame + source.frames
+        return end <= last and all(source.spans(view, end - 1, last) for view in views)
+
+    def _note(self, block: Block) -> None:
+        self._blocks.append((block.stream, block.t, len(block)))
+        _add(self._sha256, block)
+
+    def _wait(self, there: Callable[[], bool], what: str) -> None:
+        """Look at the files until something is there, they are finished or nothing comes."""
+        if there():
             return
         deadline = time.monotonic() + self._timeout
         while not self.stop():
             finished = self.finished
             before = self._frames()
             error = self._look()
-            if self._reaches(end):
+            if there():
                 return
             if finished:
                 if error is not None:
