@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import foxglove.messages
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf import CameraCalibration_pb2, FrameTransforms_pb2, SceneUpdate_pb2
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.json_format import MessageToDict
+from mcap.reader import make_reader
 from rerun.chunk import McapReader
 
 from cdmisfa.core.config import as_table
@@ -105,3 +109,38 @@ def test_rerun_reads_cameras_and_frames_without_us(recorded):
     assert "Pinhole:image_from_camera" in read["/calibration/left/left_eye"]
     assert {"Transform3D:quaternion", "Transform3D:child_frame"} <= read["/tf"]
     assert "/scene" in read
+
+
+def class_of(schema_name, descriptors):
+    """A message's class from a schema alone, apart from every one that this process knows."""
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
+        pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema_name))
+
+
+@pytest.mark.parametrize(
+    ("topic", "published"),
+    [
+        ("/view/left", foxglove.messages.RawImage),
+        ("/calibration/left/left_eye", foxglove.messages.CameraCalibration),
+        ("/tf", foxglove.messages.FrameTransforms),
+        ("/scene", foxglove.messages.SceneUpdate),
+    ],
+)
+def test_foxglove_s_own_reader_and_schemas_decode_every_message(recorded, topic, published):
+    """By the schema of the channel, and by the one that Foxglove's SDK publishes, to the same."""
+    schema = published.get_schema()
+    newest, count = class_of(schema.name, schema.data), 0
+    with (recorded / "left.mcap").open("rb") as file:
+        for own, channel, message in make_reader(file).iter_messages([topic]):
+            assert (own.name, own.encoding) == (schema.name, schema.encoding)
+            assert channel.message_encoding == "protobuf"
+            by_own = class_of(own.name, own.data).FromString(message.data)
+            by_newest = newest.FromString(message.data)
+            assert MessageToDict(by_own) == MessageToDict(by_newest) != {}
+            for read in (by_own, by_newest):
+                read.DiscardUnknownFields()
+                assert read.SerializeToString(deterministic=True) == message.data
+            count += 1
+    assert count == (FRAMES if topic in ("/view/left", "/scene") else 3)
