@@ -38,7 +38,7 @@ COMPARED = {"by 2.0": ("seed0", "seed1", "seed2"), "by progress": ("progress", "
 """Runs that are laid over one another."""
 
 VIEWS = {
-    "view": ("icub", "World", "--at", "25540"),
+    "view": ("icub", "World", "--at", "51990"),
     "oscillatory": ("seed0", "Overview"),
     "abstraction": ("icub", "Abstraction"),
     "gate": ("icub", "Gate"),
