@@ -18,6 +18,7 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.cli import run
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
+from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.recompute.check import check_run, learner_after
 from cdmisfa.experiments.recompute.forks import fork_run
 from cdmisfa.experiments.sources import open_source
@@ -239,7 +240,15 @@ def test_at_prints_all_of_the_memory(place: Path, tmp_path: Path, cdmisfa: Cdmis
             printed = np.array(found["arrays"][name], float).reshape(array.shape)
             assert np.array_equal(printed, array, equal_nan=True), name
     done = cdmisfa("at", run, 50, "--save-module", early)
-    assert done.code == 0
+    policy = ", ".join(
+        f"{name} {ACTIONS[action]}"
+        for name, action in zip(learner.spec.streams, found["final_policy"], strict=True)
+    )
+    assert (done.code, f"policy: {policy}" in done.out.splitlines()) == (0, True)
+    assert f"memory: {len(found['arrays'])} arrays, " in done.out
+    said = cdmisfa("at", place / "progress-live", 50).out.splitlines()
+    state = cdmisfa("at", place / "progress-live", 50, "--json").json["streams"]
+    assert [line.partition(":")[0] for line in said[2:-1]] == [one["stream"] for one in state]
     (module,) = load_modules(early)
     assert np.array_equal(module.phi, learner.phi)
     assert cdmisfa("at", run, 50, "--save-module", early).code == 2
@@ -364,6 +373,7 @@ def test_compare_says_what_differs_and_shows_both(
     other = cdmisfa("compare", parent, place / "progress-live").out
     assert "learner.algorithm 2.0 against progress; " in other
     assert "; only one of them says learner.agreement, learner.alpha" in other
+    assert other.splitlines()[1].endswith(" more")
     assert "None against" not in other
     same = cdmisfa("compare", parent, place / "2.0-live-resumed", "--json").json
     assert (same["signals"], same["identical"]) == ({}, True)

@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 from run_data import VECTOR, write_run
 
 from cdmisfa.core.errors import UsageError
-from replay.runs.compare import side_by_side
+from replay.runs.compare import Difference, side_by_side
 from replay.view import overlay
 from replay.view.overlay import build_overlay
 
@@ -73,6 +73,33 @@ def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
     np.testing.assert_allclose(
         np.power(10, found), [np.ravel(getattr(r, name))[0] for r in records]
     )
+
+
+@pytest.mark.parametrize("stretch", [500, 2])
+def test_where_a_fork_begins_is_marked_on_each_curve(stretch, three, tmp_path, monkeypatch):
+    """Also on one of which nothing is known in that iteration."""
+    runs, (records, *_) = three
+    monkeypatch.setattr("replay.runs.stretches.ITERATIONS", stretch)
+    monkeypatch.setattr("replay.runs.log.RunHeader.forked_at", 5)
+    build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
+    marks = 0
+    for chunk in RrdReader(str(tmp_path / "all.rrd")).stream():
+        if chunk.is_static or "/1_run/forked/learning_error_of/" not in chunk.entity_path:
+            continue
+        batch = chunk.to_record_batch()
+        stream = int(chunk.entity_path.split("/")[-1][0]) - 1
+        own = [(s.iteration, s.learning_error) for s in records if s.stream == stream]
+        at, shown = batch["iteration"].to_pylist(), batch["Scalars:scalars"].to_pylist()
+        expected = np.interp(at, *zip(*own, strict=True))
+        np.testing.assert_allclose(np.ravel(shown), expected, rtol=1e-12)
+        assert at == [5 if own[0][0] <= 5 else own[0][0]]
+        marks += 1
+    assert marks == 3
+
+
+def test_runs_that_are_the_same_until_one_ends_are_said_to_be():
+    found = Difference(5, "", (), "ended after 5 iterations", "goes on")
+    assert overlay._shortly(found) == "identical as far as both go, 5 iterations"
 
 
 def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):

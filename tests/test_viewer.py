@@ -164,7 +164,7 @@ def test_a_moment_is_a_frame_an_iteration_or_an_event(cdmisfa: Cdmisfa, tmp_path
     for wrong, said in (
         ("999999", "the last of"),
         ("iteration 999999", "the last of"),
-        ("module 7", "there are stream x"),
+        ("module 7", "; events: stream x"),
         ("odule 1", "no frame, iteration or event"),
     ):
         with pytest.raises(UsageError, match=said):

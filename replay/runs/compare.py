@@ -25,6 +25,9 @@ FEW_VALUES = 4
 LONGEST = 60
 """Letters of a value that runs were told."""
 
+MOST_ALONE = 5
+"""Keys that are named of those which only one of two runs was told, as runs of two learners are."""
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -55,7 +58,7 @@ class Difference:
 
     def _place(self) -> str:
         if not self.signal:
-            return f"iteration {self.iteration}: {self.first} against {self.second}"
+            return f"iteration {self.iteration}: the first {self.first}, the second {self.second}"
         place = f"[{', '.join(map(str, self.place))}]" if self.place else ""
         where = f"iteration {self.iteration}: {self.signal}{place}"
         return f"{where} is {self.first} against {self.second}"
@@ -252,7 +255,9 @@ class Row:
             both = [(key, a, b) for key, a, b in self.told if a is not None and b is not None]
             what = [f"{key} {_short(a)} against {_short(b)}" for key, a, b in both]
             if alone := [key for key, a, b in self.told if a is None or b is None]:
-                what.append(f"only one of them says {', '.join(alone)}")
+                more = f" and {len(alone) - MOST_ALONE} more" if len(alone) > MOST_ALONE else ""
+                named = ", ".join(alone[:MOST_ALONE])
+                what.append(f"only one of them says {named}{more}")
             found.append(f"{self.name} was told otherwise: {'; '.join(what)}")
         if self.otherwise:
             why = "; ".join(self.otherwise)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import rerun as rr
@@ -41,6 +41,9 @@ FIRST_TAB = ("eta_dot", "epsilon")
 R_STAY = "R_stay"
 
 OF_STREAM, ERROR_OF = "learning_error_of", "Learning error of"
+
+Point = tuple[int, NDArray[np.float64]]
+"""An iteration, and the values of a curve there."""
 
 FORKED = "forked"
 """Entities of the points where forks begin."""
@@ -104,7 +107,7 @@ def _fork(row: Row) -> str:
     changed = ancestry.get("changed")
     told = changed.items() if isinstance(changed, Mapping) else ()
     what = "".join(f"; {key} {old} became {new}" for key, (old, new) in told)
-    parent, at = ancestry.get("parent"), header.forked_at
+    parent, at = PurePath(str(ancestry.get("parent"))).name, header.forked_at
     return f"{row.name} is a fork of {parent} after {at} iterations{what}"
 
 
@@ -113,6 +116,8 @@ def _shortly(difference: Difference | None) -> str:
         return "identical"
     if difference.iteration < 0:
         return f"{difference.first} against {difference.second}, else identical"
+    if not difference.signal:
+        return f"identical as far as both go, {difference.iteration} iterations"
     return f"differs from iteration {difference.iteration}, first in {difference.signal}"
 
 
@@ -120,16 +125,20 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
     header = row.outline.header
     shown = row.outline.streams(MOST_STREAMS)
     lines: dict[str, Column] = {}
-    fork, marked = row.outline.header.forked_at, set[str]()
+    fork, marked, last = row.outline.header.forked_at, set[str](), dict[str, Point]()
     for columns in read_columns(run, header):
         for entity, kept, values in _curves(columns, header.spec.streams, shown):
-            later = np.flatnonzero(kept & (columns.iterations >= fork))
-            if fork and len(later) and entity not in marked:
-                marked.add(entity)
-                first = np.searchsorted(np.flatnonzero(kept), later[0])
-                value, color = values.reshape(int(kept.sum()), -1)[first], colour(number)
-                _mark(recording, f"{root}/{FORKED}/{entity}", row.name, color, fork, value)
             path, rows = f"{root}/{entity}", values.reshape(int(kept.sum()), -1)
+            if fork and entity not in marked and len(rows):
+                at = columns.iterations[kept]
+                first = int(np.searchsorted(at, fork))
+                if first < len(at):
+                    before = (int(at[first - 1]), rows[first - 1]) if first else last.get(entity)
+                    there = _between(before, (int(at[first]), rows[first]), fork)
+                    place, color = f"{root}/{FORKED}/{entity}", colour(number)
+                    _mark(recording, place, row.name, color, *there)
+                    marked.add(entity)
+                last[entity] = int(at[-1]), rows[-1]
             if path not in lines:
                 width = rows.shape[1]
                 names, rgbs = [row.name] * width, [colour(number)] * width
@@ -137,6 +146,14 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
             lines[path].add(columns.frames[kept], columns.iterations[kept], rows)
     for line in lines.values():
         line.flush()
+
+
+def _between(before: Point | None, after: Point, iteration: int) -> Point:
+    """The point of a curve at an iteration, or the next one that there is."""
+    if before is None or iteration == after[0] or np.isnan(before[1]).any():
+        return after
+    share = (iteration - before[0]) / (after[0] - before[0])
+    return iteration, before[1] + share * (after[1] - before[1])
 
 
 def _mark(

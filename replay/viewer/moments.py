@@ -59,7 +59,7 @@ def _of_event(run: Path, words: str) -> int:
                 return int(event.t)
             told.append(event.text)
     some = "; ".join(told[:TOLD]) or "none"
-    raise UsageError(f"--at {words!r} is no frame, iteration or event of {run}: there are {some}")
+    raise UsageError(f"--at {words!r} is no frame, iteration or event of {run}; events: {some}")
 
 
 def _last_frame(path: Path) -> int:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.learn import Reporter, show
+from cdmisfa.cli.commands.learn import Reporter, outcome_line, show
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar, compiling_said
 from cdmisfa.core.errors import NotReproducedError, UsageError
@@ -52,6 +52,7 @@ def at_command(
     the run learned from. Right after a keyframe no source is needed. --json prints all of
     its memory.
     """
+    from cdmisfa.core.signals import ACTIONS
     from cdmisfa.experiments.recompute.check import learner_after
     from cdmisfa.experiments.runs import module_table
     from replay.runs.folders import run_log
@@ -78,9 +79,14 @@ def at_command(
     click.echo(f"after {iterations} iterations: frame {t}, next {streams[learner.stream]}")
     learned = ", ".join(f"{m.index} {m.stream}" for m in learner.modules)
     click.echo(f"modules: {learned or 'none'}")
-    rows = [(name, f"{a.dtype}", "x".join(map(str, a.shape))) for name, a in state.arrays.items()]
-    plain = [(name, kind, shape) for name, kind, shape in rows if not kind.startswith("[")]
-    options.print_table(("memory", "type", "shape"), plain)
+    summary = learner.summary()
+    for outcome in summary.get("streams", ()):
+        click.echo(outcome_line(outcome))
+    if "streams" not in summary and "final_policy" in summary:
+        policy = zip(streams, summary["final_policy"], strict=True)
+        click.echo(f"policy: {', '.join(f'{name} {ACTIONS[action]}' for name, action in policy)}")
+    size = sum(array.nbytes for array in state.arrays.values()) / 1000
+    click.echo(f"memory: {len(state.arrays)} arrays, {size:.1f} kB; --json prints all of it")
     if save_module is not None:
         click.echo(f"module written to {save_module}")
 
