@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks import (
     history,
+    iteration,
     kernels,
     learn,
     long_recordings,
@@ -57,6 +58,15 @@ def test_learn(tmp_path: Path) -> None:
     assert set(times) == set(learn.CLOCKS)
     assert 0 < times["learning thread"] <= times["all threads"] + 1000
     assert {"run.mcap", "run.rrd"} <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_the_parts_of_an_iteration_are_no_more_than_the_whole() -> None:
+    times = iteration.measured(1, 3)
+    for whole, parts in (("all", iteration.PARTS), ("log", iteration.LOG_PARTS)):
+        rows = iteration.table(times, whole, list(parts))
+        assert [row[0] for row in rows] == [*parts, "all else", "together"]
+        assert all(row[1] > 0 for row in rows)
+        assert sum(row[1] for row in rows[:-1]) == pytest.approx(rows[-1][1], abs=1)
 
 
 def test_the_page_refuses_a_run_that_contradicts_itself(results: Path) -> None:
