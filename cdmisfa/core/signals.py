@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -334,20 +334,13 @@ def canonical_bytes(signals: BlockSignals, version: int = SCHEMA_VERSION) -> byt
     """The bytes that stand for a record, as a version has it, wherever runs are compared."""
     fields = _fields(version)
     values = fields.values(signals)
-    arrays = [(place, values[place]) for place in fields.arrays]
-    floats = np.concatenate([a.reshape(-1) for _, a in arrays if a.dtype.kind == "f"])
+    plan = _plan(version, tuple([values[place].shape for place in fields.arrays]))
+    data = bytearray(b"".join([values[part.place].tobytes() for part in plan.parts]))
+    floats = np.frombuffer(data, "<f8", plan.floats)
     floats[np.isnan(floats)] = math.nan
-    data, at, lengths = floats.tobytes(), 0, []
-    for place, array in arrays:
-        if array.dtype.kind == "f":
-            elements = data[at : at + array.nbytes]
-            at += array.nbytes
-        else:
-            elements = array.tobytes()
-        values[place] = _sizes(array.shape) + elements
-        lengths.append(len(values[place]))
-    layout = _layout(version, tuple(lengths))
-    return layout.pack(*(x if x == x else math.nan for x in values))
+    for part in plan.parts:
+        values[part.place] = part.sizes + data[part.start : part.stop]
+    return plan.layout.pack(*[x if x == x else math.nan for x in values])
 
 
 @cache
@@ -355,16 +348,41 @@ def _fields(version: int) -> Fields:
     return Fields(s for s in SIGNALS.values() if s.since <= version)
 
 
-@lru_cache
-def _sizes(shape: tuple[int, ...]) -> bytes:
-    return struct.pack(f"<{len(shape)}q", *shape)
+class _Part(NamedTuple):
+    """An array of a record: its place, its shape as bytes, and where its elements stand."""
+
+    place: int
+    sizes: bytes
+    start: int
+    stop: int
+
+
+class _Plan(NamedTuple):
+    """How the bytes lie of records whose arrays have some shapes.
+
+    Attributes:
+        layout: of all fields.
+        parts: the arrays, in the order of their elements: those of float64 first.
+        floats: how many these are together.
+    """
+
+    layout: struct.Struct
+    parts: tuple[_Part, ...]
+    floats: int
 
 
 @lru_cache
-def _layout(version: int, lengths: tuple[int, ...]) -> struct.Struct:
-    """How the bytes lie in records of a version whose arrays take so many, sizes included."""
-    left = iter(lengths)
-    fields = _fields(version).signals
-    return struct.Struct(
-        "<" + "".join(f"{next(left)}s" if s.dims else CODES[s.dtype] for s in fields)
-    )
+def _plan(version: int, shapes: tuple[tuple[int, ...], ...]) -> _Plan:
+    fields = _fields(version)
+    formats = [CODES[signal.dtype] for signal in fields.signals]
+    parts: list[_Part] = []
+    stop = floats = 0
+    places = list(zip(fields.arrays, shapes, strict=True))
+    for place, shape in sorted(places, key=lambda pair: formats[pair[0]] != "d"):
+        start, stop = stop, stop + 8 * math.prod(shape)
+        if formats[place] == "d":
+            floats = stop // 8
+        parts.append(_Part(place, struct.pack(f"<{len(shape)}q", *shape), start, stop))
+    for part in parts:
+        formats[part.place] = f"{len(part.sizes) + part.stop - part.start}s"
+    return _Plan(struct.Struct("<" + "".join(formats)), tuple(parts), floats)
