@@ -24,6 +24,7 @@ from recorder.images.decoding import message_decoder
 from recorder.images.fields import Field, numbers_of
 from recorder.images.reading import MessageKind
 from recorder.log.messages import descriptor_set
+from replay.camera_logs.formats.table import MAX_ROWS
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 
@@ -326,6 +327,13 @@ def test_a_table_that_is_none_is_damaged(tmp_path: Path) -> None:
     for name in ("t.parquet", "t.csv"):
         with pytest.raises(LogDamagedError, match="PyArrow cannot read it"):
             ForeignSource(tmp_path / name, rate=5)
+
+
+def test_a_few_bytes_that_are_many_rows_are_refused(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "t.parquet", {"a": np.zeros(MAX_ROWS + 1, bool)})
+    assert path.stat().st_size < 100_000
+    with pytest.raises(LogDamagedError, match="4194305 rows are too many for its few bytes"):
+        ForeignSource(path, rate=5)
 
 
 class TestTable(SourceContract):

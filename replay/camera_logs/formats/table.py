@@ -26,6 +26,9 @@ TABLES: Final = (".csv", ".parquet")
 MAX_BYTES: Final = 1024**3
 """Largest file that is read as a table, which is held in memory."""
 
+MAX_ROWS: Final = 4 * 1024**2
+"""Most rows of a file with fewer bytes than rows: each has a place on the clock, too."""
+
 UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 """What a column of times may count, in nanoseconds."""
 
@@ -73,14 +76,16 @@ class TableNumbers(ImageStream):
             whole &= times >= 0
             times = times[whole]
         self._places = np.flatnonzero(whole)
-        self._numbers = numbers[whole]
+        self._numbers = numbers if whole.all() else numbers[whole]
         self.fields = tuple(names)
         if not len(self._numbers):
             raise UsageError(f"{path}: there is no row with all of {', '.join(names)}")
         if len(times):
-            order = np.argsort(times, kind="stable")
-            self.times = sorted_times(str(path), times[order].astype(np.uint64))
-            self._numbers, self._places = self._numbers[order], self._places[order]
+            if (np.diff(times) < 0).any():
+                order = np.argsort(times, kind="stable")
+                times = times[order]
+                self._numbers, self._places = self._numbers[order], self._places[order]
+            self.times = sorted_times(str(path), times.astype(np.uint64))
         else:
             self.times = np.empty(0, np.uint64)
         left = len(whole) - len(self._numbers)
@@ -129,6 +134,8 @@ def _table(path: Path) -> Any:
             import pyarrow.parquet
 
             table = pyarrow.parquet.ParquetFile(path).read()
+        if table.num_rows > max(MAX_ROWS, path.stat().st_size):
+            raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for its few bytes")
         twice = [n for n in table.column_names if table.column_names.count(n) > 1]
         if twice:
             raise LogDamagedError(f"{path}: two columns are called {twice[0]!r}")
