@@ -125,15 +125,15 @@ def main(*, quick: bool = False, full: bool = False) -> None:
 def _one(work: str, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         WORK[work](write_long(Path(folder), MEGABYTE))  # imports and compiles what it needs
-    bytes_before, before = _bytes_read(), time.perf_counter()
+    bytes_before, before = bytes_read(), time.perf_counter()
     WORK[work](path)
-    seconds, read = time.perf_counter() - before, _bytes_read() - bytes_before
+    seconds, read = time.perf_counter() - before, bytes_read() - bytes_before
     status = Path("/proc/self/status").read_text(encoding="utf-8")
     peak = next(line for line in status.splitlines() if line.startswith("VmHWM"))
     print(seconds, int(peak.split()[1]) / 1000, read / MEGABYTE)
 
 
-def _bytes_read() -> int:
+def bytes_read() -> int:
     """Bytes that this process has read so far."""
     return int(Path("/proc/self/io").read_text(encoding="utf-8").split()[1])
 

@@ -10,14 +10,18 @@ import numpy as np
 import pytest
 
 from benchmarks import (
+    converting,
+    foreign,
     history,
     iteration,
     kernels,
     learn,
+    live_streams,
     long_recordings,
     many_views,
     modules,
     moments,
+    opening,
     reader,
     recorder,
     recursive,
@@ -166,6 +170,36 @@ def test_recorder(tmp_path: Path) -> None:
     frame, start = recorder.steady_and_start("oscillatory", 500, tmp_path, 1, 1)
     assert 0 < frame < 1e6
     assert start > -1
+
+
+@pytest.mark.parametrize("name", list(foreign.CASES))
+def test_foreign(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both readers give the same."""
+    monkeypatch.setattr(foreign, "TAU", 4)
+    path = foreign.write(tmp_path / "log.mcap", foreign.CASES[name], 4)
+    assert foreign.frames(path) == foreign.mcap_frames(path) == 4
+    assert foreign.messages(path) == foreign.mcap_messages(path) == 4
+
+
+def test_opening(tmp_path: Path) -> None:
+    path = opening.write(tmp_path / "log.mcap", 5 * long_recordings.MEGABYTE)
+    assert 0 < opening.seconds(path, 1, cold=True) < 60
+
+
+def test_live_streams(tmp_path: Path) -> None:
+    """A camera's pictures come, and are recorded."""
+    row = live_streams.watch(tmp_path / "recording", 0.1, streams=1)
+    assert row[0] == 1
+    assert row[-1] == 0
+
+
+def test_converting(tmp_path: Path) -> None:
+    for path in (
+        converting.write_folder(tmp_path / "png", 4),
+        converting.write_video(tmp_path / "a.mp4", 4),
+    ):
+        assert converting.decoding(path) == 4
+        assert converting.converting(path, tmp_path / "out")() == 4
 
 
 def test_scaling() -> None:

@@ -1,0 +1,84 @@
+"""The first picture of a long log of others, whose pictures do not compress."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from benchmarks import foreign
+from benchmarks.long_recordings import MEGABYTE, bytes_read
+from benchmarks.report import middle, save
+from replay.camera_logs.source import ForeignSource
+
+
+def write(path: Path, size: int) -> Path:
+    """Write noise of 640x480 with mcap's own writer, in chunks of its own size, up to `size`."""
+    rng = np.random.default_rng(0)
+    made = [foreign.foxglove_raw(rng.integers(0, 256, foreign.VGA, np.uint8)) for _ in range(20)]
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start()
+        schema = writer.register_schema(foreign.RAW, "protobuf", b"")
+        channel = writer.register_channel(foreign.TOPIC, "protobuf", schema)
+        i = 0
+        while file.tell() < size:
+            time_ns = i * foreign.STEP_NS
+            writer.add_message(channel, time_ns, made[i % len(made)], time_ns)
+            i += 1
+        writer.finish()  # type: ignore[no-untyped-call]
+        os.fsync(file.fileno())
+    return path
+
+
+def first_picture(path: Path) -> None:
+    """Open a log and take its first frame."""
+    with contextlib.closing(ForeignSource(path)) as source:
+        source.take(0, 1)
+
+
+def forget(path: Path) -> None:
+    """Let the system forget what it has of a file in memory, where it can."""
+    if hasattr(os, "posix_fadvise"):
+        with path.open("rb") as file:
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def seconds(path: Path, rounds: int, *, cold: bool) -> float:
+    """The median of how long the first picture takes, by the wall's clock."""
+    found = []
+    for _ in range(rounds):
+        if cold:
+            forget(path)
+        start = time.perf_counter()
+        first_picture(path)
+        found.append(time.perf_counter() - start)
+    return middle(found, 3)
+
+
+def main(*, quick: bool = False, full: bool = False) -> None:
+    """Measure, and write results/opening.json; a log of 10 GB with `full`."""
+    rows = []
+    for size in (100, 10_000) if full else (10, 100 if quick else 1000):
+        with tempfile.TemporaryDirectory() as folder:
+            path = write(Path(folder) / "log.mcap", size * MEGABYTE)
+            first_picture(path)
+            before = bytes_read()
+            first_picture(path)
+            read = bytes_read() - before
+            row: list[object] = [f"{size} MB"]
+            row += [seconds(path, 5, cold=cold) for cold in (True, False)]
+            rows.append([*row, f"{read / path.stat().st_size:.4f}x"])
+    save(
+        "opening",
+        "Opening a log of others",
+        "Opening a log of noise of 640x480 that mcap's own writer wrote, uncompressed, and taking "
+        "its first frame: seconds by the wall's clock, the file not in memory, and in memory. "
+        "What is read is the file's end, the message index of each chunk, and one chunk.",
+        [(["log", "cold, seconds", "warm, seconds", "read of it"], rows)],
+    )
