@@ -85,15 +85,29 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return files
 
 
-def test_a_file_that_is_being_written_stays_open(files: list[Path]) -> None:
-    """Its size and time change, so another in its place could not be told from it."""
+def test_a_file_that_is_being_written_is_known_again_by_what_it_held(files: list[Path]) -> None:
+    files[0] = files[0].rename(f"{files[0]}.partial")
+    one, two = map(FileStore, files)
+    assert len(store._OPEN) == 1
+    with files[0].open("ab") as file:
+        file.write(b", and more")
+    finished = files[0].rename(files[0].with_suffix(""))
+    assert one.is_at(finished)
+    one.path = finished
+    assert one.grow()
+    assert one.read(0, 16) == b"a.mcap, and more"
+    assert two.read(0, 1) == b"b"
+
+
+def test_another_file_in_place_of_one_that_is_being_written_is_refused(files: list[Path]) -> None:
     files[0] = files[0].rename(f"{files[0]}.partial")
     one, two = map(FileStore, files)
     assert two.read(0, 1) == b"b"
-    files[0].unlink()
-    files[0].write_bytes(b"another")
-    assert one.read(0, 6) == b"a.mcap"
+    with files[0].open("r+b") as file:  # even with the same number in its file system
+        file.write(b"another, and longer")
     assert not one.is_at(files[0])
+    with pytest.raises(LogDamagedError, match="it was replaced while it was read"):
+        one.read(0, 6)
 
 
 @pytest.mark.parametrize("there", [False, True])

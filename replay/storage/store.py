@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import sys
@@ -19,6 +20,9 @@ from replay.storage.location import Location
 
 OPEN_FILES = 24
 """Files of recordings that are open at once; a recording in parts has thousands."""
+
+_MARK: Final = 4096
+"""Bytes at both ends of a file by which one that grows is known again."""
 
 _PEEK: Final = 4096
 _PEEK_FAR: Final = 256
@@ -127,6 +131,7 @@ class FileStore(Store):
         """
         super().__init__(path)
         self._closed = False
+        self._mark = b""
         try:
             self._seen = _regular(path)
             self._keep(_Descriptor(path))
@@ -161,10 +166,11 @@ class FileStore(Store):
     def is_at(self, path: Path) -> bool:
         try:
             now = os.stat(path)
+            if not os.path.samestat(now, self._seen):
+                return False
+            return self in _OPEN or self._unchanged(now) or self._is_grown(_Descriptor(path))
         except OSError:
             return False
-        unchanged = self in _OPEN or self._unchanged(now)
-        return unchanged and os.path.samestat(now, self._seen)
 
     def grow(self) -> bool:
         now = os.fstat(self._open().number)
@@ -194,9 +200,10 @@ class FileStore(Store):
         try:
             file = _Descriptor(Path(str(self.path)))
             now = os.fstat(file.number)
+            known = self._unchanged(now) or self._is_grown(file)
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror} while it was read") from None
-        if not (os.path.samestat(now, self._seen) and self._unchanged(now)):
+        if not (os.path.samestat(now, self._seen) and known):
             raise LogDamagedError(f"{self.path}: it was replaced while it was read")
         self._keep(file)
         return file
@@ -204,14 +211,26 @@ class FileStore(Store):
     def _unchanged(self, now: os.stat_result) -> bool:
         return (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
 
+    def _is_grown(self, file: _Descriptor) -> bool:
+        """Whether a file is this one, which was still written when it was closed, and is longer."""
+        longer = os.fstat(file.number).st_size >= self.size
+        return self._mark != b"" and longer and self._marks(file) == self._mark
+
+    def _marks(self, file: _Descriptor) -> bytes:
+        """The first and the last bytes of what is known of a file."""
+        count = min(_MARK, self.size)
+        return os.pread(file.number, count, 0) + os.pread(file.number, count, self.size - count)
+
     def _keep(self, file: _Descriptor) -> None:
-        """Hold a file open, and close others; those that still grow are known only while open."""
+        """Hold a file open, and close others; of those that still grow a mark is kept."""
         with _LOCK:
             _OPEN[self] = file
             if (above := len(_OPEN) - OPEN_FILES) > 0:
-                whole = [f for f in _OPEN if f is not self and f.path.suffix != PARTIAL]
-                for one in whole[:above]:
-                    del _OPEN[one]
+                for one in [f for f in _OPEN if f is not self][:above]:
+                    closed = _OPEN.pop(one)
+                    if one.path.suffix == PARTIAL:
+                        with contextlib.suppress(OSError):  # it is not known again
+                            one._mark = one._marks(closed)
 
 
 class _Descriptor:
