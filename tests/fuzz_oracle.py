@@ -90,15 +90,15 @@ def _key(message: Message) -> tuple[str, int, bytes]:
 
 
 @cache
-def _truth(base: str) -> frozenset[tuple[str, int, bytes]]:
-    """What the log that was broken held."""
+def _truth(base: str) -> frozenset[tuple[int, bytes]]:
+    """Log times and messages of the log that was broken."""
     import tempfile
 
     with tempfile.NamedTemporaryFile(suffix=".mcap") as file:
         file.write(bases()[base])
         file.flush()
         with LogReader(file.name) as reader:
-            return frozenset(map(_key, reader.messages()))
+            return frozenset((m.log_time, m.data) for m in reader.messages())
 
 
 def _read(case: Case, path: Path, *, salvage: bool) -> None:
@@ -114,7 +114,7 @@ def _read(case: Case, path: Path, *, salvage: bool) -> None:
                 raise BrokenPromise("one order has other messages than the other")
         told = reader.problems or reader.crc_absent() or (salvage and reader.missing)
         if case.base and case.trusted and not told:
-            true = {m[1:] for m in _truth(case.base)}
+            true = _truth(case.base)
             if not all((m.log_time, m.data) in true for m in found):
                 raise BrokenPromise("a message was changed, its checksum does not say so")
 

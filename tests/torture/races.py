@@ -13,8 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow
 from camera_files import write_pictures
+from pyarrow import csv, parquet
 
+from . import materials
 from .commands import Fork, here, judge, must, until, worst
 from .kills import check_disk
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome
@@ -68,6 +72,28 @@ READERS: dict[str, Line] = {
 }
 
 
+TWO = ("--topic", "/cam_left", "--topic", "/cam_right", "--size", "16x12")
+OTHERS: dict[str, Words] = {
+    "png": ("--rate", 25, "--size", "16x12"),
+    "bag": TWO,
+    "db3": TWO,
+    "mp4": ("--size", "16x12"),
+    "csv": ("--rate", 25),
+    "parquet": ("--rate", 25),
+}
+"""Inputs without checksums, and the options with which they are read."""
+
+
+def _table(folder: Path) -> Path:
+    """One of numbers, in both forms."""
+    table = pyarrow.table({f"x{i}": np.sin(np.arange(3000) / (7 + i)) for i in range(4)})
+    for name in ("csv", "parquet"):
+        (folder / name).mkdir()
+    csv.write_csv(table, folder / "csv" / "a.csv")
+    parquet.write_table(table, folder / "parquet" / "a.parquet", row_group_size=100)
+    return folder
+
+
 def prepare(folder: Path) -> dict[str, Any]:
     """What is read, and what commands give that are alone."""
     for seed, name in enumerate(("recording", "other")):
@@ -86,12 +112,19 @@ def prepare(folder: Path) -> dict[str, Any]:
             raise Defect(WRONG, "setup", f"{ran.line}: {ran.told()}")
         results[name] = result(place)
     learned = here("learn", folder / "recording", *LEARN, "--json").json["signals_sha256"]
-    return {"folder": folder, "results": results, "learned": learned}
+    others = [kind for kind in OTHERS if kind not in materials.missing()]
+    (folder / "others").mkdir()
+    _table(folder / "others")
+    for kind in others:
+        if kind in materials.MAKERS:
+            materials.MAKERS[kind](folder / "others" / kind)
+    return {"folder": folder, "results": results, "learned": learned, "others": others}
 
 
 def case(job: Job) -> Outcome:
-    """One of the three."""
-    return (_two_writers, _beside_a_writer, _while_it_is_read)[job.seed % 3](job)
+    """One of the three; each other file that is read is no recording."""
+    reading = (_while_others_are_read, _while_it_is_read)[job.seed // 3 % 2]
+    return (_two_writers, _beside_a_writer, reading)[job.seed % 3](job)
 
 
 def _two_writers(job: Job) -> Outcome:
@@ -185,3 +218,24 @@ def _while_it_is_read(job: Job) -> Outcome:
         raise Defect(MIXED, group, f"{ran.line}: other signals, no error")
     check_disk(run, {}, group, ran)
     return outcome
+
+
+def _while_others_are_read(job: Job) -> Outcome:
+    """Nothing tells other pixels from those that were there, but no reader falls over them."""
+    kind, change = job.rng.choice(job.given["others"]), job.rng.choice(CHANGES)
+    command = job.rng.choice(("learn", "convert"))
+    group = f"{kind} {change.__name__[1:]} while it is read"
+    place = job.folder / "in"
+    shutil.copytree(job.given["folder"] / "others" / kind, place)
+    files = sorted(path for path in place.rglob("*") if path.is_file())
+    inputs = sorted(place.iterdir())
+    how = (*LEARN, "--loop") if command == "learn" else ("-o", job.folder / "out")
+    reader = Fork(
+        job.folder,
+        *(command, *inputs, *OTHERS[kind], *how),
+        tweak=witnessing(job.folder / "witness", 0.01),
+    )
+    until(lambda: not reader.running, job.rng.uniform(0, 0.6))
+    one, other = job.rng.choice(files), job.rng.choice(files)
+    change(one, other)
+    return judge(reader.wait(30, group), group, limit=None)
