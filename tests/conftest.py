@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +14,11 @@ from typing import Any
 import hypothesis
 import pytest
 from ignored_signals import let_children_be_signalled
+
+MEMORY, ROOM = Path("/dev/shm"), 6 << 30
+if "TMPDIR" not in os.environ and MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
+    # What tests write is synced some thousand times, which a disk takes milliseconds for.
+    os.environ["TMPDIR"] = tempfile.tempdir = str(MEMORY)
 
 # Compiling takes longer than any deadline, and a test run says the same thing every time.
 hypothesis.settings.register_profile("cdmisfa", deadline=None, derandomize=True)
