@@ -145,7 +145,7 @@ def test_live_streams_are_recorded_in_colours(cdmisfa: Cdmisfa, tmp_path: Path) 
 
 def test_what_has_no_colours_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "t.csv").write_text("a\n1\n2\n")
-    with pytest.raises(UsageError, match=r"--color are for images"):
+    with pytest.raises(UsageError, match=r"as they are: --color is for images"):
         ForeignSource(tmp_path / "t.csv", rate=5, color=True)
     monkeypatch.setitem(CAMERAS._entries, "plain", CameraKind(lambda word, name: None))
     with pytest.raises(UsageError, match="plain:1 shows gray images: leave out --color"):

@@ -300,6 +300,11 @@ def test_a_view_s_name_leads_nowhere_else():
     assert found[-1] == "left"
 
 
+def test_no_two_views_have_one_name():
+    spec = SourceSpec(("a_-3", "a_", "a?", "a!", "a"), (2, 2), "uint8", (), 50.0, 0, None)
+    assert frames.file_names(spec) == ("a_-3", "a_", "a_-4", "a_-5", "a")
+
+
 def test_only_exports_are_replaced(tmp_path):
     out = tmp_path / "out"
     out.mkdir()

@@ -386,6 +386,13 @@ def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> No
         thread.join()
 
 
+def test_a_range_for_images_of_a_running_robot_without_distances_is_refused(robot: Robot) -> None:
+    words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right"]
+    for shown in (words[:1], words[1:], words):
+        with pytest.raises(UsageError, match=r"shows no distances \(16UC1, 32FC1\): --range"):
+            open_live(shown, LiveOptions(depth=(1, 3)))
+
+
 def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
     cdmisfa: Cdmisfa, tmp_path: Path, robot: Robot
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import random
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from recorder.images.decoding import message_decoder
 from recorder.images.fields import Field, numbers_of
 from recorder.images.reading import MessageKind
 from recorder.log.messages import descriptor_set
+from replay.camera_logs import stream
 from replay.camera_logs.formats.table import MAX_ROWS
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
@@ -297,7 +299,8 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
         ({"time": "word"}, "word holds string, neither dates nor numbers"),
         ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),
         ({"time": "big"}, "beyond any clock, counted in s: say what they count, as --time big:ns"),
-        ({"rate": 5, "size": (4, 4)}, "--size, --fit, --color are for images"),
+        ({"rate": 5, "size": (4, 4)}, "as they are: --size is for images"),
+        ({"rate": 5, "size": (4, 4), "fit": "pad"}, "--size and --fit are for images"),
         ({"rate": 5, "topics": ["x"]}, "a table has no topics, leave x out; see --field"),
     ],
 )
@@ -305,6 +308,22 @@ def test_what_a_table_lacks_is_said(options: Any, why: str, tmp_path: Path) -> N
     columns = {"s": [0.0, 1.0], "a": [1, 2], "word": ["x", "y"], "big": [10**18, 10**18 + 1]}
     with pytest.raises(UsageError, match=why):
         ForeignSource(write_table(tmp_path / "t.csv", columns), **options)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="there is no limit elsewhere")
+def test_a_table_of_too_many_numbers_is_taken_in_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "BUDGET", 64 << 20)
+    small = {f"c{i}": np.zeros(1 << 20, np.int8) for i in range(16)}
+    path = write_table(tmp_path / "t.parquet", small)
+    with pytest.raises(LogDamagedError, match=r"64 MiB of .*: take fewer columns, with --field"):
+        ForeignSource(path, rate=5)
+    ForeignSource(path, rate=5, fields=["c3"]).close()
+    large = {f"c{i}": np.zeros(1 << 20) for i in range(16)}
+    path = write_table(tmp_path / "l.parquet", large)
+    with pytest.raises(LogDamagedError, match="the limit: write fewer columns or rows into a file"):
+        ForeignSource(path, rate=5, fields=["c3"])
 
 
 def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from typing import Any
 import click
 import psutil
 import pytest
+from camera_files import write_cameras
 from click.testing import CliRunner
 from engine_tasks import trace
 from pyarrow import parquet
@@ -38,6 +39,7 @@ from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
 from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.sources import open_source
 from cdmisfa.experiments.store import ROWS, read_rows
 from cdmisfa.experiments.sweep import REQUEST, plan, sweep
 from recorder.recording import record_scene
@@ -153,6 +155,20 @@ def test_a_recording_is_swept_as_the_scene_is(tmp_path: Path) -> None:
         sweep(source, folder, seeds=[0, 1], max_iterations=30)
         found.append([row["result"] for row in read_rows(folder)])
     assert found[0] == found[1]
+
+
+def test_cameras_are_swept_with_the_learner_that_learn_takes(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    write_cameras(log, {"/left": (100, 20)})
+    source, learned = open_source([log])
+    source.close()
+    (trial,) = plan([log], grid={}, seeds=[0])
+    assert trial.configuration == learned
+    assert learned.learner.algorithm == "progress"
+    (chosen,) = plan([log], grid={"learner.algorithm": ["2.0"]}, seeds=[0])
+    assert chosen.configuration.learner.algorithm == "2.0"
+    report = sweep([log], tmp_path / "sweep", seeds=[0], max_iterations=2)
+    assert (report.computed, report.failed) == (1, ())
 
 
 # Going on

@@ -29,7 +29,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "view": ("view", "Open a run in the Rerun viewer, or save, serve or picture it."),
     "play": ("view", "Show a recording as it was seen, in real time."),
     "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),
-    "verify": ("logs", "Check that a log is whole: structure, checksums, no gaps."),
+    "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
     "convert": ("convert", "Write camera logs of others as a recording."),
     "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),

@@ -4,6 +4,10 @@ The message is built where the fact is known and names the file or key and the
 remedy. Only the command line turns these into exit codes.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 
 class CdmisfaError(Exception):
     """Something the user can mend; the message is one line that says how."""
@@ -35,6 +39,12 @@ class NotReproducedError(CdmisfaError):
     """A result differs from the one it was compared with."""
 
     exit_code = 4
+
+
+def are_for(options: Sequence[str], what: str) -> str:
+    """That options, one at least, are for something else, in words."""
+    *others, last = options
+    return f"{', '.join(others)} and {last} are for {what}" if others else f"{last} is for {what}"
 
 
 def one_line(error: BaseException) -> str:

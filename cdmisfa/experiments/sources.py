@@ -11,7 +11,7 @@ from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.arithmetic.choice import portable_bits
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import versions
 from recorder.config import RecordConfig, SceneConfig
@@ -174,6 +174,11 @@ def streams_of(described: Mapping[str, Any]) -> str:
     return "" if scene in SCENES else scene or str(described["kind"])
 
 
+def learner_of(streams: str) -> str | None:
+    """The learner of what `streams_of` says where nobody chooses one; None for the preset's."""
+    return OF_CAMERAS if streams else None
+
+
 def open_source(
     words: Sequence[str | Path],
     *,
@@ -203,10 +208,9 @@ def open_source(
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
     if follow is None and len(words) == 1 and words[0] in SCENES:
-        if cameras not in (None, CameraOptions()):
-            raise UsageError(
-                f"{words[0]} is a scene: --topic, --size, --align and --rate are for camera logs"
-            )
+        if cameras is not None and cameras != CameraOptions():
+            refused = are_for(cameras.given(), "camera logs")
+            raise UsageError(f"{words[0]} is a scene: {refused}")
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
         return configuration.open_scene(), configuration
@@ -215,8 +219,7 @@ def open_source(
         described = source.describe()
         kind = scene_kind_for(source.spec, described, preset)
         streams = streams_of(described)
-        learner = OF_CAMERAS if streams else None
-        configuration = configure(kind, preset, settings, seed, learner=learner)
+        configuration = configure(kind, preset, settings, seed, learner=learner_of(streams))
         return source, replace(configuration, streams=streams)
     except BaseException:
         source.close()

@@ -23,6 +23,7 @@ from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import (
     Configuration,
     configure,
+    learner_of,
     open_logs,
     scene_kind_for,
     streams_of,
@@ -174,7 +175,7 @@ def plan(
     trials: dict[str, SweepTrial] = {}
     for point in points:
         chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
-        seeded = _seeded(kind, preset, chosen)
+        seeded = _seeded(kind, preset, chosen, learner_of(streams))
         for seed in each:
             configuration = replace(seeded(seed), streams=streams)
             depends: list[Any] = [as_table(configuration.learner)]
@@ -203,10 +204,10 @@ def plan(
 
 
 def _seeded(
-    kind: str, preset: str | None, settings: Sequence[str]
+    kind: str, preset: str | None, settings: Sequence[str], learner: str | None
 ) -> Callable[[int], Configuration]:
     """`configure` for many seeds at once: a seed only ever becomes `scene.seed`."""
-    base, other = (configure(kind, preset, settings, seed) for seed in (0, 1))
+    base, other = (configure(kind, preset, settings, seed, learner=learner) for seed in (0, 1))
     if base == other:
         return lambda seed: base
     return lambda seed: replace(base, scene=replace(base.scene, seed=seed))

@@ -20,6 +20,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.cameras.video import Steady
 from recorder.images.decoding import Taken, decoder_of
+from recorder.images.messages import holds_distances
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
 
@@ -54,6 +55,8 @@ class FoxgloveCamera:
 
     finite = False
     rate: float | None = None
+    distances: bool | None = None
+    """Whether its first image holds distances; None before that, and of numbers."""
 
     def __init__(
         self,
@@ -94,17 +97,20 @@ class FoxgloveCamera:
         except Exception as error:  # of the network, the address or the protocol
             raise CdmisfaError(f"{self._where} does not answer: {one_line(error)}") from None
         with connection:
-            number, decode = self._find(connection)
+            number, kind, decode = self._find(connection)
             wanted = [{"id": _SUBSCRIPTION, "channelId": number}]
             connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
             steady = Steady()
             for message in connection:
                 if isinstance(message, bytes) and len(message) >= _HEADER.size:
-                    kind, subscription, log_time = _HEADER.unpack_from(message)
-                    if (kind, subscription) == (_DATA, _SUBSCRIPTION):
+                    what, subscription, log_time = _HEADER.unpack_from(message)
+                    if (what, subscription) == (_DATA, _SUBSCRIPTION):
                         logged = log_time / NANOSECONDS if log_time else None
                         age = steady.age(time.monotonic(), logged)
-                        yield age, decode(message[_HEADER.size :])
+                        data = message[_HEADER.size :]
+                        if self.distances is None and not self._reading.fields:
+                            self.distances = holds_distances(kind.schema, kind.encoding, data)
+                        yield age, decode(data)
                 elif isinstance(message, str) and self._is_gone(message, number):
                     return
 
@@ -112,8 +118,8 @@ class FoxgloveCamera:
         """The server and the topic."""
         return {"camera": f"{self._where}{self._topic}"}
 
-    def _find(self, connection: Any) -> tuple[int, Taken]:
-        """The channel of the topic, waited for, and how its messages are decoded."""
+    def _find(self, connection: Any) -> tuple[int, MessageKind, Taken]:
+        """The channel of the topic, waited for, of what kind it is, and its decoder."""
         channels: dict[str, Mapping[str, Any]] = {}
         images: dict[str, Taken] = {}
         said = False
@@ -133,7 +139,8 @@ class FoxgloveCamera:
                 images = {t: d for t, c in channels.items() if (d := self._decoder(c)) is not None}
             found = self._topic or (next(iter(images)) if len(images) == 1 else "")
             if found in images:
-                return int(channels[found]["id"]), images[found]
+                channel = channels[found]
+                return int(channel["id"]), _kind(channel), images[found]
             if found in channels:
                 kind = channels[found].get("schemaName")
                 lacks = "has no fields" if self._reading.fields else "is no image"
@@ -149,19 +156,23 @@ class FoxgloveCamera:
         return f"{self._where} {what}: it has {wanted} on {known}"
 
     def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
-        schema, language = channel.get("schema"), str(channel.get("schemaEncoding", ""))
-        definition = schema.encode() if isinstance(schema, str) else b""
-        encoding = str(channel.get("encoding"))
-        if encoding == "protobuf":  # its definition is no text
-            with contextlib.suppress(ValueError):
-                definition = base64.b64decode(definition, validate=True)
-        kind = MessageKind(str(channel.get("schemaName")), encoding, definition, language)
-        return decoder_of(kind, self._reading)
+        return decoder_of(_kind(channel), self._reading)
 
     @staticmethod
     def _is_gone(message: str, number: int) -> bool:
         told = _told(message)
         return told.get("op") == "unadvertise" and number in told.get("channelIds", ())
+
+
+def _kind(channel: Mapping[str, Any]) -> MessageKind:
+    """Of what kind the messages of a channel are, as the server says."""
+    schema, language = channel.get("schema"), str(channel.get("schemaEncoding", ""))
+    definition = schema.encode() if isinstance(schema, str) else b""
+    encoding = str(channel.get("encoding"))
+    if encoding == "protobuf":  # its definition is no text
+        with contextlib.suppress(ValueError):
+            definition = base64.b64decode(definition, validate=True)
+    return MessageKind(str(channel.get("schemaName")), encoding, definition, language)
 
 
 def _told(message: str | bytes) -> Mapping[str, Any]:

@@ -65,6 +65,11 @@ class FramedCamera:
         """See `Camera`."""
         return self._camera.rate
 
+    @property
+    def distances(self) -> bool | None:
+        """Whether its first image holds distances; None where that is not known."""
+        return getattr(self._camera, "distances", None)
+
     def pictures(self) -> Iterator[tuple[int, Shown]]:
         """See `Camera`.
 

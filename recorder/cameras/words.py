@@ -180,7 +180,15 @@ def open_live(
         about[PACKAGES] = packages
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
-    return LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)
+    source = LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)
+    may_show = [
+        "depth" in kind.takes and camera.distances is not False
+        for kind, camera in zip(kinds, cameras, strict=True)
+    ]
+    if options.depth is not None and not any(may_show):
+        source.close()
+        raise UsageError(f"{words[0]} shows no distances (16UC1, 32FC1): --range is for these")
+    return source
 
 
 def stream_names(words: Sequence[str]) -> tuple[str, ...]:

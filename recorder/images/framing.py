@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.pixels import Bytes, Shown, shrink
 
 Fit = Literal["crop", "pad", "stretch"]
@@ -140,8 +140,9 @@ def framings(
             + " and ".join(dict.fromkeys(_shown_in_words(first) for first in firsts))
             + ": take as many numbers of each, as with --field position[0:6], or each apart"
         )
-    if size is not None or fit != "crop" or color:
-        raise UsageError("numbers are taken as they are: --size, --fit, --color are for images")
+    given = {"--size": size is not None, "--fit": fit != "crop", "--color": color}
+    if refused := [option for option, said in given.items() if said]:
+        raise UsageError(f"numbers are taken as they are: {are_for(refused, 'images')}")
     return [Vector(count) for count in counts]
 
 

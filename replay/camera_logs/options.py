@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Final, Literal
 
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import Depth
@@ -11,6 +12,15 @@ from recorder.images.reading import Clock
 
 Align = Literal["index", "time"]
 Gaps = Literal["skip", "hold"]
+
+_SPELLED: Final[Mapping[str, str]] = {
+    "topics": "topic",
+    "start": "from",
+    "stop": "to",
+    "depth": "range",
+    "fields": "field",
+}
+"""Options that the command line calls otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,3 +60,11 @@ class CameraOptions:
     time: str | None = None
     stamp: Clock = "log"
     color: bool = False
+
+    def given(self) -> tuple[str, ...]:
+        """The options of the command line that say other than the defaults."""
+        return tuple(
+            f"--{_SPELLED.get(field.name, field.name)}"
+            for field in fields(self)
+            if getattr(self, field.name) != field.default
+        )

@@ -184,20 +184,21 @@ def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) ->
 
 
 @contextmanager
-def explained(path: Location, program: str, *, held: int = 0) -> Iterator[None]:
+def explained(path: Location, program: str, *, held: int = 0, remedy: str = "") -> Iterator[None]:
     """Say in one line what a library cannot read that lets any exception through, or any size.
 
     Args:
         path: what is read.
         program: the library.
         held: bytes of the memory that it may take which are taken already.
+        remedy: what to do where it takes more.
     """
-    with in_one_line(path, program), budget(max(BUDGET - held, 0)):
+    with in_one_line(path, program, remedy), budget(max(BUDGET - held, 0)):
         yield
 
 
 @contextmanager
-def arrow_explained(path: Location, *, held: int = 0) -> Iterator[None]:
+def arrow_explained(path: Location, *, held: int = 0, remedy: str = "") -> Iterator[None]:
     """Do as `explained` where PyArrow reads, which takes its memory of the system meanwhile.
 
     What its own pool has in reserve has no budget.
@@ -205,21 +206,21 @@ def arrow_explained(path: Location, *, held: int = 0) -> Iterator[None]:
     import pyarrow
 
     pyarrow.set_memory_pool(pyarrow.system_memory_pool())
-    with explained(path, "PyArrow", held=held):
+    with explained(path, "PyArrow", held=held, remedy=remedy):
         yield
 
 
 @contextmanager
-def in_one_line(path: Location, program: str) -> Iterator[None]:
+def in_one_line(path: Location, program: str, remedy: str = "") -> Iterator[None]:
     """Say in one line what a library cannot read that lets any exception through."""
     try:
         yield
     except CdmisfaError:
         raise
     except MemoryError:
-        raise LogDamagedError(
-            f"{path}: {program} takes more than {BUDGET >> 20} MiB of memory for it, the limit"
-        ) from None
+        most = f"{BUDGET >> 20} MiB of memory for it, the limit"
+        said = f"{path}: {program} takes more than {most}"
+        raise LogDamagedError(f"{said}: {remedy}" if remedy else said) from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise LogDamagedError(f"{path}: {program} cannot read it ({reason})") from None

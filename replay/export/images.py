@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -52,7 +53,8 @@ def file_names(spec: SourceSpec) -> tuple[str, ...]:
     names: list[str] = []
     for view in spec.streams:
         name = _UNSAFE.sub("_", view)[:64] or "_"
-        names.append(name if name not in names else f"{name}-{len(names) + 1}")
+        numbered = (f"{name}-{number}" for number in itertools.count(len(names) + 1))
+        names.append(next(n for n in itertools.chain([name], numbered) if n not in names))
     return tuple(names)
 
 

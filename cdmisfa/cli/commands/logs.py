@@ -74,7 +74,7 @@ def _clock(ns: int | None) -> str:
 @options.as_json
 @click.pass_context
 def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> None:
-    """Check that a log is whole: structure, checksums, no gaps.
+    """Check that a log is whole: structure, checksums, nothing lost.
 
     Of a camera log without checksums every image is decoded. PATH may be several, a pattern such
     as 'logs/*.mcap', or a URL. Exits with 3 when anything is wrong.

@@ -61,7 +61,7 @@ class TableNumbers(ImageStream):
         names = reading.fields or numeric
         if not names:
             raise UsageError(f"{path}: it has no column of numbers")
-        with arrow_explained(path):
+        with arrow_explained(path, remedy="take fewer columns, with --field"):
             columns = [_column(path, table, name) for name in names]
         numbers = bounded(np.concatenate(columns, axis=1), reading.depth)
         whole = np.all(np.isfinite(numbers), axis=1)
@@ -125,7 +125,7 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 
 def _table(path: Path) -> Any:
     check_regular(path, MAX_BYTES)
-    with arrow_explained(path):
+    with arrow_explained(path, remedy="write fewer columns or rows into a file"):
         if path.suffix.lower() == ".csv":
             import pyarrow.csv
 
