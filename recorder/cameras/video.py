@@ -6,6 +6,7 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.clock import NANOSECONDS
@@ -66,7 +67,8 @@ class VideoCamera:
         self.rate: float | None = None
         self._word, self._address, self._form, self._timeout = word, address, form, timeout
         self._remote = _NETWORK.match(address) is not None
-        self.finite = not self._remote and not address.startswith("/dev/")
+        device = address.startswith("/dev/") and not Path(address).is_file()  # /dev/shm has files
+        self.finite = not self._remote and not device
         self._av = pyav(word)
         self._shown = frame_colors if color else frame_gray
 
