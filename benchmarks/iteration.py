@@ -68,27 +68,26 @@ def timed(parts: dict[str, tuple[Any, tuple[str, ...]]], times: Times) -> Iterat
 
 def measured(rounds: int, iterations: int) -> dict[str, list[float]]:
     """Microseconds an iteration by part, one entry a round; `all` and `log` are wholes."""
-    source = RecordedSource(SAMPLE, loop=True)
-    learner = CuriousLearner(LearnerConfig(**load_preset("icub")["learner"]), source.spec, 0)
+    config = LearnerConfig(**load_preset("icub")["learner"])
     found: dict[str, list[float]] = defaultdict(list)
-    digest, clock = SignalsHash(), time.thread_time_ns
-    with tempfile.TemporaryDirectory() as folder:
-        log = RunWriter(Path(folder) / "run.mcap", source.spec, {})
-        for turn in range(rounds + 1):
-            times: Times = defaultdict(float)
-            with timed({**PARTS, **LOG_PARTS}, times):
-                for _ in range(iterations):
-                    begin = clock()
-                    block = source.take(learner.stream, learner.tau)
-                    signals = learner.step(block)
-                    digest.add(signals)
-                    learned = clock()
-                    log.block(block, signals, learner)
-                    times["log"] += clock() - learned
-                    times["all"] += learned - begin
-            for part in ("all", *PARTS, "log", *LOG_PARTS) if turn else ():
-                found[part].append(times[part] / 1000 / iterations)
-        log.finish()
+    clock = time.thread_time_ns
+    for turn in range(rounds + 1):
+        source, times = RecordedSource(SAMPLE, loop=True), defaultdict[str, float](float)
+        learner, digest = CuriousLearner(config, source.spec, 0), SignalsHash()
+        with tempfile.TemporaryDirectory() as folder, timed({**PARTS, **LOG_PARTS}, times):
+            log = RunWriter(Path(folder) / "run.mcap", source.spec, {})
+            for _ in range(iterations):
+                begin = clock()
+                block = source.take(learner.stream, learner.tau)
+                signals = learner.step(block)
+                digest.add(signals)
+                learned = clock()
+                log.block(block, signals, learner)
+                times["log"] += clock() - learned
+                times["all"] += learned - begin
+            log.finish()
+        for part in ("all", *PARTS, "log", *LOG_PARTS) if turn else ():
+            found[part].append(times[part] / 1000 / iterations)
     return dict(found)
 
 
@@ -105,13 +104,13 @@ def table(times: dict[str, list[float]], whole: str, parts: list[str]) -> list[l
 
 def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/iteration.json."""
-    rounds, iterations = (4, 100) if quick else (15, 400)
+    rounds, iterations = (4, 100) if quick else (9, 1000)
     times = measured(rounds, iterations)
     save(
         "iteration",
         "An iteration by its parts",
         f"Of the preset icub (K = 7, 40 frames of the sample log, 48 x 128 pixels): CPU time of "
-        f"the learning thread, the median of {rounds} rounds of {iterations} iterations, the "
+        f"the learning thread, the median of {rounds} runs of {iterations} iterations, the "
         "clock included that is asked before and after each part. The second table is of "
         "run.mcap, whose chunks are compressed in a thread of their own, and in shares of an "
         "iteration without a log. What limits an iteration: reading is zstd (33 us a block where "
