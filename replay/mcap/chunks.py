@@ -32,8 +32,11 @@ from replay.storage.store import FileStore, Store
 
 UNUSED: Final = "(the index is not used)"
 """How it ends what is said of an index that contradicts its chunk, which costs no message."""
-CACHE_BYTES: Final = 32 * 1024 * 1024
-"""Decoded chunks that are kept, unless told otherwise; one always is."""
+CACHE_BYTES: Final = 1024 * 1024
+"""Decoded chunks that are kept, unless told otherwise; one always is.
+
+Few, because reading moves forward, and memory that is used again is still in the CPU's cache.
+"""
 AHEAD: Final = 2
 """Chunks that are decompressed ahead at once, each in a thread, while others are looked at."""
 _LARGE: Final = 8 * 1024 * 1024
@@ -56,14 +59,14 @@ class Chunks:
         file: Store,
         definitions: Definitions,
         note: Callable[[str, str], None],
-        cache_bytes: int | None,
+        cache_bytes: int,
         without_crc: Callable[[], None],
     ) -> None:
         self._file = file
         self._without_crc = without_crc
         self._definitions = definitions
         self._note = note
-        self._cache_bytes = CACHE_BYTES if cache_bytes is None else cache_bytes
+        self._cache_bytes = cache_bytes
         self._cache: OrderedDict[int, MessageTable] = OrderedDict()
         self._cached = 0
         self._decompressor = Decompressor()

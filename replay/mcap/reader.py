@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap.chunks import Chunks
+from replay.mcap.chunks import CACHE_BYTES, Chunks
 from replay.mcap.data_section import DataSection
 from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
 from replay.mcap.segments import Attachment, Message, Problem, Segment
@@ -59,7 +59,7 @@ class LogReader:
         path: str | Location,
         *,
         salvage: bool = False,
-        cache_bytes: int | None = None,
+        cache_bytes: int = CACHE_BYTES,
         check: Check | None = None,
         store: Store | None = None,
     ) -> None:

@@ -23,11 +23,6 @@ from replay.storage.listing import log_files
 from replay.storage.location import Location, Url
 from replay.stored import StoredSource, joined
 
-CACHE_BYTES: Final = 1024 * 1024
-"""Decoded chunks that are kept of each view; one always is.
-
-Few, because playing moves forward, and memory that is used again is still in the CPU's cache.
-"""
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
 _SMALLEST: Final = 64
 """Bytes that no log of a recording has less of once its header is written."""
@@ -79,7 +74,7 @@ class RecordedSource(StoredSource):
         try:
             for path in self._files:
                 view = known.get(path)
-                views.append(view or ViewFile(path, salvage=salvage, cache_bytes=CACHE_BYTES))
+                views.append(view or ViewFile(path, salvage=salvage))
             self._views = _arrange(views, salvage=salvage)
             self._set_clock()
         except BaseException:
@@ -114,7 +109,7 @@ class RecordedSource(StoredSource):
                     view.refresh(path)
                     opened.append(view)
                 elif not _only_begun(path):
-                    added.append(ViewFile(path, cache_bytes=CACHE_BYTES))
+                    added.append(ViewFile(path))
             views = _arrange(opened + added, salvage=False)
         except BaseException:
             for view in added:

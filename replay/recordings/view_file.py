@@ -53,7 +53,6 @@ class ViewFile:
         path: Location,
         *,
         salvage: bool = False,
-        cache_bytes: int | None = None,
         passing: LogReader | None = None,
     ) -> None:
         """Open one view's file and check the times of its frames.
@@ -61,7 +60,6 @@ class ViewFile:
         Args:
             path: the file.
             salvage: leave out what is damaged.
-            cache_bytes: of decoded chunks that are kept.
             passing: its reader, where `pass_over` is told of the chunks that this gives.
 
         Raises:
@@ -70,7 +68,7 @@ class ViewFile:
         self.path = path
         self._scanner: ChunkScanner | None = None
         self._passing = passing is not None
-        self.reader = passing or LogReader(path, salvage=salvage, cache_bytes=cache_bytes)
+        self.reader = passing or LogReader(path, salvage=salvage)
         try:
             self._open()
         except BaseException:

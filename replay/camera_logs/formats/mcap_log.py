@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,6 @@ from replay.mcap.records import Channel, MalformedRecord
 from replay.mcap.segments import Segment
 from replay.mcap.tables import MessageTable
 from replay.storage.location import Location
-
-CACHE_BYTES: Final = 1024 * 1024
-"""Decoded chunks that are kept; one always is."""
-
 
 Found = TypeVar("Found")
 
@@ -53,7 +49,7 @@ class McapImages(ImageStream):
         self._own: tuple[MessageTable | None, NDArray[np.intp]] = None, np.empty(0, np.intp)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
-        self.reader = LogReader(path, salvage=salvage, cache_bytes=CACHE_BYTES)
+        self.reader = LogReader(path, salvage=salvage)
         try:
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
             self._channel, self._decode = choose_images(path, topic, channels, reading)
