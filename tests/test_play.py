@@ -146,7 +146,7 @@ def test_messages_keep_their_bytes_and_times(recording: Path) -> None:
             f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], proxy=None
         )
         with server as connection:
-            number, _ = camera._find(connection)
+            number, *_ = camera._find(connection)
             wanted = [{"id": 1, "channelId": number}]
             connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
             seen = [m for m in connection if isinstance(m, bytes) and m[0] == 1]

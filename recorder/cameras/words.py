@@ -56,7 +56,7 @@ def _foxglove(word: str, name: str, *, say: Callable[[str], None], **chosen: Any
     return FoxgloveCamera(word, name, timeout=_TIMEOUT, reading=Reading(**chosen), say=say)
 
 
-def _video(word: str, name: str, *, color: bool) -> Camera:
+def _video(word: str, name: str, *, color: bool = False) -> Camera:
     from recorder.cameras.video import video_camera
 
     return video_camera(word, name, timeout=_TIMEOUT, color=color)
