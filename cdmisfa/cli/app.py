@@ -19,7 +19,7 @@ from typing import NoReturn
 
 import click
 
-from cdmisfa.cli.interrupts import interruptible
+from cdmisfa.cli.interrupts import end_at_once, interruptible
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
 
@@ -114,7 +114,9 @@ def main() -> NoReturn:
     _open_standard_streams()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
+    end_at_once()
     code = run(sys.argv[1:])
+    end_at_once(code)
     # An interrupt inside of an exec, as imports have them, is remembered until the next one:
     # `python -m` would end by SIGINT, whatever the code.
     exec("")
@@ -140,10 +142,13 @@ def run(args: Sequence[str]) -> int:
     """
     with interruptible() as stop:
         try:
-            _refuse_odd_names(args)
-            # without standalone mode, Context.exit(code) comes back as the value
-            code = cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
-            sys.stdout.flush()
+            try:
+                _refuse_odd_names(args)
+                # without standalone mode, Context.exit(code) comes back as the value
+                code = cli.main(args=list(args), prog_name="cdmisfa", standalone_mode=False)
+                sys.stdout.flush()
+            finally:
+                stop.ended = True
         except (click.Abort, KeyboardInterrupt) as error:
             remedy = str(error.__cause__ or error)  # click puts an Abort around an interrupt
             return _fail(f"interrupted{': ' if remedy else ''}{remedy}", stop.exit_code)

@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+_AGAIN = 0.02
+"""Seconds after which an interrupt comes again that was raised where nothing passes it on."""
+
 
 class Stop:
-    """Whether a signal has come; callable, as a loop's `stop`."""
+    """Whether a signal has come; callable, as a loop's `stop`.
+
+    Attributes:
+        number: of the last signal, 0 for none.
+        ended: the work is over, and a signal changes nothing any more.
+    """
 
     def __init__(self) -> None:
         self.number: int = 0
+        self.ended = False
 
     def __call__(self) -> bool:
         """Whether to stop."""
@@ -33,11 +45,22 @@ def interruptible() -> Iterator[Stop]:
     stop = Stop()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        stop.number = number
-        raise KeyboardInterrupt
+        if not stop.ended:
+            stop.number = number
+            raise KeyboardInterrupt
 
-    with _handled_by(interrupt):
+    with _handled_by(interrupt), _not_lost(stop):
         yield stop
+
+
+def end_at_once(code: int | None = None) -> None:
+    """Let a signal that comes from now on end this process, where nothing handles it otherwise.
+
+    Args:
+        code: to end with; None for that of the signal.
+    """
+    for number in {*SIGNALS} - _ignored():
+        signal.signal(number, lambda n, _: os._exit(128 + n if code is None else code))
 
 
 @contextmanager
@@ -66,10 +89,8 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
         _let_go_of_terminal()
         handler(number, frame)
 
-    # nohup has SIGHUP ignored
-    kept = {signal.SIGHUP} if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else set()
     try:
-        before = {number: signal.signal(number, handle) for number in {*SIGNALS} - kept}
+        before = {number: signal.signal(number, handle) for number in {*SIGNALS} - _ignored()}
     except ValueError:  # not the main thread: signals are not ours to handle
         yield
         return
@@ -78,6 +99,34 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
+
+
+def _ignored() -> set[signal.Signals]:
+    """What nohup has ignored."""
+    return {n for n in (signal.SIGHUP,) if signal.getsignal(n) == signal.SIG_IGN}
+
+
+@contextmanager
+def _not_lost(stop: Stop) -> Iterator[None]:
+    """Bring an interrupt again that Python dropped: in a destructor, in a callback of C.
+
+    What an interrupt left half made, and whose destructor fails, is not spoken of.
+    """
+    before = sys.unraisablehook
+
+    def dropped(what: Any) -> None:
+        if not stop():
+            before(what)
+        elif what.exc_type is KeyboardInterrupt and not stop.ended:
+            again = threading.Timer(_AGAIN, os.kill, (os.getpid(), stop.number))
+            again.daemon = True
+            again.start()
+
+    sys.unraisablehook = dropped
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def _let_go_of_terminal() -> None:

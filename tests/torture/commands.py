@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cdmisfa.cli.interrupts import SIGNALS
+
 from .outcomes import CLEAR_ERROR, HANG, RIGHT, TRACEBACK, WRONG, Defect, Outcome
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -175,6 +177,8 @@ class Fork(Process):
             os.chdir(folder)
             os.dup2(out, 1)
             os.dup2(err, 2)
+            for number in SIGNALS:  # what comes after the command has ended
+                signal.signal(number, lambda *_: None)
             self._tweak()
             from cdmisfa.cli import run
 
