@@ -28,7 +28,9 @@ LIMIT = 5.0
 
 CODES = (0, 1, 2, 3, 4, 129, 130, 143)
 ERRORS = (1, 2, 3, 4)
-UNCLEAR = re.compile(r"Traceback \(most recent|please report it|Exception ignored|Fatal Python")
+UNCLEAR = re.compile(
+    r"Traceback \(most recent|cdmisfa: unexpected \w+|Exception ignored|Fatal Python"
+)
 
 
 @dataclass(frozen=True, slots=True)
