@@ -35,7 +35,8 @@ from mcap.records import (
 from recorder.config import Compression
 from recorder.mcap.checksum import crc32
 
-_MAGIC: Final = b"\x89MCAP0\r\n"
+MAGIC: Final = b"\x89MCAP0\r\n"
+"""What a file begins and ends with."""
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; the data follow."""
@@ -106,7 +107,7 @@ class McapWriter:
         self._size = 0
         self._index: dict[int, list[int]] = {}
         self._crc = 0
-        self._append(_MAGIC)
+        self._append(MAGIC)
         self._append(_encoded(Header(profile, library)))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -228,7 +229,7 @@ class McapWriter:
             at += len(part)
         summary = b"".join(parts) + _encoded(*offsets)
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, at), crc32(summary))
-        self._append(summary + _encoded(Footer(start, at, crc)) + _MAGIC)
+        self._append(summary + _encoded(Footer(start, at, crc)) + MAGIC)
 
     def _append_chunk(self, buffer: bytearray, size: int, index: dict[int, list[int]]) -> None:
         """Append a chunk with its message indexes.

@@ -8,7 +8,7 @@ from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.checksum import crc32
-from replay.mcap.records import MAGIC
+from recorder.mcap.writer import MAGIC
 from replay.mcap.summary import FOOTER_BYTES
 from replay.mcap.walk import DATA_END_BYTES, LogStructure
 from replay.storage.location import Url

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
+from recorder.mcap.writer import MAGIC
 from replay.mcap.reader import LogReader
-from replay.mcap.records import MAGIC
 from replay.storage.checksum import sha256
 from replay.storage.location import Location
 

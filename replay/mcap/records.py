@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 
-MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD_HEADER: Final = struct.Struct("<BQ")
 MAX_CHUNK: Final = 144 * 1024 * 1024
 """Largest decompressed chunk, in bytes, that is read; asked for before decompressing."""

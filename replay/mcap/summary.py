@@ -17,9 +17,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from recorder.mcap.writer import MAGIC
 from replay.mcap.records import (
     INDEX_HEADER,
-    MAGIC,
     MAX_CHUNK,
     MAX_DEFINITION,
     RECORD_HEADER,

@@ -14,9 +14,9 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.mcap.writer import MAGIC
 from replay.mcap.compression import check_size
 from replay.mcap.records import (
-    MAGIC,
     MAX_CHUNK,
     MAX_DEFINITION,
     RECORD_HEADER,
