@@ -148,7 +148,8 @@ def _view_sweep(
 @click.command("play")
 @options.fetched_argument("recording", nargs=-1)
 @options.one_of(
-    *("--to", ("rerun", "foxglove")),
+    "--to",
+    ("rerun", "foxglove"),
     "To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
     argument="target",
 )
