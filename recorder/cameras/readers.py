@@ -144,7 +144,7 @@ class Readers:
         delay, name = shortest, reading.camera.name
         while self._is_on(reading, epoch):
             came = False
-            why = f"{name} ended"
+            why = f"{name} ended" if reading.came else f"{name} ended before a picture of it came"
             try:
                 for age, image in reading.camera.pictures():
                     picture = Picture(self.now() - age, image)
