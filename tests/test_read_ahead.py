@@ -6,6 +6,7 @@ import io
 import struct
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
 from mcap.opcode import Opcode
@@ -13,9 +14,10 @@ from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap import summary
+from replay.mcap.compression import Decompressor
 from replay.mcap.reader import LogReader
 from replay.mcap.records import RECORD_HEADER, MalformedRecord
-from replay.storage.store import Store
+from replay.storage.store import FileStore, Store
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
@@ -138,3 +140,43 @@ def test_runs_of_chunk_indexes_of_several_lengths_are_all_found() -> None:
         found.append(rows.tobytes())
         at += rows.size
     assert found == [one[0], other[0], one[0]]
+
+
+@pytest.mark.parametrize("size", [1, 65_535, 65_536, 65_537, 200_000])
+@pytest.mark.parametrize("stated", [True, False])
+def test_lz4_is_decompressed_in_pieces_and_refused_where_it_holds_more_or_less(
+    size: int, stated: bool
+) -> None:
+    data = np.random.default_rng(size).integers(0, 9, size, np.uint8).tobytes()
+    stored = memoryview(lz4.frame.compress(data, store_size=stated))
+    out = np.empty(size, np.uint8)
+    Decompressor().decompress(stored, "lz4", out)
+    assert out.tobytes() == data
+    for wrong in (size - 1, size + 1):
+        with pytest.raises(MalformedRecord, match=f"it states {wrong} bytes decompressed"):
+            Decompressor().decompress(stored, "lz4", np.empty(wrong, np.uint8))
+    with pytest.raises(MalformedRecord, match="cut short"):
+        Decompressor().decompress(stored[:-1], "lz4", out)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_chunk_is_read_with_its_message_indexes_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType
+) -> None:
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1000, compression=compression)
+        writer.start()
+        channels = [writer.register_channel(topic, "b", 0) for topic in "xyz"]
+        for i in range(60):
+            writer.add_message(channels[i % 3], i, bytes([i]) * 400, i)
+        writer.finish()
+    with LogReader(path) as reader:
+        chunks = len(reader.segments)
+        reads: list[int] = []
+        for name in ("read_at", "read_into"):
+            read = getattr(FileStore, name)
+            counted = lambda *args, read=read: reads.append(1) or read(*args)  # noqa: E731
+            monkeypatch.setattr(FileStore, name, counted)
+        assert [message.data[0] for message in reader.messages()] == list(range(60))
+        assert len(reads) == chunks == 20

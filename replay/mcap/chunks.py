@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import bisect
 import contextlib
+import struct
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -22,7 +22,6 @@ from replay.mcap.records import (
     MAX_CHUNK,
     RECORD_HEADER,
     Bytes,
-    Fields,
     MalformedRecord,
 )
 from replay.mcap.segments import Definitions, Segment
@@ -41,6 +40,16 @@ AHEAD: Final = 2
 """Chunks that are decompressed ahead at once, each in a thread, while others are looked at."""
 _LARGE: Final = 8 * 1024 * 1024
 """Bytes of a chunk that is not decompressed ahead, because of the memory that this takes."""
+
+
+_HEAD: Final = struct.Struct("<BQQQQI")
+"""Of a chunk: opcode, length, first and last log time, size and CRC of its records."""
+_OF_CHUNK: Final = bytes([Opcode.CHUNK])
+_INDEX_HEAD: Final = struct.Struct("<BQHI")
+"""Of a message index: opcode, length, channel, bytes of the pairs."""
+
+Unpacked = tuple[Bytes, bytes]
+"""The records of a chunk, and what of its message indexes follows it in the file."""
 
 
 class Chunks:
@@ -73,7 +82,7 @@ class Chunks:
         self._memory = Memory()
         self._expected: Sequence[Segment] = ()
         self._next = -1
-        self._ahead: dict[int, Future[Bytes]] = {}
+        self._ahead: dict[int, Future[Unpacked]] = {}
         self._threads: ThreadPoolExecutor | None = None
 
     def table(self, segment: Segment) -> MessageTable:
@@ -111,12 +120,7 @@ class Chunks:
         size = last.offset + 16 * last.count - first
         if size > MAX_CHUNK:
             raise MalformedRecord("its message index is larger than any chunk")
-        raw = self._file.read(first, size)
-        pairs = np.frombuffer
-        return [
-            (p.channel, pairs(raw, "<u8", 2 * p.count, p.offset - first).reshape(-1, 2))
-            for p in segment.indexes
-        ]
+        return _pairs(segment, self._file.read(first, size), first)
 
     def unpack(self, segment: Segment, out: Bytes) -> memoryview:
         """Decompress the records of a chunk with message indexes into `out`, (segment.size,).
@@ -127,12 +131,13 @@ class Chunks:
         Raises:
             MalformedRecord: it is damaged, or larger than any chunk with its indexes.
         """
-        first, stop = segment.indexes[0].offset - INDEX_HEADER, segment.stop
-        if stop - first > MAX_CHUNK:
+        records, after = self._unpack(segment, self._file, out)
+        if segment.stop > segment.data_end + len(after):
             raise MalformedRecord("its message index is larger than any chunk")
-        self._unpack(segment, out, self._file)
+        if records is not out:
+            out[:] = records
         self._prove(segment)
-        return memoryview(self._file.read(first, stop - first))
+        return memoryview(after)[segment.indexes[0].offset - INDEX_HEADER - segment.data_end :]
 
     @contextlib.contextmanager
     def passing(self) -> Iterator[OnePass]:
@@ -170,8 +175,9 @@ class Chunks:
             return
         self._next = at + 1
         for one in expected[at + 1 : at + 1 + AHEAD] if isinstance(self._file, FileStore) else ():
-            small = one.chunked and not one.cut and max(one.size, one.stored) <= _LARGE
-            if small and one.offset not in self._cache and one.offset not in self._ahead:
+            # What is not compressed is read in less time than another thread takes it over.
+            packed = one.compression and not one.cut and max(one.size, one.stored) <= _LARGE
+            if packed and one.offset not in self._cache and one.offset not in self._ahead:
                 self._threads = self._threads or ThreadPoolExecutor(AHEAD)
                 self._ahead[one.offset] = self._threads.submit(self._records, one, self._file)
 
@@ -184,28 +190,40 @@ class Chunks:
         if not segment.crc:
             self._without_crc()
 
-    def _unpack(self, segment: Segment, out: Bytes, file: Store) -> None:
-        """Decompress the records of a chunk into `out`, (segment.size,), and check their CRC."""
-        if segment.stated:
-            confirm(file, segment)
-        as_is = not segment.compression and segment.stored == len(out)
-        stored = out if as_is else self._memory.take(min(segment.stored, file.size))
-        there = file.read_into(segment.data_offset, stored.data)
-        if not as_is:
-            self._decompressor.decompress(stored[:there].data, segment.compression, out)
-        elif there < len(out):
-            raise MalformedRecord(f"it states {len(out)} bytes and holds {there}")
-        if segment.crc and crc32(out.data) != segment.crc:
-            raise MalformedRecord("its CRC does not match: damaged")
+    def _unpack(self, segment: Segment, file: Store, out: Bytes | None = None) -> Unpacked:
+        """Read a chunk with its message indexes at once, decompress it and check its CRC.
 
-    def _records(self, segment: Segment, file: Store) -> Bytes:
-        """The records of a whole chunk, decompressed and checked; threads may call it."""
+        Args:
+            segment: not cut.
+            file: that holds it.
+            out: (segment.size,), what is decompressed is written into; by default into memory
+                that is kept.
+        """
         check_size(segment.compression, segment.size)
-        raw = self._memory.take(segment.size)
-        self._unpack(segment, raw, file)
-        return freeze(raw)
+        begin, ends = segment.offset, segment.data_end
+        stop = segment.stop if segment.stop - ends <= MAX_CHUNK else ends
+        raw = self._memory.take(max(min(stop, file.size) - begin, 0))
+        raw = raw[: file.read_into(begin, raw.data)]
+        if segment.stated:
+            confirm(file, segment, raw.data)
+        stored = raw[segment.data_offset - begin : ends - begin]
+        if not segment.compression and segment.stored == segment.size:
+            records = stored
+            if len(records) < segment.size:
+                raise MalformedRecord(f"it states {segment.size} bytes and holds {len(records)}")
+        else:
+            records = self._memory.take(segment.size) if out is None else out
+            self._decompressor.decompress(stored.data, segment.compression, records)
+        if segment.crc and crc32(records.data) != segment.crc:
+            raise MalformedRecord("its CRC does not match: damaged")
+        return records, raw[ends - begin :].tobytes()
 
-    def _decode(self, segment: Segment, coming: Future[Bytes] | None) -> MessageTable:
+    def _records(self, segment: Segment, file: Store) -> Unpacked:
+        """The records of a whole chunk, checked, that nobody writes to; threads may call it."""
+        records, after = self._unpack(segment, file)
+        return freeze(records), after
+
+    def _decode(self, segment: Segment, coming: Future[Unpacked] | None) -> MessageTable:
         if segment.cut:
             stored = self._file.read(segment.data_offset, segment.stored)
             size = min(segment.size, MAX_CHUNK)
@@ -213,9 +231,9 @@ class Chunks:
             raw = np.frombuffer(found, np.uint8)
             table, definitions = walked_table(raw, cut=True)
         else:
-            raw = coming.result() if coming else self._records(segment, self._file)
+            raw, after = coming.result() if coming else self._records(segment, self._file)
             self._prove(segment)
-            table, definitions = self._table_of(segment, raw)
+            table, definitions = self._table_of(segment, raw, after)
             times = table.log_time
             if len(times) and (times.min() < segment.start or times.max() > segment.end):
                 raise MalformedRecord("it holds messages outside the time range it states")
@@ -223,38 +241,53 @@ class Chunks:
             self._definitions.add(opcode, raw[start:stop].tobytes(), segment.name)
         return table
 
-    def _table_of(self, segment: Segment, raw: Bytes) -> tuple[MessageTable, Spans]:
+    def _table_of(self, segment: Segment, raw: Bytes, after: bytes) -> tuple[MessageTable, Spans]:
         if not segment.indexes:
             return walked_table(raw)
         try:
-            return indexed_table(raw, self.index(segment))
+            if segment.stop > segment.data_end + len(after):
+                raise MalformedRecord("its message index is larger than any chunk")
+            return indexed_table(raw, _pairs(segment, after, segment.data_end))
         except MalformedRecord as error:
             found = walked_table(raw)
             self._note(segment.name, f"{error} {UNUSED}")
             return found
 
 
-def confirm(file: Store, segment: Segment) -> None:
+def _pairs(segment: Segment, data: bytes, at: int) -> list[tuple[int, NDArray[np.uint64]]]:
+    """A chunk's message indexes, in the bytes of the file from a place on; see `Chunks.index`."""
+    pairs = np.frombuffer
+    return [
+        (p.channel, pairs(data, "<u8", 2 * p.count, p.offset - at).reshape(-1, 2))
+        for p in segment.indexes
+    ]
+
+
+def confirm(file: Store, segment: Segment, data: memoryview) -> None:
     """Compare a chunk, and its message indexes, with what the summary says of it.
+
+    Args:
+        file: that holds it.
+        segment: what the summary says.
+        data: the bytes of the file from its first on, if not all of them.
 
     Raises:
         MalformedRecord: they differ.
     """
-    head = file.read(segment.offset, segment.data_offset - segment.offset)
-    opcode, length = RECORD_HEADER.unpack_from(head)
-    if opcode != Opcode.CHUNK:
+    head = data[: segment.data_offset - segment.offset]
+    if head[:1] != _OF_CHUNK:
         raise MalformedRecord("the summary points to something that is no chunk")
-    found = Segment.of_chunk(segment.offset, head[RECORD_HEADER.size :])
-    found.indexes = segment.indexes
-    end = found.data_offset + found.stored
-    stated = replace(segment, crc=found.crc, stated=False)
-    if segment.offset + RECORD_HEADER.size + length != end or found != stated:
+    name, length = segment.compression.encode(), segment.data_end - segment.offset
+    crc = int.from_bytes(head[_HEAD.size - 4 : _HEAD.size], "little")
+    times = segment.start, segment.end
+    stated = _HEAD.pack(Opcode.CHUNK, length - RECORD_HEADER.size, *times, segment.size, crc)
+    stated += len(name).to_bytes(4, "little") + name + segment.stored.to_bytes(8, "little")
+    if head != stated:
         raise MalformedRecord("it is not the chunk that the summary names")
     for part in segment.indexes:
-        raw = Fields(file.read(part.offset - INDEX_HEADER, INDEX_HEADER), "a message index")
-        fields = [raw.integer(width) for width in (1, 8, 2, 4)]
-        size = 16 * part.count
-        if fields != [Opcode.MESSAGE_INDEX, size + 6, part.channel, size]:
+        at, size = part.offset - INDEX_HEADER, 16 * part.count
+        found = data[at - segment.offset :][:INDEX_HEADER] or file.read(at, INDEX_HEADER)
+        if found != _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, size + 6, part.channel, size):
             raise MalformedRecord("its message index is not the one that the summary names")
-    segment.crc = found.crc
+    segment.crc = crc
     segment.stated = False

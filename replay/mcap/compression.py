@@ -17,6 +17,8 @@ _WINDOW: Final = MAX_CHUNK // 2
 _KEPT: Final = 6
 _KEPT_BYTES: Final = 8 * 1024 * 1024
 """Buffers that are kept to be used again, and the size of the largest."""
+_PIECE: Final = 64 * 1024
+"""Bytes that LZ4 gives at once: less than the C library would ask new memory of the system for."""
 _BROKEN: Final = (zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError)
 
 
@@ -72,11 +74,12 @@ class Decompressor:
         try:
             if compression == "zstd":
                 there = self._from_zstd(stored, out)
+            elif compression == "lz4":
+                there = _from_lz4(stored, out)
             else:
-                data = _from_lz4(stored, size) if compression == "lz4" else stored
-                there = len(data)
+                there = len(stored)
                 if there == size:
-                    out[:] = np.frombuffer(data, np.uint8)
+                    out[:] = np.frombuffer(stored, np.uint8)
         except _BROKEN as error:
             raise MalformedRecord(f"its {compression} data is broken ({error})") from None
         if there != size:
@@ -136,12 +139,21 @@ def check_size(compression: str, size: int) -> None:
         )
 
 
-def _from_lz4(stored: memoryview, size: int) -> bytes:
+def _from_lz4(stored: memoryview, out: Bytes) -> int:
+    """How many bytes there are; one more than fit stands for any number of them."""
+    size = len(out)
     stated = lz4.frame.get_frame_info(stored)["content_size"]
     if stated not in (0, size):
         raise MalformedRecord(f"it states {size} bytes decompressed, its data {stated}")
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    data = bytes(decompressor.decompress(stored, max_length=size + 1))
-    if not decompressor.eof and len(data) <= size:
-        raise MalformedRecord("its lz4 data is cut short")
-    return data
+    context = lz4.frame.create_decompression_context()
+    there, used, ended = 0, 0, False
+    while not ended:
+        most = min(max(size - there, 1), _PIECE)
+        data, taken, ended = lz4.frame.decompress_chunk(context, stored[used:], max_length=most)
+        if not taken and not data:
+            raise MalformedRecord("its lz4 data is cut short")
+        if there + len(data) > size:
+            return size + 1
+        out[there : there + len(data)] = np.frombuffer(data, np.uint8)
+        there, used = there + len(data), used + taken
+    return there

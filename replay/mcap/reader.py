@@ -202,18 +202,13 @@ class LogReader:
         Raises:
             LogDamagedError: at the first damage, without `salvage`.
         """
-        fields = ["channel", "sequence", "log_time", "publish_time"]
-        tables = self.tables(start=start, stop=stop, ordered=ordered, topics=topics)
-        for segment, table in tables:
+        for segment, table in self.tables(start=start, stop=stop, ordered=ordered, topics=topics):
             known = {c: self._channel(c, segment) for c in np.unique(table.channel).tolist()}
-            data = table.data.data
-            headers, places = table.headers[fields].tolist(), table.at.tolist()
-            for header, at, size in zip(headers, places, table.size.tolist(), strict=True):
-                number, sequence, log_time, publish_time = header
-                channel = known[number]
-                if channel is not None and (topics is None or channel.topic in topics):
-                    payload = bytes(data[at : at + size])
-                    yield Message(channel, sequence, log_time, publish_time, payload)
+            own = {c: k for c, k in known.items() if k and (topics is None or k.topic in topics)}
+            if len(own) < len(known):
+                table = table.select(np.isin(table.channel, list(own)))
+            for number, sequence, log_time, published, data in table.rows():
+                yield Message(own[number], sequence, log_time, published, data)
 
     def tables(
         self,

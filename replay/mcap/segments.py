@@ -74,10 +74,15 @@ class Segment:
         return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
 
     @property
+    def data_end(self) -> int:
+        """Place in the file after its records."""
+        return self.data_offset + self.stored
+
+    @property
     def stop(self) -> int:
         """Place in the file after its message indexes."""
         ends = (part.offset + 16 * part.count for part in self.indexes)
-        return max(ends, default=self.data_offset + self.stored)
+        return max(ends, default=self.data_end)
 
     @property
     def name(self) -> str:

@@ -61,6 +61,22 @@ class MessageTable:
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
         return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
 
+    def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
+        """Each message: channel, sequence, log time, publish time and payload."""
+        heads, data = self.headers, self.data.data
+        fields = ("channel", "sequence", "log_time", "publish_time")
+        columns = [heads[name].tolist() for name in fields]
+        places = self.at.tolist(), (self.at + self.size).tolist()
+        for channel, sequence, log_time, published, at, stop in zip(*columns, *places, strict=True):
+            yield channel, sequence, log_time, published, bytes(data[at:stop])
+
+    def by_time(self) -> MessageTable:
+        """The messages by log time, ties as they are."""
+        times = self.log_time
+        if (times[1:] >= times[:-1]).all():
+            return self
+        return self.select(np.argsort(times, kind="stable"))
+
     def payload(self, row: int) -> bytes:
         return self.view(row).tobytes()
 
@@ -181,6 +197,12 @@ def in_order(
         table_of: decodes a chunk; None where it is left out. Few are asked for at once.
     """
     for group in _overlapping(segments):
+        if len(group) == 1:
+            (segment,) = group
+            alone = table_of(segment)
+            if alone is not None and len(alone):
+                yield segment, alone.by_time()
+            continue
         times = [t.log_time if (t := table_of(s)) is not None else _NO_TIMES for s in group]
         order = np.argsort(np.concatenate(times), kind="stable")
         counts = [len(each) for each in times]
@@ -188,11 +210,10 @@ def in_order(
         row_of = np.concatenate([np.arange(count) for count in counts])[order]
         edges = [0, *(np.flatnonzero(np.diff(chunk_of)) + 1).tolist(), len(order)]
         for low, high in itertools.pairwise(edges if len(order) else ()):
-            segment, rows = group[int(chunk_of[low])], row_of[low:high]
+            segment = group[int(chunk_of[low])]
             table = table_of(segment)
             if table is not None:
-                whole = len(rows) == len(table) and not (rows[1:] < rows[:-1]).any()
-                yield segment, table if whole else table.select(rows)
+                yield segment, table.select(row_of[low:high])
 
 
 def _overlapping(segments: list[tuple[int, Segment]]) -> Iterator[list[Segment]]:

@@ -154,6 +154,8 @@ class FileStore(Store):
                 done += n
         except OSError as error:
             raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+        if done < most:
+            raise self._was_cut()
         return done
 
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:
