@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,8 @@ from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
 from recorder.recording import record_scene
 from replay.mcap.reader import LogReader
+from replay.mcap.records import INDEX_HEADER
+from replay.mcap.segments import Segment
 from replay.mcap.tables import indexed_table
 from replay.recordings.kernels import scan
 from replay.recordings.scanner import ChunkScanner
@@ -114,6 +119,7 @@ def scanned(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
         scanner._places,
         scanner._marks,
         ends,
+        np.zeros(ends.shape, np.uint64),
         wanted,
     )
     return ends if sound else None
@@ -192,6 +198,56 @@ def test_a_flipped_bit_is_found(pictures: dict[str, Path], tmp_path: Path) -> No
         scanner.chunk(view.reader.segments[2])
     assert scanner.scanned(view.reader.segments[1], BUFFER) is not None
     view.close()
+
+
+def parts_of(path: Path, number: int) -> tuple[Segment, bytearray]:
+    """A chunk as its file's summary names it, and the bytes of the file."""
+    with LogReader(path) as reader:
+        assert reader.by_index
+        return reader.segments[number], bytearray(path.read_bytes())
+
+
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_a_chunk_that_is_not_as_the_summary_says_is_refused(
+    pictures: dict[str, Path], tmp_path: Path, compression: str
+) -> None:
+    chunk, raw = parts_of(pictures[compression], 2)
+    heads = [range(chunk.offset, chunk.data_offset)]
+    heads += [range(part.offset - INDEX_HEADER, part.offset) for part in chunk.indexes]
+    places = [place for head in heads for place in head]
+    path = tmp_path / "left.mcap"
+    for place in places:
+        raw[place] ^= 2
+        path.write_bytes(raw)
+        raw[place] ^= 2
+        with contextlib.closing(ViewFile(path)) as view:
+            assert fast(view, 0, 100)[0].any()
+            with pytest.raises(LogDamagedError, match=f"chunk at byte {chunk.offset} .*"):
+                fast(view, 99, 2)
+    assert len(places) == 49 + len(chunk.compression) + 2 * INDEX_HEADER
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_time_that_is_not_its_frames_is_refused_where_its_chunk_is_read(
+    pictures: dict[str, Path], tmp_path: Path, which: int
+) -> None:
+    """Even if its index and all checksums that are read agree."""
+    chunk, raw = parts_of(pictures["none"], 2)
+    pair = chunk.indexes[which].offset + 16 * 7
+    time, place = struct.unpack_from("<QQ", raw, pair)
+    later = struct.pack("<Q", time + 1)
+    message = chunk.data_offset + place + 15
+    assert raw[message : message + 8] == raw[pair : pair + 8]
+    raw[message : message + 8] = raw[pair : pair + 8] = later
+    data = raw[chunk.data_offset :][: chunk.stored]
+    raw[chunk.offset + 33 : chunk.offset + 37] = struct.pack("<I", zlib.crc32(data))
+    path = tmp_path / "left.mcap"
+    path.write_bytes(raw)
+    with contextlib.closing(ViewFile(path)) as view:
+        assert fast(view, 0, 100)[0].any()
+        for _ in range(2):
+            with pytest.raises(LogDamagedError, match=f"after frame 106 comes log time {time + 1}"):
+                fast(view, 99, 2)
 
 
 def test_looking_at_a_log_compiles_nothing(pictures: dict[str, Path]) -> None:

@@ -44,7 +44,7 @@ class Segment:
         crc: CRC-32 of the decompressed bytes, 0 where the writer gave none.
         start: log time of its earliest message.
         end: log time of its latest message.
-        indexes: the chunk's message indexes.
+        indexes: the chunk's message indexes, in file order.
         counts: messages of each channel where a walk counted them.
         cut: the file ends within it.
         stated: only the summary speaks of it, its own header was not read.
@@ -81,8 +81,10 @@ class Segment:
     @property
     def stop(self) -> int:
         """Place in the file after its message indexes."""
-        ends = (part.offset + 16 * part.count for part in self.indexes)
-        return max(ends, default=self.data_end)
+        if not self.indexes:
+            return self.data_end
+        last = self.indexes[-1]
+        return last.offset + 16 * last.count
 
     @property
     def name(self) -> str:

@@ -38,6 +38,7 @@ class Piece(NamedTuple):
     Attributes:
         segment: the chunk.
         which: the channel: 0 frames, 1 ground truth.
+        number: of the chunk among those that hold messages of the channel.
         low: the first of them among the channel's messages in the chunk.
         n: how many.
         at: the first of them among the messages wanted.
@@ -45,6 +46,7 @@ class Piece(NamedTuple):
 
     segment: Segment
     which: int
+    number: int
     low: int
     n: int
     at: int
@@ -145,11 +147,22 @@ class ChannelRows:
         self._number(batch, row, found)
         return found
 
-    def _confirm(self, number: int) -> None:
-        """Check the log times of a chunk whose frames were numbered by the summary."""
+    def confirm(self, number: int, times: NDArray[np.uint64]) -> None:
+        """Check the log times of a chunk whose frames were numbered by the summary.
+
+        Args:
+            number: of the chunk among those that hold messages of the channel.
+            times: (>= n,) of its n messages, in file order.
+
+        Raises:
+            LogDamagedError: one is not that of its frame.
+        """
         if number in self._to_confirm:
-            row = self._starts[number]
-            self._number([self._times(number)], row, self._unbroken(row))
+            row, first = self._starts[number], self._facts.first_frame
+            frames = np.arange(first + row, first + self._starts[number + 1])
+            own = times[: len(frames)]
+            if (own != self._facts.times(frames)).any():
+                self._number([own], row, self._unbroken(row))  # says what is wrong
             self._to_confirm.remove(number)
 
     def _number(self, batch: list[NDArray[np.uint64]], row: int, found: list[Span]) -> None:
@@ -206,8 +219,7 @@ class ChannelRows:
         while at < count:
             low = row + at - self._starts[number]
             here = min(self._starts[number + 1] - row, count) - at
-            found.append(Piece(self._segments[number], which, low, here, at))
-            self._confirm(number)
+            found.append(Piece(self._segments[number], which, number, low, here, at))
             at, number = at + here, number + 1
         return found
 
@@ -223,8 +235,9 @@ class ChannelRows:
         return 0 if table is None else int((table.channel == self.channel.id).sum())
 
     def _table(self, number: int) -> MessageTable:
-        self._confirm(number)
-        return own_messages(self._reader, self._segments[number], self.channel)
+        own = own_messages(self._reader, self._segments[number], self.channel)
+        self.confirm(number, own.log_time)
+        return own
 
 
 def own_messages(reader: LogReader, segment: Segment, channel: Channel) -> MessageTable:

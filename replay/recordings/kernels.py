@@ -74,6 +74,7 @@ def scan(
     places: Places,
     marks: Bytes,
     ends: Places,
+    times: NDArray[np.uint64],
     counts: Places,
 ) -> bool:
     """Check a chunk of messages and find those of some channels.
@@ -89,6 +90,7 @@ def scan(
             message; 0 none.
         marks: (C, M) those bytes.
         ends: (C, n) written: place after each message's payload.
+        times: (C, n) written: its log time.
         counts: (C,) how many messages of each there are.
 
     Returns:
@@ -128,7 +130,7 @@ def scan(
             for k in range(places.shape[1]):
                 if places[c, k] and data[end - places[c, k]] != marks[c, k]:
                     return False
-            ends[c, seen[c]] = end
+            ends[c, seen[c]], times[c, seen[c]] = end, time
             seen[c] += 1
         at = end
     for part in range(n_parts):

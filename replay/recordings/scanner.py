@@ -68,10 +68,12 @@ class ScannedChunk:
     Attributes:
         buffer: (>= B,) uint8, its records first.
         ends: (C, n) place after each message of each channel wanted.
+        times: (C, n) its log time.
     """
 
     buffer: Bytes
     ends: Places
+    times: NDArray[np.uint64]
 
 
 class ChunkScanner:
@@ -138,6 +140,7 @@ class ChunkScanner:
             return None
         wanted = [counts.get(layout.channel.id, 0) for layout in self._layouts]
         ends = np.empty((len(wanted), max(wanted)), np.int64)
+        times = np.empty(ends.shape, np.uint64)
         if max(segment.start, segment.end) >= 2**63 or not self._kernels.scan(
             data,
             np.frombuffer(index, np.uint8),
@@ -148,21 +151,24 @@ class ChunkScanner:
             self._places,
             self._marks,
             ends,
+            times,
             np.array(wanted, np.int64),
         ):
             return None
-        return ScannedChunk(buffer, ends)
+        return ScannedChunk(buffer, ends, times)
 
     def tabled(self, segment: Segment, buffer: Bytes) -> ScannedChunk:
         """Decode a chunk by its tables, into a buffer where it is large enough."""
         tables = [own_messages(self._reader, segment, layout.channel) for layout in self._layouts]
         ends = np.zeros((len(tables), max(map(len, tables))), np.int64)
+        times = np.zeros(ends.shape, np.uint64)
         for which, (layout, table) in enumerate(zip(self._layouts, tables, strict=True)):
             ends[which, : len(table)] = layout.checked_ends(self._reader.path, segment, table)
+            times[which, : len(table)] = table.log_time
         data = tables[0].data
         buffer = _fitting(buffer, len(data))
         buffer[: len(data)] = data
-        return ScannedChunk(buffer, ends)
+        return ScannedChunk(buffer, ends, times)
 
 
 def _fitting(buffer: Bytes, size: int) -> Bytes:

@@ -133,6 +133,7 @@ class ViewFile:
         pieces.sort(key=operator.attrgetter("segment.offset"))
         for piece in pieces:
             chunk = self._scanner.chunk(piece.segment)
+            self._channels[piece.which].confirm(piece.number, chunk.times[piece.which])
             out = outs[piece.which][piece.at : piece.at + piece.n]
             self._scanner.copy(chunk, piece.which, piece.low, out)
 

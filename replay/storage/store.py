@@ -98,7 +98,11 @@ class Store(ABC):
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def read_into(self, offset: int, out: memoryview) -> int:
-        """Fill memory with the bytes from `offset` on; how many, fewer only at the end."""
+        """Fill memory with the bytes from `offset` on; how many, fewer only at the end.
+
+        Raises:
+            LogDamagedError: they cannot be read, or are not there any more.
+        """
         data = self.read(offset, len(out))
         out[: len(data)] = data
         return len(data)
