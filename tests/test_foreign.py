@@ -16,13 +16,20 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
-from PIL import Image
+from PIL import Image, ImageOps
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.testing.sources import SourceContract
 from recorder.images.messages import image_decoder
-from recorder.images.pixels import ENCODINGS, MalformedImage, gray, shrink
+from recorder.images.pixels import (
+    ENCODINGS,
+    MalformedImage,
+    compressed_gray,
+    gray,
+    picture_size,
+    shrink,
+)
 from replay.camera_logs.source import ForeignSource
 
 RANDOM = np.random.default_rng(5)
@@ -163,6 +170,25 @@ def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
         decoder = image_decoder(*which)
         assert decoder is not None
         assert abs(decoder(message) - expected).max() <= (0 if kind == "PNG" else 6)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+@pytest.mark.parametrize("orientation", range(10))
+def test_an_image_stands_upright_as_its_exif_says(kind: str, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    file = io.BytesIO()
+    Image.fromarray(GRAY).save(file, kind, exif=exif)
+    turned = ImageOps.exif_transpose(Image.open(file))
+    np.testing.assert_array_equal(compressed_gray(file.getvalue()), np.asarray(turned))
+    assert picture_size(file) == turned.size[::-1]
+
+
+def test_an_image_with_broken_exif_is_taken_as_it_is() -> None:
+    file = io.BytesIO()
+    Image.fromarray(GRAY).save(file, "PNG", exif=b"Exif\0\0II*\0\xff\xff\xff\x7f")
+    np.testing.assert_array_equal(compressed_gray(file.getvalue()), GRAY)
+    assert picture_size(file) == GRAY.shape
 
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb12", "64FC1", "yuv422", ""])

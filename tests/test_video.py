@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 import shlex
+import struct
 import sys
 from collections.abc import Iterable
 from fractions import Fraction
@@ -121,6 +124,29 @@ def test_limited_luma_becomes_the_full_range(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mkv", flat, pixels="yuv420p")
     frames = ForeignSource(tmp_path / "a.mkv", size=SIZE).take(0, 5).frames
     assert abs(frames[:, 0, 0].astype(int) - [0, 64, 128, 200, 255]).max() <= 1
+
+
+@pytest.mark.parametrize(("angle", "turns"), [(90, -1), (180, 2), (270, 1), (0, 0)])
+def test_a_video_of_a_telephone_stands_upright(tmp_path: Path, angle: int, turns: int) -> None:
+    path = tmp_path / "a.mp4"
+    images = write_video(path, pictures(3), codec="libx264", pixels="yuv420p")
+    turn_clockwise(path, angle)
+    upright = np.rot90(images[0], turns)
+    with contextlib.closing(VideoImages(path, None)) as video:
+        small = shrink(video.image(0), *upright.shape)
+        assert abs(small.astype(float) - upright).mean() < 8
+    with contextlib.closing(VideoImages(path, None, color=True)) as video:
+        assert video.image(0).shape == (4 * upright.shape[0], 4 * upright.shape[1], 3)
+
+
+def turn_clockwise(path: Path, angle: int) -> None:
+    """Let the header of a track of an MP4 file say by how much a player turns it."""
+    data = bytearray(path.read_bytes())
+    cos, sin = (round(f(math.radians(angle))) << 16 for f in (math.cos, math.sin))
+    struct.pack_into(
+        ">9i", data, data.index(b"tkhd") + 44, cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30
+    )
+    path.write_bytes(data)
 
 
 def test_times_are_those_of_the_video(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from recorder.images.pixels import RECIPE, Bytes, gray
 
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
-    "((Y - 16) * 510 + 219) // 438 where its range is limited"
+    "((Y - 16) * 510 + 219) // 438 where its range is limited, by the nearest quarter turns of its "
+    "display matrix"
 )
 """How a frame of a video becomes a frame, for the record."""
 
@@ -40,15 +41,35 @@ _WEIGHTS: Final = {
 
 
 def frame_colors(frame: Any) -> Bytes:
-    """The colours of a frame of PyAV, (height, width, 3) uint8, or the luma of one without."""
+    """The colours of a frame of PyAV, (height, width, 3) uint8, or the luma of one without.
+
+    It is turned upright, as `frame_gray` is.
+    """
+    return _upright(_colors(frame), frame)
+
+
+def frame_gray(frame: Any) -> Bytes:
+    """The luma of a frame of PyAV, or the grey of its colours, (height, width) uint8.
+
+    It is turned by quarters, as a telephone says how it was held.
+    """
+    return _upright(_luma(frame), frame)
+
+
+def _upright(pixels: Bytes, frame: Any) -> Bytes:
+    turns = round(frame.rotation / 90) % 4
+    return np.ascontiguousarray(np.rot90(pixels, turns)) if turns else pixels
+
+
+def _colors(frame: Any) -> Bytes:
     form = frame.format
     if form.name.startswith("gray"):
-        return frame_gray(frame)
+        return _luma(frame)
     luma_first = form.name.startswith("yuv") and len(form.components) >= 3
     if not luma_first or form.components[0].bits != 8 or not form.is_planar:
         colours: Bytes = frame.to_ndarray(format="rgb24")
         return colours
-    luma = frame_gray(frame).astype(np.int32) << 16
+    luma = _luma(frame).astype(np.int32) << 16
     full = form.name.startswith("yuvj") or frame.color_range == _FULL_RANGE
     height, width = luma.shape
     chroma = []
@@ -66,8 +87,7 @@ def frame_colors(frame: Any) -> Bytes:
     return np.stack([((c + 32768) >> 16).clip(0, 255).astype(np.uint8) for c in colors], axis=2)
 
 
-def frame_gray(frame: Any) -> Bytes:
-    """The luma of a frame of PyAV, or the grey of its colours, (height, width) uint8."""
+def _luma(frame: Any) -> Bytes:
     form = frame.format
     if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
         colours = frame.to_ndarray(format="rgb24")

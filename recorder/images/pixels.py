@@ -27,9 +27,23 @@ _BAND: Final = 1 << 20
 
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
-    "size: area average (Pillow BOX)"
+    "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
 )
 """How any image becomes a frame, for the record."""
+
+_ORIENTATION: Final = 0x0112
+"""The tag of EXIF that says how a camera was held."""
+
+_TURNS: Final = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What puts an image upright, by its orientation; 1 is."""
 
 _LAYOUTS: Final[Mapping[str, tuple[int, str]]] = {
     "mono8": (1, "gray"),
@@ -234,6 +248,8 @@ def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
                     f"a progressive JPEG of {image.width}x{image.height} in {image.mode} takes "
                     f"more than {BUDGET >> 20} MiB of memory, the limit"
                 )
+            if (orientation := _orientation(image)) in _TURNS:
+                image = image.transpose(_TURNS[orientation])
             if image.mode in ("I;16", "I;16B", "I"):
                 return _high_bytes(np.asarray(image))
             if image.mode not in ("L", "RGB"):
@@ -250,12 +266,25 @@ def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
 
 
 def picture_size(file: BinaryIO) -> tuple[int, int] | None:
-    """The (height, width) that the head of a JPEG or PNG states; None where it is broken."""
+    """The (height, width), upright, that the head of a JPEG or PNG states; None if it is broken."""
     try:
         with budget(), Image.open(file, formats=["JPEG", "PNG"]) as image:
-            return image.height, image.width
+            turned = 5 <= _orientation(image) <= 8
+            return (image.width, image.height) if turned else (image.height, image.width)
     except Exception:  # Pillow raises whatever its codecs raise
         return None
+
+
+def _orientation(image: Image.Image) -> int:
+    """EXIF's number for how the camera was held; 1, upright, where nothing whole says it."""
+    if "exif" not in image.info:
+        return 1
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            return int(image.getexif().get(_ORIENTATION, 1))
+    except Exception:  # Pillow raises whatever its parser raises; the picture may be whole
+        return 1
 
 
 def _progressive_bytes(image: Image.Image) -> int:
