@@ -62,7 +62,7 @@ class RecordedWhileWatched:
         self._source = source
         self.folder = folder_here(folder)
         self.gaps = bool(getattr(source, "gaps", False))
-        refuse_existing(self.folder, force=force)
+        refuse_existing(self.folder, force=force, goes_on=False)
         settings = settings or RecordConfig()
         identity = identity_of(source, None, settings, None)
         self._views = identity.spec.streams

@@ -36,7 +36,7 @@ from recorder.log.resume import (
 from recorder.log.split import Split
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewParts
-from recorder.log.whole import refuse_taken, whole
+from recorder.log.whole import refuse_taken, refuse_unless_png, whole
 from recorder.world.rendering import render_in_processes, take_here
 from recorder.world.scenes import SCENES, OpenScene, open_scene, scene_of
 
@@ -218,7 +218,7 @@ def record(
                 logs[block.stream].write(block)
                 if progress is not None:
                     progress(min(log.t for log in logs.values()))
-                if stop():
+                if stop() and min(log.t for log in logs.values()) < frames:
                     raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
         if logs:
             source.describe()  # an error where it was replaced while it was read
@@ -385,8 +385,7 @@ def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = Fa
         able = " or ".join(able for able, entry in SCENES.items() if entry.picture)
         raise UsageError(f"the scene {name} has no picture: --scene-picture is for {able}")
     path = Path(path)
-    if path.suffix.lower() != ".png":
-        raise UsageError(f"{path}: the picture is a PNG, name it .png")
+    refuse_unless_png(path)
     refuse_taken(path, force=force)
     image = draw(config)
     with whole(path) as partial:

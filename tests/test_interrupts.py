@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import pkgutil
 import signal
 import time
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import click
 import pytest
+from conftest import Cdmisfa, Outcome
 
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
+from replay.playing.pace import Played, paced
 
 
 def wait() -> None:
@@ -45,7 +49,7 @@ def test_the_second_signal_interrupts_although_a_destructor_drops_it(capfd: Any)
         with pytest.raises(KeyboardInterrupt):
             wait()
     assert outer.exit_code == 130
-    assert capfd.readouterr().err == "stopping after this iteration; again to stop at once\n"
+    assert capfd.readouterr().err == "finishing what is begun; again to stop at once\n"
 
 
 def test_what_else_a_destructor_raises_is_told(capsys: Any, monkeypatch: Any) -> None:
@@ -72,3 +76,77 @@ def test_a_line_that_is_told_at_the_end_is_told_whole(monkeypatch: Any, capsys: 
     monkeypatch.setattr(click, "echo", interrupted)
     assert run(["info", "not/there"]) == 2
     assert capsys.readouterr().err.startswith("cdmisfa: not/there")
+
+
+class Message(NamedTuple):
+    """What is played."""
+
+    time_ns: int
+
+
+LEARN = ("learn", "oscillatory", "--set", "learner.tau=10", "--max-iterations", 3)
+RECORD = ("record", "oscillatory", "--frames", 20, "--view", "x1")
+LIVE = ("record", "gym:Pendulum-v1", "--frames", 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "last"),
+    [
+        (LEARN, "replay.view.build.build_view"),
+        (RECORD, "recorder.log.viewlog.ViewParts.write"),
+        (LIVE, "recorder.log.viewlog.ViewParts.finish"),
+    ],
+    ids=["learn", "record", "live"],
+)
+def test_a_signal_that_changes_nothing_any_more_is_no_failure(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: Any, words: tuple[Any, ...], last: str
+) -> None:
+    done = _signalled(cdmisfa, (*words, "-o", tmp_path / "out"), last, 1, monkeypatch)
+    assert done.code == 0, done.err
+    assert not list((tmp_path / "out").glob("*.partial"))
+
+
+def test_an_interrupt_says_what_is_missing_of_a_run(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: Any
+) -> None:
+    out = tmp_path / "out"
+    words = (*LEARN, "-o", out)
+    done = _signalled(cdmisfa, words, "replay.view.build.build_view", 2, monkeypatch)
+    assert done.code == 130
+    missing, _, remedy = done.err.splitlines()[-1].partition("make it again with cdmisfa ")
+    assert missing == f"cdmisfa: interrupted: all of {out} is there but its view: "
+    assert cdmisfa(*remedy.split()).code == 0
+    assert cdmisfa("verify", out).code == 0
+
+    words = (*LEARN, "-o", out, "--force", "--no-rerun")
+    done = _signalled(cdmisfa, words, "replay.runs.modules.save_modules", 2, monkeypatch)
+    assert done.code == 130
+    said = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
+    assert done.err.splitlines()[-1] == said
+    assert cdmisfa("learn", "-o", out, "--resume", "--no-rerun").code == 0
+    assert cdmisfa("verify", out).code == 0
+
+
+def _signalled(
+    cdmisfa: Cdmisfa, words: tuple[Any, ...], last: str, times: int, monkeypatch: Any
+) -> Outcome:
+    """What a command says to signals that come when it does the last of its work."""
+    work = pkgutil.resolve_name(last)
+
+    def signalled(*args: Any, **options: Any) -> Any:
+        monkeypatch.undo()
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+        return work(*args, **options)
+
+    monkeypatch.setattr(last, signalled)
+    return cdmisfa(*words)
+
+
+def test_what_was_played_to_its_end_was_not_stopped() -> None:
+    for last, stopped in ((2, False), (1, True)):
+        played, signals = Played(), list[int]()
+        items = ((i, Message(i)) for i in range(3))
+        for i, _ in paced(items, 1.0, played, stop=lambda signals=signals: bool(signals)):
+            signals += [i] if i == last else []
+        assert played.stopped is stopped

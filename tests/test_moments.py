@@ -282,6 +282,23 @@ def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) 
         assert first_difference(parent, fork) is None
 
 
+def test_a_fork_at_the_beginning_is_one_too(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    parent, fork, straight = place / "2.0-live", tmp_path / "fork", tmp_path / "straight"
+    told = ("--set", "learner.nu=0.02", "--seed", 9, "--no-rerun", "--json")
+    begun = ("fork", parent, "--at", 0, *told)
+    assert cdmisfa(*begun, "-o", fork, "--max-iterations", 20).code == 0
+    assert cdmisfa(*begun, "-o", straight, "--max-iterations", 60).code == 0
+    resumed = cdmisfa("learn", "--resume", "-o", fork, "--max-iterations", 60, "--no-rerun")
+    assert resumed.code == 0, resumed.err
+    assert first_difference(fork, straight) is None
+    assert check_run(fork).difference is None
+    compared = cdmisfa("compare", parent, fork, "--save", tmp_path / "both.rrd")
+    assert (compared.code, "learner.nu 0.05 against 0.02; seed 3 against 9" in compared.out) == (
+        4,
+        True,
+    )
+
+
 def test_forks_of_forks_are_resumed_and_checked(
     place: Path, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:

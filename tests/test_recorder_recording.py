@@ -17,7 +17,7 @@ from foxglove_schemas_protobuf import RawImage_pb2
 from mcap.reader import make_reader
 from waiting import wait_for
 
-from cdmisfa.core.errors import LogWriteError, UsageError
+from cdmisfa.core.errors import UsageError
 from recorder.config import RecordConfig
 from recorder.log import resume
 from recorder.log.begun import RECORDING
@@ -385,7 +385,7 @@ def test_an_exception_leaves_readable_partials(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(LogWriteError, match="file/a cannot be used"):
+    with pytest.raises(UsageError, match="file is a file: name a folder"):
         record_scene("oscillatory", tmp_path / "file" / "a", frames=10)
 
 

@@ -263,6 +263,15 @@ def test_a_changed_run_is_refused_and_left_alone(
     assert contents(out) == before
 
 
+def test_a_run_that_stated_the_clock_of_a_preset_goes_on(tmp_path: Path) -> None:
+    out, source = tmp_path / "run", OscillatorySource(fps=25.0)
+    go(source, out, 20, sections={"record": {"fps": 50.0, "start_ns": 0}})
+    now = {"record": {"fps": source.spec.fps, "start_ns": source.spec.start_ns}}
+    assert go(OscillatorySource(fps=25.0), out, 30, resume=True, sections=now).iterations == 30
+    with pytest.raises(UsageError, match=r"record\.chunk_size = None, not 7"):
+        go(source, out, 40, resume=True, sections={"record": {**now["record"], "chunk_size": 7}})
+
+
 def test_there_must_be_a_run_to_go_on_with(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no run to resume"):
         go(OscillatorySource(), tmp_path, 10, resume=True)

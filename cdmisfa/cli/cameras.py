@@ -130,7 +130,7 @@ frame_options = options.together(
 )
 """How images of cameras, live or stored, become frames."""
 
-camera_options = options.together(
+log_options = options.together(
     topic_option,
     number_options,
     size_option,
@@ -166,6 +166,11 @@ camera_options = options.together(
         ("log", "header"),
         "When a message is of: when it was logged, or the time in its header.",
     ),
+)
+"""What of camera logs becomes frames, and how."""
+
+camera_options = options.together(
+    log_options,
     click.option(
         "--dry-run",
         is_flag=True,
@@ -301,7 +306,7 @@ def live_source(
 
     for folder in (out, record_to):
         if folder is not None:
-            refuse_existing(folder, force=force)
+            refuse_existing(folder, force=force, goes_on=False)
     source, configuration = open_cameras_now(
         words, live, cameras=cameras, preset=preset, settings=settings, say=tell
     )

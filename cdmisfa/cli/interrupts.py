@@ -65,7 +65,7 @@ def end_at_once(code: int | None = None) -> None:
 
 @contextmanager
 def stoppable(
-    notice: str = "stopping after this iteration; again to stop at once\n",
+    notice: str = "finishing what is begun; again to stop at once\n",
 ) -> Iterator[Stop]:
     """Let the body end its step at the first signal, and say so; the second one interrupts it."""
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Final
 
 from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
+
+INTERRUPTED: Final = "interrupted"
+"""Why a run ended that was stopped before it came to an end of its own."""
 
 ENDINGS: Mapping[str, str] = {
     "max_modules": "as many modules as asked for were learned",
@@ -15,7 +19,7 @@ ENDINGS: Mapping[str, str] = {
     "nothing_left": "exploration ended long ago and no further abstraction converged",
     "all_decided": "every stream is learned, known or given up",
     "log_exhausted": "the recording ended",
-    "interrupted": "it was interrupted",
+    INTERRUPTED: "it was interrupted",
 }
 """Why a run ended, in words."""
 
@@ -48,7 +52,7 @@ def learn(
     exhausted: LogExhaustedError | None = None
     modules = learner.max_modules if max_modules is None else max_modules
     while True:
-        ended = ending(learner, modules, max_iterations) or ("interrupted" if stop() else "")
+        ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")
         if ended:
             break
         try:

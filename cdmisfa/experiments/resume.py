@@ -21,6 +21,7 @@ from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import versions
+from cdmisfa.experiments.sources import CLOCK
 from recorder.cameras.words import is_live
 from recorder.log.begun import Begun, found_path, is_path, relative_path
 from recorder.log.whole import partial_path
@@ -216,14 +217,14 @@ def take_over(
     log.sync()
 
 
-def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> Keyframe | None:
+def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> Keyframe | None:
     """Bring learner and source to where the newest keyframe of a log stands; writes nothing.
 
     Args:
         log: of the run that is to be resumed.
         learner: of its configuration.
         source: what it learns from.
-        forked_at: the iteration from which on a fork is itself; 0 where it is none.
+        forked_at: the iteration from which on a fork is itself; None where it is none.
 
     Returns:
         The keyframe; None where the log has none, and all begins anew.
@@ -232,7 +233,7 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int) -> Keyfram
     from replay.runs.stretches import read_columns
 
     keyframe = read_keyframe(log)
-    if forked_at and (keyframe is None or keyframe.iteration < forked_at):
+    if forked_at is not None and (keyframe is None or keyframe.iteration < forked_at):
         raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
     if keyframe is None:
         return None
@@ -328,7 +329,8 @@ def ancestry_of(run: Path | None) -> Mapping[str, Any] | None:
         ancestry = None if run is None else read_header(log_to_resume(run)).manifest.get(FORK)
     except (LogDamagedError, UsageError):  # told where the run is resumed
         return None
-    return ancestry if isinstance(ancestry, Mapping) and ancestry.get("at") else None
+    known = isinstance(ancestry, Mapping) and isinstance(ancestry.get("at"), int)
+    return ancestry if known else None
 
 
 def _has_header(log: Path) -> bool:
@@ -360,10 +362,16 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
             continue  # begun when there was no choice
         if key.startswith("config.scene.") and streams is not None and streams not in SCENES:
             continue  # begun when every source was called a scene
+        if key.removeprefix("config.record.") in CLOCK and _clock(header.spec) == _clock(spec):
+            continue  # begun when a preset's clock was said of every source
         raise UsageError(
             f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: resume with "
             "what it was made with, or choose another folder"
         )
+
+
+def _clock(spec: SourceSpec) -> list[Any]:
+    return [getattr(spec, name) for name in CLOCK]
 
 
 def _json(value: Any) -> Any:

@@ -176,7 +176,7 @@ def run(
 
     def going_back(found: Path) -> None:
         nonlocal stood
-        stood = go_back(found, learner, source, 0 if ancestry is None else ancestry["at"])
+        stood = go_back(found, learner, source, None if ancestry is None else ancestry["at"])
 
     with contextlib.ExitStack() as opened:
         log = shown = None
@@ -188,9 +188,11 @@ def run(
                     {**manifest, **begun},
                     force=force,
                     resume=going_back if resume else None,
+                    goes_on=fork is None and isinstance(source, SeekableSource),
                     fsync_every=fsync_every,
                 )
             )
+            opened.enter_context(_telling_of_interrupts(folder, source))
             told += [
                 _Unfinished(log, learner),
                 Keyframes(log, source, learner, versions, keyframes),
@@ -268,6 +270,24 @@ class _Unfinished(Sink):
 
 
 @contextlib.contextmanager
+def _telling_of_interrupts(run: Path, source: FrameSource) -> Iterator[None]:
+    """Let an interrupt say what is missing of a run, and how to go on."""
+    from replay.integrity.run_files import view_again
+    from replay.runs.folders import RUN_FILE
+
+    try:
+        yield
+    except KeyboardInterrupt:
+        if (run / RUN_FILE).is_file():
+            said = f"all of {run} is there but its view: {view_again(run)}"
+        elif isinstance(source, SeekableSource):
+            said = f"{run} is not finished: go on with --resume"
+        else:
+            said = f"{run} is not finished, and cameras cannot go back: cdmisfa info {run}"
+        raise KeyboardInterrupt(said) from None
+
+
+@contextlib.contextmanager
 def _run_log(
     out: Path,
     spec: SourceSpec,
@@ -275,6 +295,7 @@ def _run_log(
     *,
     force: bool,
     resume: Callable[[Path], None] | None,
+    goes_on: bool,
     fsync_every: float | None,
 ) -> Iterator[RunWriter]:
     """The run's log, to be finished inside, and its folder held.
@@ -287,7 +308,7 @@ def _run_log(
     from replay.runs.writer import RunWriter
 
     if resume is None:
-        refuse_existing(out, force=force)
+        refuse_existing(out, force=force, goes_on=goes_on)
         try:
             make_folder(out)
         except OSError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -27,6 +28,9 @@ OF_CAMERAS = "progress"
 SECTIONS = ("learner", "scene", "record")
 """Configuration tables that a run knows."""
 
+CLOCK = ("fps", "start_ns")
+"""Keys of `record` that logs and cameras say themselves."""
+
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
@@ -38,12 +42,15 @@ class Configuration:
         record: keys `record.*`.
         streams: of what kind the streams are where they are no scene's: "cameras", "gym",
             "foreign"; "" of a scene.
+        clock: frames a second, and log time of frame 0 in nanoseconds, where the source says
+            them; None where `record` does.
     """
 
     learner: Any
     scene: SceneConfig
     record: RecordConfig
     streams: str = ""
+    clock: tuple[float, int] | None = None
 
     def open_scene(self) -> SeekableSource:
         """The live scene; what it computes in the arithmetic that the learner is told to use."""
@@ -55,7 +62,12 @@ class Configuration:
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
         scene = {"kind": self.streams} if self.streams else as_table(self.scene)
-        return {"scene": scene, "record": as_table(self.record)}
+        clock = {} if self.clock is None else dict(zip(CLOCK, self.clock, strict=True))
+        return {"scene": scene, "record": as_table(self.record) | clock}
+
+    def shown_by(self, spec: SourceSpec, streams: str) -> Configuration:
+        """The same of a source that is no live scene, whose streams are of a kind."""
+        return replace(self, streams=streams, clock=(spec.fps, spec.start_ns))
 
 
 def configure(
@@ -207,10 +219,7 @@ def open_source(
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
-    if follow is None and len(words) == 1 and words[0] in SCENES:
-        if cameras is not None and cameras != CameraOptions():
-            refused = are_for(cameras.given(), "camera logs")
-            raise UsageError(f"{words[0]} is a scene: {refused}")
+    if follow is None and is_scene(words, cameras):
         kind = str(words[0])
         configuration = configure(kind, preset, settings, seed)
         return configuration.open_scene(), configuration
@@ -220,10 +229,24 @@ def open_source(
         kind = scene_kind_for(source.spec, described, preset)
         streams = streams_of(described)
         configuration = configure(kind, preset, settings, seed, learner=learner_of(streams))
-        return source, replace(configuration, streams=streams)
+        return source, configuration.shown_by(source.spec, streams)
     except BaseException:
         source.close()
         raise
+
+
+def is_scene(words: Sequence[str | Path], cameras: CameraOptions | None = None) -> bool:
+    """Whether words name a live scene, which no options of cameras are for.
+
+    Raises:
+        UsageError: they do, and some are given.
+    """
+    if len(words) != 1 or words[0] not in SCENES:
+        return False
+    if cameras is not None and (given := cameras.given()):
+        clock = "; its rate is --set record.fps=HZ" if "--rate" in given else ""
+        raise UsageError(f"{words[0]} is a scene: {are_for(given, 'cameras')}{clock}")
+    return True
 
 
 def open_logs(
@@ -233,8 +256,17 @@ def open_logs(
     salvage: bool = False,
     cameras: CameraOptions | None = None,
     follow: float | None = None,
+    goal: tuple[str, str] = ("learn", "RUN"),
 ) -> SeekableSource:
     """Open a recording, or other people's camera logs, as `open_source`, without a configuration.
+
+    Args:
+        words: see `open_source`, as are the next ones.
+        loop: see there.
+        salvage: see there.
+        cameras: see there.
+        follow: see there.
+        goal: see `open_log`.
 
     Raises:
         UsageError: no path that exists.
@@ -248,10 +280,16 @@ def open_logs(
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
+    from recorder.cameras.words import is_live
     from replay.inputs.opening import open_log
     from replay.inputs.words import places
     from replay.storage.location import Url
 
+    if live := [str(word) for word in words if is_live(str(word))]:
+        raise UsageError(
+            f"{live[0]} is a live stream, which cannot go back: record it first, with cdmisfa "
+            f"record {shlex.join(live)} -o REC"
+        )
     paths = places(words)
     for path in paths:
         if not isinstance(path, Url) and not path.exists() and follow is None:
@@ -260,7 +298,7 @@ def open_logs(
                 f"the scenes are {', '.join(SCENES)}"
             )
     if follow is None:
-        return open_log(paths, cameras, loop=loop, salvage=salvage)
+        return open_log(paths, cameras, loop=loop, salvage=salvage, goal=goal)
     from replay.recordings.followed import FollowedSource
 
     if isinstance(paths[0], Url):
@@ -304,18 +342,16 @@ def open_cameras_now(
     framing = {
         key: getattr(cameras, key) for key in ("size", "fit", "depth", "fields", "color", "rate")
     }
-    if cameras != CameraOptions(**framing):
-        raise UsageError(
-            "of live streams only --size, --fit, --range, --field, --color and --rate are set: "
-            "leave out the others"
-        )
+    theirs = CameraOptions(**framing).given()
+    if of_logs := [option for option in cameras.given() if option not in theirs]:
+        raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     live = replace(live, **framing)
     source = open_live([str(word) for word in words], live, say=say, stop=stop)
     try:
         described = source.describe()
         kind = scene_kind_for(source.spec, described, preset)
         configuration = configure(kind, preset, settings, live.seed, learner=OF_CAMERAS)
-        return source, replace(configuration, streams=streams_of(described))
+        return source, configuration.shown_by(source.spec, streams_of(described))
     except BaseException:
         source.close()
         raise

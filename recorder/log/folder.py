@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-from recorder.log.whole import make_folder, refuse_special
+from recorder.log.whole import make_folder, refuse_file, refuse_special
 
 RECORDING = "recording.json"
 """File that says how a recording was begun; gone when every view is finished.
@@ -111,17 +111,22 @@ def view_logs(folder: Path, views: Collection[str]) -> dict[str, list[Path]]:
     return found
 
 
-def refuse_existing(folder: Path, *, force: bool) -> None:
+def refuse_existing(folder: Path, *, force: bool, goes_on: bool = True) -> None:
     """Refuse to write a recording or a run where there is something.
 
+    Args:
+        folder: of the recording or the run.
+        force: what is there is overwritten.
+        goes_on: whether what is there could be gone on with instead, by --resume.
+
     Raises:
-        UsageError: the folder is not empty, or no folder, and `force` is not set.
+        UsageError: the folder is not empty and `force` is not set, or it is a file.
     """
     refuse_special(folder)
-    if folder.exists() and not force and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(
-            f"{folder} exists: choose another folder, go on with --resume or overwrite with --force"
-        )
+    refuse_file(folder)
+    if folder.exists() and not force and any(folder.iterdir()):
+        other = ", go on with --resume" if goes_on else ""
+        raise UsageError(f"{folder} exists: choose another folder{other} or overwrite with --force")
 
 
 def holds_recording(folder: Path) -> bool:

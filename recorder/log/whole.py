@@ -43,11 +43,27 @@ def to_disk(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, with those above it, that a power cut cannot take away again."""
+    """Make a folder, with those above it, that a power cut cannot take away again.
+
+    Raises:
+        UsageError: a file stands there.
+    """
+    for path in (folder, *folder.parents):
+        refuse_file(path)
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for made in reversed(missing):
         to_disk(made.parent)
+
+
+def refuse_file(folder: Path) -> None:
+    """Refuse to make a folder where a file stands.
+
+    Raises:
+        UsageError: so it does.
+    """
+    if folder.is_file():
+        raise UsageError(f"{folder} is a file: name a folder, which is made if it is not there")
 
 
 def refuse_taken(path: Path, *, force: bool) -> None:
@@ -61,6 +77,16 @@ def refuse_taken(path: Path, *, force: bool) -> None:
         raise UsageError(f"{path} is a folder: name the file to write")
     if path.exists() and not force:
         raise UsageError(f"{path} exists: choose another name or overwrite with --force")
+
+
+def refuse_unless_png(path: Path) -> None:
+    """Refuse to write a picture, which is a PNG, under the name of something else.
+
+    Raises:
+        UsageError: its name ends otherwise.
+    """
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"{path}: the picture is a PNG, name it {path.stem}.png")
 
 
 def refuse_special(*paths: Path) -> None:
@@ -94,16 +120,17 @@ def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
         A path that does not exist.
 
     Raises:
-        UsageError: that name is a device's, or that of something else that is no file.
+        UsageError: that name is a device's, or that of something else that is no file, or a file
+            stands where its folder would be.
         LogWriteError: it cannot be written.
     """
     refuse_special(path)
     partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
+        make_folder(partial.parent)
         for left in _left(path):
             _remove(left)
         _remove(partial)
-        make_folder(partial.parent)
         yield partial
         if sync and partial.is_file():
             to_disk(partial)
@@ -126,7 +153,7 @@ def whole(path: Path, *, sync: bool = True) -> Iterator[Path]:
 def _left(path: Path) -> Iterator[Path]:
     """What processes left of a name that are not there any more."""
     name = re.compile(rf"{re.escape(path.name)}\.(\d+){re.escape(PARTIAL)}")
-    for other in path.parent.iterdir() if path.parent.is_dir() else ():
+    for other in path.parent.iterdir():
         if (found := name.fullmatch(other.name)) and not _lives(int(found[1])):
             yield other
 

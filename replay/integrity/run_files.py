@@ -75,13 +75,13 @@ class RunPass:
         yield from _check_modules(folder / MODULES_FILE, final.get("modules_sha256"))
         view = folder / VIEW_FILE
         if final.get("view") == json.dumps(True) and not view.is_file():
-            yield Problem(str(view), f"is missing; {_view_again(folder)}")
+            yield Problem(str(view), f"is missing; {view_again(folder)}")
 
     def notes(self) -> Iterator[str]:
         """What nothing proves."""
         folder = self._log.parent
         if self._beside and (view := folder / VIEW_FILE).is_file():
-            yield f"{view} is not checked: {_view_again(folder)}"
+            yield f"{view} is not checked: {view_again(folder)}"
         if self._final is None:
             yield f"{self._log} holds no final record: nothing proves what is beside it"
 
@@ -109,7 +109,7 @@ class RunPass:
             self._stretches = None
 
 
-def _view_again(run: Path) -> str:
+def view_again(run: Path) -> str:
     """How the view of a run comes back; it holds nothing that the log does not."""
     command = ("cdmisfa", "view", str(run), "--save", str(run / VIEW_FILE), "--force")
     return f"make it again with {shlex.join(command)}"

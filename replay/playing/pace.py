@@ -32,11 +32,13 @@ class Played:
         count: how many items.
         seconds: of log time, all rounds together.
         behind: seconds by which the last item came late.
+        stopped: whether it was ended before the last item.
     """
 
     count: int = 0
     seconds: float = 0.0
     behind: float = 0.0
+    stopped: bool = False
 
 
 def rounds(
@@ -87,6 +89,7 @@ def paced(
         while (left := due - now()) > 0 and not stop():
             sleep(min(left, SLICE))
         if stop():
+            played.stopped = True
             return
         played.count += 1
         played.seconds = since / NANOSECONDS

@@ -77,11 +77,11 @@ class RunHeader:
         return version if isinstance(version, int) else 1
 
     @property
-    def forked_at(self) -> int:
-        """Iterations that a fork has in common with its parent; 0 of a run that is none."""
+    def forked_at(self) -> int | None:
+        """Iterations that a fork has in common with its parent; None of a run that is no fork."""
         fork = self.manifest.get("fork")
         at = fork.get("at") if isinstance(fork, Mapping) else None
-        return at if isinstance(at, int) and at > 0 else 0
+        return at if isinstance(at, int) and at >= 0 else None
 
     def setting(self, section: str, key: str) -> Any:
         """A value of the run's configuration, as `setting("learner", "delta")`, or None."""

@@ -102,7 +102,7 @@ def _fork(row: Row) -> str:
     """What a fork is one of; "" of another run."""
     header = row.outline.header
     ancestry = header.manifest.get("fork")
-    if not header.forked_at or not isinstance(ancestry, Mapping):
+    if header.forked_at is None or not isinstance(ancestry, Mapping):
         return ""
     changed = ancestry.get("changed")
     told = changed.items() if isinstance(changed, Mapping) else ()
@@ -129,7 +129,7 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
     for columns in read_columns(run, header):
         for entity, kept, values in _curves(columns, header.spec.streams, shown):
             path, rows = f"{root}/{entity}", values.reshape(int(kept.sum()), -1)
-            if fork and entity not in marked and len(rows):
+            if fork is not None and entity not in marked and len(rows):
                 at = columns.iterations[kept]
                 first = int(np.searchsorted(at, fork))
                 if first < len(at):
@@ -209,7 +209,7 @@ def _layout(rows: Sequence[Row], tab: str | None) -> rrb.Blueprint:
         marks = [
             f"{root}/{FORKED}/{entity}"
             for root, row in zip(roots, rows, strict=True)
-            if row.outline.header.forked_at
+            if row.outline.header.forked_at is not None
         ]
         return lines(title, [*(f"{root}/{entity}" for root in roots), *marks], axis)
 

@@ -129,6 +129,7 @@ def learn_command(
     if not source:
         learn_as_begun(ctx, out if resume else None)
         return
+    from cdmisfa.experiments.loop import INTERRUPTED
     from cdmisfa.experiments.resume import command_of
     from cdmisfa.experiments.runs import RunExhaustedError, run
     from cdmisfa.experiments.sources import open_source
@@ -210,7 +211,7 @@ def learn_command(
     if resume and not reporter.told and not stop():
         click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)
-    if stop():
+    if result.ended == INTERRUPTED:
         ctx.exit(stop.exit_code)
 
 

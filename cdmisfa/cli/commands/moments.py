@@ -141,7 +141,7 @@ def check_command(
 @click.command("fork")
 @options.path_argument("run")
 @click.option(
-    "--at", type=click.IntRange(1), required=True, metavar="K", help="Iterations kept of the run."
+    "--at", type=click.IntRange(0), required=True, metavar="K", help="Iterations kept of the run."
 )
 @options.out("Folder of the fork.", required=True)
 @click.option(
@@ -186,6 +186,7 @@ def fork_command(
 
     It has the run's first K iterations as they are; resume, check and view it like any run.
     """
+    from cdmisfa.experiments.loop import INTERRUPTED
     from cdmisfa.experiments.recompute.forks import fork_run
     from cdmisfa.experiments.runs import RunExhaustedError
 
@@ -213,5 +214,5 @@ def fork_command(
     show(result, as_json=as_json)
     both = f"cdmisfa compare {options.quoted(run)} {options.quoted(out)} --save both.rrd"
     click.echo(f"both in one view: {both}", err=True)
-    if stop():
+    if result.ended == INTERRUPTED:
         ctx.exit(stop.exit_code)

@@ -91,7 +91,7 @@ def record_command(
     same seed gives the same bytes. Or it is live streams, one or several: camera:/dev/video0,
     rtsp://, http://.../x.mjpg, tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
     """
-    from cdmisfa.experiments.sources import configure
+    from cdmisfa.experiments.sources import configure, is_scene
     from recorder.cameras.words import is_live
     from recorder.log.begun import Begun, read_recording
     from recorder.world.scenes import SCENES
@@ -121,11 +121,6 @@ def record_command(
             settings=settings,
         )
         return
-    if cameras != CameraOptions():
-        raise UsageError(
-            "--size, --fit, --rate, --range, --field and --color are for cameras: a scene has "
-            "record.fps, and its own"
-        )
     _refuse_logs(source)
     begun = read_recording(out) if resume and out is not None else Begun()
     if begun.source and begun.source[0] in LIVE:
@@ -138,6 +133,7 @@ def record_command(
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
     named = "".join(source or begun.source)
+    is_scene([named], cameras)  # which refuses options of cameras
     if resume and out is not None and not (named or frames or given_seed or split):
         from recorder.recording import recorded
 
@@ -203,7 +199,7 @@ def _refuse_logs(words: tuple[str, ...]) -> None:
     """Refuse what is recorded already, and more than one scene."""
     from recorder.world.scenes import SCENES
 
-    logs = [w for w in words if w not in SCENES and (Path(w).exists() or set("*?:") & set(w))]
+    logs = [w for w in words if w and w not in SCENES and (Path(w).exists() or set("*?:") & set(w))]
     if logs:
         convert = f"cdmisfa convert {shlex.join(logs)} -o REC"
         raise UsageError(f"{logs[0]} is a log, no scene: write it as a recording with {convert}")
@@ -233,7 +229,7 @@ def record_streams(
     from recorder.log.split import Split
     from recorder.recording import DEFAULT_FRAMES
 
-    refuse_existing(out, force=force)
+    refuse_existing(out, force=force, goes_on=False)
     with stoppable(notice="finishing the recording; again to stop at once\n") as stop:
         source, configuration = open_cameras_now(
             words,
@@ -265,7 +261,7 @@ def record_streams(
         tell(f"ended at frame {recorded.t}: {recorded.ended}")
     say_counts(recorded)
     print_recording(out, recorded.files, as_json=as_json)
-    if stop() and frames is not None:
+    if stop() and frames is not None and recorded.t < frames:
         ctx.exit(stop.exit_code)
 
 

@@ -238,5 +238,5 @@ def play_command(
         )
     else:
         click.echo(f"played {played.count} {what}, {played.seconds:.2f} s of the recording")
-    if stop() and not loop:
+    if played.stopped and not loop:
         ctx.exit(stop.exit_code)
