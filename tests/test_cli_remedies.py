@@ -99,6 +99,95 @@ def test_errors_about_a_fetched_log_name_its_url(
     assert "/cdmisfa-" not in done.err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("learn", "oscillatory", "-o"),
+        ("record", "oscillatory", "-o"),
+        ("record", "oscillatory", "--resume", "-o"),
+        ("sweep", "oscillatory", "--seeds", 0, "-o"),
+        ("fork", "RUN", "--at", 3, "-o"),
+        ("plot", "RUN", "-o"),
+    ],
+    ids=lambda words: " ".join(map(str, words)),
+)
+def test_a_file_is_not_taken_for_a_folder(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"kept")
+    force = ("--force",) if words[0] in ("learn", "fork") else ()
+    for out in (file, file / "below"):
+        told = (str(word).replace("RUN", str(oscillatory_run)) for word in words)
+        done = cdmisfa(*told, out, *force)
+        assert (done.code, done.err.count("\n")) == (2, 1)
+        assert f"{file} is a file: name a folder" in done.err
+    assert file.read_bytes() == b"kept"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("learn", "oscillatory", "-o", ""),
+        ("record", "oscillatory", "--frames", 20, "-o", ""),
+        ("view", "RUN", "--save", ""),
+        ("fork", "", "--at", 3, "-o", "fork"),
+        ("learn", ""),
+        ("view", ""),
+        ("info", ""),
+        ("play", ""),
+    ],
+    ids=lambda words: " ".join(map(str, words)),
+)
+def test_no_name_is_not_the_folder_one_is_in(
+    cdmisfa: Cdmisfa,
+    oscillatory_run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = cdmisfa(*(str(word).replace("RUN", str(oscillatory_run)) for word in words))
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "is empty: name a" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resuming_is_advised_only_where_it_can_be(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "there").touch()
+    for words, goes_on in (
+        (("fork", oscillatory_run, "--at", 3), False),
+        (("learn", "gym:Pendulum-v1"), False),
+        (("record", "gym:Pendulum-v1"), False),
+        (("learn", "oscillatory"), True),
+        (("record", "oscillatory"), True),
+    ):
+        done = cdmisfa(*words, "-o", tmp_path)
+        assert (done.code, "go on with --resume" in done.err) == (2, goes_on)
+        assert f"{tmp_path} exists: choose another folder" in done.err
+
+
+def test_a_picture_is_not_written_under_the_name_of_another_format(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path
+) -> None:
+    done = cdmisfa("view", oscillatory_run, "--screenshot", tmp_path / "x.jpg")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "the picture is a PNG, name it x.png" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_of_cameras_are_refused_for_a_scene_by_their_names(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    for command in ("learn", "record", "sweep"):
+        done = cdmisfa(command, "oscillatory", "-o", tmp_path / "o", "--size", "8x8", "--rate", 9)
+        assert (done.code, list(tmp_path.iterdir())) == (2, [])
+        told = "oscillatory is a scene: --size and --rate are for cameras; its rate is --set rec"
+        assert told in done.err
+
+
 def test_advice_can_be_pasted_into_a_shell(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     run = tmp_path / "my run #1"
     done = cdmisfa("learn", "oscillatory", "-o", run, "--max-iterations", 3, *SHORT)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.server
 import io
+import json
 import re
 import socket
 import subprocess
@@ -32,6 +33,7 @@ from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.video import video_camera
 from recorder.cameras.words import LiveOptions, is_live, open_live, stream_names
 from replay.recordings.source import RecordedSource
+from replay.runs.log import read_header
 
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
 
@@ -493,7 +495,7 @@ def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
         (["learn", TEST, "--resume", "-o", "run"], "learn from a recording of them"),
         (
             ["learn", TEST, "--topic", "/x"],
-            "of live streams only --size, --fit, --range, --field, --color and --rate",
+            "is a live stream: --topic is for logs",
         ),
         (["learn", "oscillatory", "--record", "x"], "--record is for live streams"),
         (["record", TEST, "-o", "x", "--resume"], "leave out --resume"),
@@ -501,11 +503,11 @@ def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
         (["record", "icub", "oscillatory", "-o", "x"], "record one scene at a time"),
         (
             ["record", "icub", "--fit", "pad", "-o", "x"],
-            "--fit, --rate, --range, --field and --color are for cameras",
+            "icub is a scene: --fit is for cameras",
         ),
         (
             ["record", "icub", "--size", "32x24", "-o", "x"],
-            "--size, --fit, --rate, --range, --field and --color are for cameras",
+            "icub is a scene: --size is for cameras",
         ),
     ],
 )
@@ -550,3 +552,14 @@ def test_a_recording_of_cameras_that_was_killed_can_be_read_and_not_resumed(
     cdmisfa("recover", str(tmp_path / "rec"), "-o", str(tmp_path / "saved"))
     with contextlib.closing(RecordedSource(tmp_path / "saved")) as source:
         assert source.frames > 0
+
+
+def test_a_run_states_the_clock_of_what_it_learned_from(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    told = ("--max-iterations", 1, "--no-rerun", "--json")
+    live = ("learn", "gym:Pendulum-v1", "-o", tmp_path / "live", "--record", tmp_path / "rec")
+    assert cdmisfa(*live, *told).code == 0
+    assert cdmisfa("learn", tmp_path / "rec", "-o", tmp_path / "again", *told).code == 0
+    for run in ("live", "again"):
+        stated = json.loads((tmp_path / run / "run.json").read_text())["config"]["record"]
+        spec = read_header(tmp_path / run / "run.mcap").spec
+        assert (stated["fps"], stated["start_ns"]) == (30.0, spec.start_ns)

@@ -10,6 +10,7 @@ import io
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -26,6 +27,7 @@ import psutil
 import pytest
 from camera_files import write_cameras
 from click.testing import CliRunner
+from conftest import Cdmisfa
 from engine_tasks import trace
 from pyarrow import parquet
 from waiting import wait_for
@@ -41,10 +43,11 @@ from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.runs import run
 from cdmisfa.experiments.sources import open_source
 from cdmisfa.experiments.store import ROWS, read_rows
-from cdmisfa.experiments.sweep import REQUEST, plan, sweep
+from cdmisfa.experiments.sweep import REQUEST, UNKEPT, plan, sweep
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 
+LEFT = ("--topic", "/left", "--size", "8x8")
 GRID = {"learner.sigma": [0, 0.0009]}
 
 
@@ -169,6 +172,33 @@ def test_cameras_are_swept_with_the_learner_that_learn_takes(tmp_path: Path) -> 
     assert chosen.configuration.learner.algorithm == "2.0"
     report = sweep([log], tmp_path / "sweep", seeds=[0], max_iterations=2)
     assert (report.computed, report.failed) == (1, ())
+
+
+def test_logs_are_swept_as_the_options_say(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    log = tmp_path / "log.mcap"
+    write_cameras(log, {"/left": (100, 20), "/right": (100, 40)})
+    short = ("--seeds", 0, "--max-iterations", 2)
+    swept = ("sweep", log, "-o", tmp_path / "sweep", *short)
+    refused = cdmisfa(*swept, "--topic", "/*")
+    assert refused.code == 2
+    advised = shlex.split(refused.err.partition("as with: ")[2])
+    assert advised[:2] == ["cdmisfa", "sweep"]
+    assert cdmisfa(*advised[1:-1], tmp_path / "advised", *short).code == 0
+
+    learned = cdmisfa("learn", log, *LEFT, "--max-iterations", 2, "--json").json
+    assert cdmisfa(*swept, *LEFT).code == 0
+    (row,) = read_rows(tmp_path / "sweep")
+    assert row["result"] == {key: value for key, value in learned.items() if key not in UNKEPT}
+    again = cdmisfa(*swept, *LEFT, "--json").json
+    assert (again["skipped"], again["computed"]) == (1, 0)
+    later = cdmisfa(*swept, "--topic", "/left", "--from", 0.2, "--json").json
+    assert (later["skipped"], later["computed"]) == (0, 1)
+
+
+def test_live_streams_are_to_be_recorded_before_a_sweep(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    done = cdmisfa("sweep", "gym:Pendulum-v1", "-o", tmp_path / "sweep", "--seeds", 0)
+    assert (done.code, list(tmp_path.iterdir())) == (2, [])
+    assert "record it first, with cdmisfa record gym:Pendulum-v1 -o REC" in done.err
 
 
 # Going on

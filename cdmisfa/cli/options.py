@@ -25,10 +25,12 @@ SCHEMA = 1
 
 
 class LocalPath(click.Path):
-    """A path on this machine: a URL would become a folder `s3:`."""
+    """A path on this machine: a URL would become a folder `s3:`, no name at all the current one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """See `click.ParamType`."""
+        if not str(value):
+            self.fail("it is empty: name a path", param, ctx)
         if "://" in str(value):
             self.fail(f"{value} is a URL: name a path on this machine", param, ctx)
         return super().convert(value, param, ctx)
@@ -212,12 +214,13 @@ def _matched(words: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _copy_of(ctx: click.Context, word: str) -> Path:
-    if "://" not in word:
-        return Path(word)
-    from replay.storage.location import location
-    from replay.storage.opening import fetched
+    from replay.storage.location import Url, location
 
     place = location(word)
+    if not isinstance(place, Url):
+        return place
+    from replay.storage.opening import fetched
+
     copy = ctx.with_resource(fetched(place))
     names = ctx.meta.setdefault(FETCHED, [])
     names += [(str(copy), str(place)), (str(copy.parent), str(place.parent))]

@@ -84,12 +84,17 @@ def _cpu() -> str:
     return platform.processor() or "unknown"
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document, whole or not at all.
+def as_text(document: Mapping[str, Any]) -> str:
+    """A JSON document as its file has it."""
+    return json.dumps(document, indent=2) + "\n"
+
+
+def write_json(path: Path, document: Mapping[str, Any] | str) -> None:
+    """Write a JSON document, or its text, whole or not at all.
 
     Raises:
         LogWriteError: the file cannot be written.
     """
-    text = json.dumps(document, indent=2) + "\n"
+    text = document if isinstance(document, str) else as_text(document)
     with whole(path) as partial:
         partial.write_text(text, encoding="utf-8")

@@ -7,22 +7,24 @@ what is missing in its folder; see `store`.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS
+from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.memory import MAX_LIST
-from cdmisfa.experiments.documents import write_json
+from cdmisfa.experiments.documents import as_text, write_json
 from cdmisfa.experiments.runs import module_table, run
 from cdmisfa.experiments.sources import (
     Configuration,
     configure,
+    is_scene,
     learner_of,
     open_logs,
     scene_kind_for,
@@ -33,6 +35,7 @@ from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES
+from replay.camera_logs.options import CameraOptions
 from replay.storage.limits import Limits, limited, limits
 
 REQUEST = "sweep.json"
@@ -63,6 +66,7 @@ class SweepTrial:
     point: Mapping[str, str]
     seed: int
     loop: bool
+    cameras: CameraOptions
     max_iterations: int | None
     max_modules: int | None
     log: Path | None
@@ -79,6 +83,7 @@ def sweep(
     preset: str | None = None,
     settings: Sequence[str] = (),
     loop: bool = False,
+    cameras: CameraOptions | None = None,
     max_iterations: int | None = None,
     max_modules: int | None = None,
     jobs: int = 1,
@@ -98,6 +103,7 @@ def sweep(
         preset: instead of the source's own.
         settings: `section.key=value` words for all trials.
         loop: start a recording again at its end.
+        cameras: how images of others become frames; see `open_source`.
         max_iterations: end each trial after so many.
         max_modules: end each trial after so many.
         jobs: local processes.
@@ -122,12 +128,13 @@ def sweep(
         preset=preset,
         settings=settings,
         loop=loop,
+        cameras=cameras,
         max_iterations=max_iterations,
         max_modules=max_modules,
         logs=folder / "trials" if keep_logs else None,
     )
-    request = _request(grid or {}, trials)
-    if len(json.dumps(request, indent=2)) >= MAX_LIST:
+    request = as_text(_request(grid or {}, trials))
+    if len(request) > MAX_LIST:
         raise UsageError(
             f"{len(trials)} trials are more than a folder takes: split them over several -o"
         )
@@ -152,6 +159,7 @@ def plan(
     preset: str | None = None,
     settings: Sequence[str] = (),
     loop: bool = False,
+    cameras: CameraOptions | None = None,
     max_iterations: int | None = None,
     max_modules: int | None = None,
     logs: Path | None = None,
@@ -162,7 +170,8 @@ def plan(
         UsageError: an unknown key, a value that does not fit, or no such source.
     """
     words = (source,) if isinstance(source, str | Path) else tuple(source)
-    kind, recorded = _identify(words, preset, loop)
+    cameras = cameras or CameraOptions()
+    kind, recorded, spec = _identify(words, preset, loop, cameras)
     streams = "" if recorded is None else streams_of(recorded)
     points = [
         dict(zip(grid, map(str, values), strict=True))
@@ -177,7 +186,9 @@ def plan(
         chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
         seeded = _seeded(kind, preset, chosen, learner_of(streams))
         for seed in each:
-            configuration = replace(seeded(seed), streams=streams)
+            configuration = seeded(seed)
+            if spec is not None:
+                configuration = configuration.shown_by(spec, streams)
             depends: list[Any] = [as_table(configuration.learner)]
             used = LEARNERS.versions(configuration.learner.algorithm)
             if recorded is None:  # the world's part counts only where it is live
@@ -185,6 +196,8 @@ def plan(
                 used |= SCENES.versions(configuration.scene.kind)
             if used:
                 depends.append(used)
+            if cameras != CameraOptions():
+                depends.append(dataclasses.asdict(cameras))
             name = identity(depends, seed, recorded, ends, code())
             trial = SweepTrial(
                 id=name,
@@ -193,6 +206,7 @@ def plan(
                 point=point,
                 seed=seed,
                 loop=loop,
+                cameras=cameras,
                 max_iterations=max_iterations,
                 max_modules=max_modules,
                 log=logs / name if logs is not None else None,
@@ -213,20 +227,21 @@ def _seeded(
     return lambda seed: replace(base, scene=replace(base.scene, seed=seed))
 
 
-def _identify(words: tuple[str | Path, ...], preset: str | None, loop: bool) -> tuple[str, Any]:
-    """The scene's name, and what tells a recording's bytes from another's (None where live)."""
-    if _is_live(words):
-        return str(words[0]), None
-    source = open_logs(words, loop=loop)
+def _identify(
+    words: tuple[str | Path, ...], preset: str | None, loop: bool, cameras: CameraOptions
+) -> tuple[str, Any, SourceSpec | None]:
+    """The scene's name, and what tells a recording's bytes from another's, and its streams.
+
+    The latter two are None where it is live.
+    """
+    if is_scene(words, cameras):
+        return str(words[0]), None, None
+    source = open_logs(words, loop=loop, cameras=cameras, goal=("sweep", "SWEEP"))
     try:
         described = dict(source.describe())
-        return scene_kind_for(source.spec, described, preset), described
+        return scene_kind_for(source.spec, described, preset), described, source.spec
     finally:
         source.close()
-
-
-def _is_live(words: Sequence[str | Path]) -> bool:
-    return len(words) == 1 and words[0] in SCENES
 
 
 def compute(trial: SweepTrial) -> Mapping[str, Any]:
@@ -266,11 +281,11 @@ def _compiled_trial(trial: SweepTrial) -> dict[str, Any]:
 
 def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     configuration = trial.configuration
-    if _is_live(trial.source):
+    if is_scene(trial.source):
         source = configuration.open_scene()
     else:
         with limited(trial.limits):
-            source = open_logs(trial.source, loop=trial.loop)
+            source = open_logs(trial.source, loop=trial.loop, cameras=trial.cameras)
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:

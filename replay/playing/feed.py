@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,8 +92,11 @@ def opened_source(paths: Sequence[Path], fps: float | None) -> Iterator[Logged]:
     try:
         source = open_to_look(paths, CameraOptions(rate=fps))
     except UsageError as error:  # where --rate is how fast it is played, and there is no --time
-        said = str(error).partition(", or name the column")[0]
-        raise UsageError(said.replace("--rate", "--fps")) from None
+        said = str(error).replace("set one with --rate", "set one with --fps")
+        files = shlex.join(map(str, paths))
+        convert = f"play what cdmisfa convert {files} --time COLUMN -o REC writes"
+        said = said.replace("name the column of its times with --time", convert)
+        raise UsageError(said) from None
     with contextlib.closing(source):
         yield source
 

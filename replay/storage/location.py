@@ -63,8 +63,10 @@ def location(value: str | Path | Url) -> Location:
     """Tell a URL from a path.
 
     Raises:
-        UsageError: a URL of a kind that is not read.
+        UsageError: a URL of a kind that is not read, or no name at all.
     """
+    if value == "":
+        raise UsageError("a name is empty: name a path or a URL")
     found = _URL.match(value) if isinstance(value, str) else None
     if not isinstance(value, str) or found is None:
         return value if isinstance(value, Url) else Path(value)

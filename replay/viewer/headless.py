@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
-from recorder.log.whole import refuse_taken, whole
+from recorder.log.whole import refuse_taken, refuse_unless_png, whole
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
 from replay.view.columns import FRAME
@@ -50,10 +50,11 @@ def screenshot(
         window: size, as "1600x1000".
 
     Raises:
-        UsageError: `out` exists and `force` is not set, there is no such moment or tab, or no
-            such size.
+        UsageError: `out` is no .png, or exists and `force` is not set, there is no such moment or
+            tab, or no such size.
         CdmisfaError: no driver, or the viewer failed.
     """
+    refuse_unless_png(out)
     refuse_taken(out, force=force)
     check_size(window)
     frame = None if at is None else frame_at(path, str(at))
@@ -87,10 +88,12 @@ def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WI
         window: size, as "1600x1000".
 
     Raises:
-        UsageError: `out` exists and `force` is not set, no such size, or no run is there.
+        UsageError: `out` is no .png, or exists and `force` is not set, no such size, or no run is
+            there.
         LogDamagedError: a run without a run.json cannot be read.
         CdmisfaError: no driver, or the viewer or the server failed.
     """
+    refuse_unless_png(out)
     refuse_taken(out, force=force)
     check_size(window)
     if missing_driver():

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options, uploads
+from cdmisfa.cli.cameras import log_options
 from cdmisfa.cli.progress import bar
 
 MOST_SEEDS = 1_000_000
@@ -38,6 +39,7 @@ MOST_SEEDS = 1_000_000
 @click.option("--max-iterations", type=click.IntRange(1), help="End each trial after so many.")
 @click.option("--max-modules", type=click.IntRange(1), help="End each trial after so many.")
 @click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@log_options
 @options.jobs
 @options.engine
 @click.option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
@@ -52,15 +54,26 @@ def sweep_command(
     out: Path,
     grid: tuple[str, ...],
     seeds: str,
+    preset: str | None,
+    settings: tuple[str, ...],
+    max_iterations: int | None,
+    max_modules: int | None,
+    loop: bool,
+    jobs: int,
+    engine: str,
+    scheduler: str | None,
+    keep_logs: bool,
+    retry_failed: bool,
     as_json: bool,
-    **each: Any,
+    **cameras: Any,
 ) -> None:
     """Learn from a source many times, over a grid of settings and seeds.
 
-    SOURCE is what learn takes. A sweep that was stopped is resumed when it is asked for
-    again. Look at what it found with: cdmisfa results DIR
+    SOURCE is what learn takes, but for live streams: record these first. A sweep that was
+    stopped is resumed when it is asked for again. Look at what it found with: cdmisfa results DIR
     """
     from cdmisfa.experiments.sweep import sweep
+    from replay.camera_logs.options import CameraOptions
 
     with bar("sweep", "trials") as shown:
 
@@ -73,8 +86,18 @@ def sweep_command(
                 out,
                 grid=parse_grid(grid),
                 seeds=parse_seeds(seeds),
+                preset=preset,
+                settings=settings,
+                loop=loop,
+                cameras=CameraOptions(**cameras),
+                max_iterations=max_iterations,
+                max_modules=max_modules,
+                jobs=jobs,
+                engine=engine,
+                scheduler=scheduler,
+                keep_logs=keep_logs,
+                retry_failed=retry_failed,
                 progress=progress,
-                **each,
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
