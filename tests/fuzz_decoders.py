@@ -25,6 +25,7 @@ from resource import RUSAGE_SELF, getrusage
 import fuzz_datasets
 import fuzz_mutations
 import numpy as np
+import video_packets
 from camera_files import HEIGHT, WIDTH, pictures
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -38,6 +39,8 @@ from cdmisfa.experiments.results import results
 from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.store import DONE, ROWS
 from recorder.images.messages import image_decoder
+from recorder.images.reading import MessageKind
+from recorder.images.videos import VideoPackets
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
 from replay.camera_logs.opening import open_images
@@ -143,6 +146,20 @@ def _image(schema: str, encoding: str) -> Callable[[Path], object]:
     decode = image_decoder(schema, encoding)
     assert decode is not None
     return lambda path: decode(path.read_bytes())
+
+
+def _video_message(schema: str, encoding: str) -> Callable[[Path], object]:
+    def read(path: Path) -> object:
+        decode = image_decoder(schema, encoding)
+        assert isinstance(decode, VideoPackets)
+        return decode.begins(path.read_bytes()), decode(path.read_bytes())
+
+    return read
+
+
+def _video_messages(schema: str, encoding: str) -> Callable[[], Iterator[bytes]]:
+    write = video_packets.KINDS[MessageKind(schema, encoding)]
+    return lambda: (write(video_packets.video(c)[0], c) for c in ("h264", "h265", "vp9", "av1"))
 
 
 def _pixels() -> bytes:
@@ -325,6 +342,15 @@ DECODERS: Mapping[str, Decoder] = {
     "cdr packed image": Decoder(
         _image("sensor_msgs/msg/CompressedImage", "cdr"), lambda: _ros(False, compressed=True)
     ),
+    **{
+        f"{kind.encoding} video of {kind.schema}": Decoder(
+            _video_message(kind.schema, kind.encoding),
+            _video_messages(kind.schema, kind.encoding),
+            text=kind.encoding == "json",
+            needs="av",
+        )
+        for kind in video_packets.KINDS
+    },
     "picture": Decoder(lambda p: open_images(p.parent, None).image(0), _packed, "0.png"),
     "bag": Decoder(_cameras, _written(".bag", _bag), "a.bag", needs="rosbags"),
     "db3": Decoder(_cameras, _written(".db3", _database), "a.db3", needs="rosbags"),

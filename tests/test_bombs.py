@@ -20,7 +20,8 @@ from cdmisfa.core.untrusted.memory import BUDGET, budget
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS
 from cdmisfa.experiments.sweep import sweep
-from recorder.cameras.video import most_pixels, video_camera
+from recorder.cameras.video import video_camera
+from recorder.images.videos import most_pixels
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
 from recorder.log.logfile import LogFile

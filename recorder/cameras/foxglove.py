@@ -23,6 +23,7 @@ from recorder.images.decoding import Taken, decoder_of
 from recorder.images.messages import holds_distances
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
+from recorder.images.videos import VideoPackets
 
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Names of the protocol, the newer first."""
@@ -101,6 +102,7 @@ class FoxgloveCamera:
             wanted = [{"id": _SUBSCRIPTION, "channelId": number}]
             connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
             steady = Steady()
+            video = decode if isinstance(decode, VideoPackets) else None
             for message in connection:
                 if isinstance(message, bytes) and len(message) >= _HEADER.size:
                     what, subscription, log_time = _HEADER.unpack_from(message)
@@ -110,7 +112,9 @@ class FoxgloveCamera:
                         data = message[_HEADER.size :]
                         if self.distances is None and not self._reading.fields:
                             self.distances = holds_distances(kind.schema, kind.encoding, data)
-                        yield age, decode(data)
+                        if video is None or video.begins(data):
+                            video = None  # it has begun
+                            yield age, decode(data)
                 elif isinstance(message, str) and self._is_gone(message, number):
                     return
 

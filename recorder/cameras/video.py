@@ -14,6 +14,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.frames import frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS, Bytes
+from recorder.images.videos import most_pixels, pyav
 
 DRIFT: Final = 1e-3
 """Seconds a second by which a camera's clock may be slow."""
@@ -26,9 +27,6 @@ LATE: Final = 60
 
 _TIMELESS: Final = 0x80
 """FFmpeg's flag of formats that hold no times (AVFMT_NOTIMESTAMPS): it makes some up, at 25 Hz."""
-
-HELD: Final = 17
-"""Pictures that a decoder holds at most, where they are made from one another: 16 and its own."""
 
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
@@ -138,18 +136,6 @@ class VideoCamera:
         return {"camera": _SECRET.sub("", self._word)}
 
 
-def most_pixels(form: Any, codec: Any) -> int:
-    """Most pixels of a live picture, so that those its decoder holds fit into the budget.
-
-    Args:
-        form: PyAV's format of its pixels; None where it is not known yet.
-        codec: PyAV's codec.
-    """
-    held = 1 if codec.intra_only else HELD
-    bits = form.padded_bits_per_pixel if form is not None else 8
-    return min(MAX_PIXELS, BUDGET * 8 // (held * bits))
-
-
 class Steady:
     """When frames were taken, by their presentation times: coming, they jitter, and these do not.
 
@@ -211,17 +197,3 @@ def video_camera(word: str, name: str, *, timeout: float, color: bool = False) -
 def _reason(error: Exception) -> str:
     """What an error of FFmpeg says, without the address, in which a password may be."""
     return str(getattr(error, "strerror", None) or _SECRET.sub("", one_line(error)))
-
-
-def pyav(word: str) -> Any:
-    """PyAV.
-
-    Raises:
-        UsageError: it is missing.
-    """
-    try:
-        import av
-    except ImportError:
-        raise UsageError(f"{word} needs PyAV: pip install 'cdmisfa[video]'") from None
-    av.logging.set_level(None)
-    return av

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
@@ -23,9 +24,13 @@ from recorder.images.pixels import (
     compressed_gray,
     gray,
 )
+from recorder.images.videos import Packet, VideoPackets
 
 Decoder = Callable[[bytes | memoryview], Bytes]
-"""Turns a message into a gray image, (height, width) uint8; raises MalformedImage."""
+"""Turns a message into a gray image, (height, width) uint8; raises MalformedImage.
+
+One that is `VideoPackets` has to be called with the messages in their order.
+"""
 
 
 class Pixels(NamedTuple):
@@ -52,6 +57,8 @@ def image_decoder(
     """
     if (pixels := _RAW.get((schema, encoding))) is not None:
         return lambda data: gray(**pixels(data)._asdict(), depth=depth, color=color)
+    if (packet := _PACKETS.get((schema, encoding))) is not None:
+        return VideoPackets(packet, color=color)
     packed = _COMPRESSED.get((schema, encoding))
     return None if packed is None else partial(packed, color=color)
 
@@ -113,7 +120,7 @@ class _RosFields:
 
     def __init__(self, data: bytes | memoryview, *, ros1: bool) -> None:
         self._data = memoryview(data)
-        self._at = 0
+        self.at = 0
         self._ros1 = ros1
         self._order = "<"
         if not ros1:
@@ -127,14 +134,14 @@ class _RosFields:
         self.text()
 
     def take(self, count: int) -> memoryview:
-        if count > len(self._data) - self._at:
+        if count > len(self._data) - self.at:
             raise MalformedImage("a ROS message is cut short or lies about a length")
-        self._at += count
-        return self._data[self._at - count : self._at]
+        self.at += count
+        return self._data[self.at - count : self.at]
 
     def u32(self) -> int:
         if not self._ros1:  # CDR's own header has 4 bytes, too
-            self.take(-self._at % 4)
+            self.take(-self.at % 4)
         return int(struct.unpack(self._order + "I", self.take(4))[0])
 
     def data(self) -> memoryview:
@@ -152,7 +159,8 @@ def ros_stamp(data: bytes | memoryview, *, ros1: bool) -> int:
 
 def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
     """What opens Foxglove's images, of which logs need not state a definition; None of others."""
-    kind = {"foxglove.RawImage": RawImage, "foxglove.CompressedImage": CompressedImage}.get(schema)
+    kinds = (RawImage, CompressedImage, CompressedVideo)
+    kind = {kind.DESCRIPTOR.full_name: kind for kind in kinds}.get(schema)
     return None if kind is None or encoding != "protobuf" else partial(_parse, kind)
 
 
@@ -167,6 +175,29 @@ def _ros_compressed(data: bytes | memoryview, *, ros1: bool, color: bool) -> Byt
     fields = _RosFields(data, ros1=ros1)
     fields.text()
     return compressed_gray(bytes(fields.data()), color=color)
+
+
+def _foxglove_video(data: bytes | memoryview) -> Packet:
+    m = _parse(CompressedVideo, data)
+    return Packet(m.data, m.format)
+
+
+def _json_video(data: bytes | memoryview) -> Packet:
+    fields = _json(data)
+    return Packet(_base64(fields), str(fields.get("format")))
+
+
+def _ros_video(data: bytes | memoryview) -> Packet:
+    fields = _RosFields(data, ros1=False)
+    return Packet(bytes(fields.data()), fields.text())
+
+
+def _ffmpeg_packet(data: bytes | memoryview) -> Packet:
+    fields = _RosFields(data, ros1=False)
+    fields.take(-fields.at % 4 + 8)  # width and height
+    codec = fields.text()
+    fields.take(-(fields.at - 4) % 8 + 10)  # a number of 64 bits, and two of 8
+    return Packet(bytes(fields.data()), codec)
 
 
 _RAW: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Pixels]]] = {
@@ -184,5 +215,13 @@ _COMPRESSED: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
     ("sensor_msgs/CompressedImage", "ros1"): partial(_ros_compressed, ros1=True),
 }
 
-SCHEMAS: Final = tuple(sorted({schema for schema, _ in (*_RAW, *_COMPRESSED)}))
+_PACKETS: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Packet]]] = {
+    ("foxglove.CompressedVideo", "protobuf"): _foxglove_video,
+    ("foxglove.CompressedVideo", "json"): _json_video,
+    ("foxglove_msgs/msg/CompressedVideo", "cdr"): _ros_video,
+    ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "cdr"): _ffmpeg_packet,
+}
+"""What messages say that hold a picture of a video."""
+
+SCHEMAS: Final = tuple(sorted({schema for schema, _ in (*_RAW, *_COMPRESSED, *_PACKETS)}))
 """Message types that are read."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from replay.camera_logs.alignment import Times, even_times
 from replay.camera_logs.stream import ImageStream, sorted_times
 from replay.mcap.records import MalformedRecord
 from replay.storage.location import Location
+
+Found = TypeVar("Found")
 
 
 class JoinedImages(ImageStream):
@@ -28,6 +31,7 @@ class JoinedImages(ImageStream):
         self.warnings = [joined] if len(parts) > 1 else []
         self.warnings += [warning for part in parts for warning in part.warnings]
         self.parts = list(parts)
+        self.decode = getattr(parts[0], "decode", None)
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")
         self.times = times[order]
@@ -36,6 +40,12 @@ class JoinedImages(ImageStream):
 
     def image(self, row: int) -> Shown:
         return self.parts[int(self._part_of[row])].image(int(self._row_in[row]))
+
+    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
+        """What is taken of a message, where the logs are of messages."""
+        part: Any = self.parts[int(self._part_of[row])]
+        found: Found = part.taken(int(self._row_in[row]), take)
+        return found
 
     def stamp(self, row: int) -> int:
         return self.parts[int(self._part_of[row])].stamp(int(self._row_in[row]))

@@ -17,6 +17,7 @@ from replay.camera_logs.formats.table import TableNumbers, is_table
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.video_messages import in_order
 from replay.mcap.identity import identity
 from replay.storage.checksum import sha256
 from replay.storage.listing import log_files
@@ -28,6 +29,11 @@ def open_images(
 ) -> ImageStream:
     """Open what `_open` does, by the times that are wanted; raises the same."""
     images = _open(path, topic, salvage=salvage, reading=reading)
+    try:
+        images = in_order(images)
+    except BaseException:
+        images.close()
+        raise
     if reading.stamp == "log":
         return images
     try:

@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -31,6 +31,8 @@ from replay.mcap.records import MAX_CHUNK
 
 BAGS: Final = (".bag", ".db3")
 
+Found = TypeVar("Found")
+
 
 class BagImages(ImageStream):
     """The images, or the numbers, on a topic of a .bag, .db3 or rosbag2's folder, by stamps.
@@ -51,7 +53,7 @@ class BagImages(ImageStream):
         self._opened = contextlib.ExitStack()
         try:
             self._reader, self._packed = self._opened.enter_context(_opened(path))
-            self._connections, self._decode = self._find(topic, reading)
+            self._connections, self.decode = self._find(topic, reading)
             self.topic = str(self._connections[0].topic)
             with explained(path, "rosbags"):
                 stamps = list(self._stamps())
@@ -64,7 +66,7 @@ class BagImages(ImageStream):
         self.warnings = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
     def image(self, row: int) -> Shown:
-        return self._decode(self._message(row))
+        return self.taken(row, self.decode)
 
     def distances(self) -> bool:
         return holds_distances(self._kind.schema, self._kind.encoding, self._message(0))
@@ -75,6 +77,10 @@ class BagImages(ImageStream):
                 f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
             )
         return self._stamp(self._message(row))
+
+    def taken(self, row: int, take: Callable[[bytes], Found]) -> Found:
+        """What is taken of a message."""
+        return take(self._message(row))
 
     def _message(self, row: int) -> bytes:
         with explained(self.path, "rosbags"):

@@ -52,7 +52,7 @@ class McapImages(ImageStream):
         self.reader = LogReader(path, salvage=salvage)
         try:
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
-            self._channel, self._decode = choose_images(path, topic, channels, reading)
+            self._channel, self.decode = choose_images(path, topic, channels, reading)
             self.topic = self._channel.topic
             self._stamp = stamp_of(_kind(self.reader, self._channel))
             self._index()
@@ -62,20 +62,20 @@ class McapImages(ImageStream):
         self.warnings = self.reader.warnings
 
     def image(self, row: int) -> Shown:
-        return self._taken(row, self._decode)
+        return self.taken(row, self.decode)
 
     def distances(self) -> bool:
         kind = _kind(self.reader, self._channel)
-        return self._taken(0, partial(holds_distances, kind.schema, kind.encoding))
+        return self.taken(0, partial(holds_distances, kind.schema, kind.encoding))
 
     def stamp(self, row: int) -> int:
         if self._stamp is None:
             raise UsageError(
                 f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
             )
-        return self._taken(row, self._stamp)
+        return self.taken(row, self._stamp)
 
-    def _taken(self, row: int, take: Callable[[memoryview], Found]) -> Found:
+    def taken(self, row: int, take: Callable[[memoryview], Found]) -> Found:
         """What is taken of a message."""
         table = self.reader.table(self._segments[int(self._segment_of[row])])
         if table is None:

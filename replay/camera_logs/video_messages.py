@@ -1,0 +1,85 @@
+"""Videos in the messages of logs: their pictures, in any order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cdmisfa.core.errors import UsageError
+from recorder.images.frames import VIDEO_RECIPE
+from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.videos import VideoPackets
+from replay.camera_logs.stream import ImageStream
+from replay.mcap.records import MalformedRecord
+
+
+class VideoMessages(ImageStream):
+    """The pictures of a video in a log's messages, from the first that needs none before it.
+
+    Args:
+        messages: the log's: a stream with `taken`, what a function takes of a message.
+        packets: their decoder.
+
+    Raises:
+        UsageError: no picture needs none before it.
+        LogDamagedError: the log is damaged.
+    """
+
+    recipe = VIDEO_RECIPE
+
+    def __init__(self, messages: Any, packets: VideoPackets) -> None:
+        self.path, self.topic = messages.path, messages.topic
+        self.parts = getattr(messages, "parts", [messages])
+        self._messages, self._packets = messages, packets
+        self._next = -1
+        rows = range(len(messages.times))
+        self._first = next((row for row in rows if self._begins(row)), len(rows))
+        if self._first == len(rows):
+            raise UsageError(f"{self.path}: {self.topic}: {self._why()}")
+        self.times = messages.times[self._first :]
+        lost = f"{self.path}: {self._first} pictures that need earlier ones are left out"
+        self.warnings = [*messages.warnings, *([lost] if self._first else [])]
+
+    def image(self, row: int) -> Shown:
+        row += self._first
+        if row != self._next:
+            start = row
+            while start not in (self._first, self._next) and not self._begins(start):
+                start -= 1
+            if start != self._next:
+                self._packets.forget()
+            self._next = -1
+            for before in range(start, row):
+                self._messages.taken(before, self._packets)
+        self._next = -1
+        shown: Shown = self._messages.taken(row, self._packets)
+        self._next = row + 1
+        return shown
+
+    def stamp(self, row: int) -> int:
+        return int(self._messages.stamp(self._first + row))
+
+    def where(self, row: int) -> str:
+        return str(self._messages.where(self._first + row))
+
+    def close(self) -> None:
+        self._messages.close()
+
+    def _why(self) -> str:
+        """Why nothing of the video can be decoded."""
+        try:
+            self._messages.taken(0, self._packets.begins)
+        except (MalformedImage, MalformedRecord) as error:
+            return str(error)
+        return "each picture of its video needs earlier ones"
+
+    def _begins(self, row: int) -> bool:
+        try:
+            return bool(self._messages.taken(row, self._packets.begins))
+        except (MalformedImage, MalformedRecord):
+            return False
+
+
+def in_order(images: ImageStream) -> ImageStream:
+    """A stream of a log's messages, its pictures in any order where these are of a video."""
+    decode = getattr(images, "decode", None)
+    return VideoMessages(images, decode) if isinstance(decode, VideoPackets) else images

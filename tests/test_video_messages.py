@@ -1,0 +1,149 @@
+"""Videos in messages, a picture each, are taken as other images are: from logs and from robots."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import foxglove as foxglove_sdk
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH
+from conftest import Cdmisfa
+from foxglove.channels import CompressedVideoChannel
+from foxglove.messages import CompressedVideo
+from message_files import STEP, every, write_mcap
+from video_packets import COUNT, ENCODERS, FOXGLOVE, GROUP, KINDS, video
+
+from cdmisfa.core.blocks import FrameSource
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.testing.sources import SourceContract
+from recorder.cameras.words import LiveOptions, open_live
+from recorder.images.frames import frame_gray
+from recorder.images.reading import MessageKind
+from replay.camera_logs.opening import open_images
+from replay.camera_logs.source import ForeignSource
+from replay.camera_logs.stream import ImageStream
+
+av = pytest.importorskip("av")
+
+DECODERS = {"h265": "hevc", "av1": "libdav1d"}
+
+
+def decoded(codec: str) -> list[np.ndarray[Any, Any]]:
+    """What FFmpeg shows of it, from its beginning to its end."""
+    decoder: Any = av.CodecContext.create(DECODERS.get(codec, codec), "r")
+    decoder.thread_count = 1
+    frames = [decoder.decode(av.Packet(packet)) for packet in video(codec)]
+    assert all(len(own) == 1 for own in frames)
+    return [frame_gray(own[0]) for own in frames]
+
+
+def write(
+    path: Path, packets: Sequence[bytes], codec: str = "h264", kind: MessageKind = FOXGLOVE
+) -> Path:
+    messages = [KINDS[kind](packet, codec) for packet in packets]
+    return write_mcap(path, kind, {"/cam": every(STEP, messages)})
+
+
+def opened(path: Path) -> contextlib.closing[ImageStream]:
+    return contextlib.closing(open_images(path, None))
+
+
+@pytest.mark.parametrize("codec", ENCODERS)
+def test_pictures_of_a_video_are_the_same_in_any_order(tmp_path: Path, codec: str) -> None:
+    path, expected = write(tmp_path / "a.mcap", video(codec), codec), decoded(codec)
+    with opened(path) as images:
+        for row in (*range(COUNT), 59, 0, 31, 32, 40, 30, 7, 11, 12, 13):
+            np.testing.assert_array_equal(images.image(row), expected[row], err_msg=str(row))
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: f"{kind.schema} {kind.encoding}")
+def test_messages_of_every_kind_hold_videos(tmp_path: Path, kind: MessageKind) -> None:
+    path = write(tmp_path / "a.mcap", video("h264"), "h264", kind)
+    with opened(path) as images:
+        np.testing.assert_array_equal(images.image(30), decoded("h264")[30])
+
+
+class TestVideoMessages(SourceContract):
+    ends = True
+
+    @pytest.fixture(autouse=True)
+    def _logs(self, tmp_path: Path) -> None:
+        self.paths = [write(tmp_path / f"{s}.mcap", video("h264", s)) for s in (0, 1)]
+
+    def open(self) -> FrameSource:
+        return ForeignSource(self.paths, size=(HEIGHT, WIDTH), align="index")
+
+
+def test_a_video_is_taken_from_its_first_whole_picture(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", video("h264")[5:])
+    with opened(path) as images:
+        assert images.count == COUNT - GROUP
+        assert "7 pictures that need earlier ones are left out" in images.warnings[-1]
+        np.testing.assert_array_equal(images.image(0), decoded("h264")[GROUP])
+    path = write(tmp_path / "b.mcap", video("h264")[1:GROUP])
+    with pytest.raises(UsageError, match="/cam: each picture of its video needs earlier ones"):
+        open_images(path, None)
+    path = write(tmp_path / "c.mcap", video("h264"), "theora")
+    with pytest.raises(UsageError, match="a video in 'theora' is not read: h264, h265, vp9 and"):
+        open_images(path, None)
+
+
+def test_what_follows_a_broken_picture_is_not_made_up(tmp_path: Path) -> None:
+    packets = list(video("h264"))
+    packets[15] = packets[15][:-40] + bytes(40)
+    path, expected = write(tmp_path / "a.mcap", packets), decoded("h264")
+    with opened(path) as images:
+        for row in (14, 24, 59):
+            np.testing.assert_array_equal(images.image(row), expected[row])
+    with (
+        contextlib.closing(ForeignSource(path, size=(HEIGHT, WIDTH))) as source,
+        pytest.raises(LogDamagedError, match="its video is broken there"),
+    ):
+        source.take(0, COUNT)
+
+
+def test_a_robots_video_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    path, size = write(tmp_path / "a.mcap", video("h264")), f"{WIDTH}x{HEIGHT}"
+    facts = cdmisfa("info", path, "--json").json
+    assert "foxglove.CompressedVideo" in json.dumps(facts)
+    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
+    learned = cdmisfa("learn", path, "--size", size, *quick)
+    assert learned.code == 0, learned.err
+    assert cdmisfa("convert", path, "--size", size, "-o", tmp_path / "rec").code == 0
+    again = cdmisfa("learn", tmp_path / "rec", "--algorithm", "progress", *quick).json
+    assert again["signals_sha256"] == learned.json["signals_sha256"]
+
+
+def test_a_running_robots_video_is_shown_from_its_first_whole_picture() -> None:
+    context = foxglove_sdk.Context()
+    server = foxglove_sdk.start_server(name="r", host="127.0.0.1", port=0, context=context)
+    channel = CompressedVideoChannel("/cam", context=context)
+    over = threading.Event()
+
+    def show() -> None:
+        row = 3
+        while not over.wait(0.02):
+            data = video("h264")[row % COUNT]
+            channel.log(CompressedVideo(data=data, format="h264"))
+            row += 1
+
+    thread = threading.Thread(target=show)
+    thread.start()
+    try:
+        word, options = f"foxglove://127.0.0.1:{server.port}/cam", LiveOptions(rate=50)
+        with contextlib.closing(open_live([word], options)) as source:
+            frames = source.take(0, 30).frames
+    finally:
+        over.set()
+        thread.join()
+        server.stop()
+    shown = decoded("h264")
+    found = [next((k for k in range(COUNT) if (shown[k] == f).all()), None) for f in frames]
+    assert None not in found
+    assert len(set(found)) > 3
