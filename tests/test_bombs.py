@@ -123,6 +123,23 @@ def test_live_pictures_that_are_too_large_are_refused() -> None:
         next(camera.pictures())
 
 
+@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4"])
+def test_live_pictures_of_just_the_limit_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codec: str
+) -> None:
+    width, height, film = 650, 450, tmp_path / "film.avi"
+    with av.open(str(film), "w") as written:
+        stream = written.add_stream(codec, rate=25)
+        stream.width, stream.height = width, height
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        written.mux(stream.encode(av.VideoFrame(width, height, stream.pix_fmt)))
+        written.mux(stream.encode())
+    monkeypatch.setattr("recorder.cameras.video.MAX_PIXELS", width * height)
+    monkeypatch.setattr("recorder.cameras.video.most_pixels", lambda *_: width * height)
+    _, image = next(video_camera(f"av:{film}", "cam", timeout=5).pictures())
+    assert image.shape == (height, width)
+
+
 LISTS = b"[" + b"[]," * (1 << 21) + b"[]]"
 """6 MiB of JSON that take some 150."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import time
@@ -27,6 +28,9 @@ LATE: Final = 60
 
 _TIMELESS: Final = 0x80
 """FFmpeg's flag of formats that hold no times (AVFMT_NOTIMESTAMPS): it makes some up, at 25 Hz."""
+
+PADDED: Final = 64
+"""Pixels by which FFmpeg makes a picture wider and higher at most before it judges its size."""
 
 _NETWORK: Final = re.compile(r"[a-z][a-z0-9+]+://", re.IGNORECASE)
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@")
@@ -78,7 +82,9 @@ class VideoCamera:
             video = container.streams.video[0]
             context = video.codec_context
             self._check(context, context.codec)
-            context.options = {"max_pixels": str(most_pixels(context.format, context.codec))}
+            most = most_pixels(context.format, context.codec)
+            padded = (context.width + PADDED) * (context.height + PADDED)
+            context.options = {"max_pixels": str(max(most, padded))}
             context.thread_count = 1  # of several cameras, each has a thread
             timed = not (self._remote and container.format.flags & _TIMELESS)
             stated = timed and (video.average_rate or video.guessed_rate)
@@ -86,11 +92,14 @@ class VideoCamera:
             try:
                 yield from self._paced(container.decode(video), context.codec, timed=timed)
             except (OSError, ValueError, self._av.FFmpegError) as error:
-                raise CdmisfaError(f"{self.name} is gone: {_reason(error)}") from None
+                reason = _reason(error)
+                if getattr(error, "errno", None) == errno.EINVAL:  # all that FFmpeg says of it
+                    reason += f", as where pictures come to have more than {most} pixels"
+                raise CdmisfaError(f"{self.name} is gone: {reason}") from None
 
     def _open(self) -> Any:
         """Open it within the budget; what decodes it later does so beside others, without one."""
-        options = {"max_pixels": str(MAX_PIXELS)}
+        options = {"max_pixels": str(2 * MAX_PIXELS)}  # of which a decoder may pad some
         if self._address.startswith("rtsp"):
             options["rtsp_transport"] = "tcp"
         if self._remote:
