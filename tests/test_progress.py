@@ -230,6 +230,11 @@ def test_wrong_settings_are_named(setting: str, message: str) -> None:
         configure("icub", settings=("learner.algorithm=progress", f"learner.{setting}"))
 
 
+def test_a_preset_of_another_learner_is_named() -> None:
+    with pytest.raises(UsageError, match=r"preset icub: .* is progress: leave that preset out"):
+        configure("icub", "icub", ("learner.algorithm=progress",))
+
+
 def test_the_preset_is_the_defaults() -> None:
     chosen = configure("icub", settings=("learner.algorithm=progress",))
     assert chosen.learner == ProgressConfig()

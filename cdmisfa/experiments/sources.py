@@ -122,7 +122,8 @@ def configure(
     if algorithm is None:
         algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
     layers["learner"] = (*layers["learner"], {"algorithm": algorithm})
-    _refuse_keys_of_others(algorithm, {**tables.get("learner", {}), **words.get("learner", {})})
+    _refuse_keys_of_others(algorithm, words.get("learner", {}))
+    _refuse_keys_of_others(algorithm, tables.get("learner", {}), preset)
     scene = build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind})
     return Configuration(
         learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"]),
@@ -131,15 +132,22 @@ def configure(
     )
 
 
-def _refuse_keys_of_others(algorithm: str, keys: Iterable[str]) -> None:
-    """Say so where a key is not this learner's but another's."""
+def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | None = None) -> None:
+    """Say so where a key is not this learner's but another's.
+
+    Args:
+        algorithm: name of the learner.
+        keys: of its configuration.
+        preset: that sets them; None where the user does.
+    """
     own = {field.name for field in fields(LEARNERS[algorithm].configuration)}
     for key in sorted(set(keys) - own):
         for name, entry in LEARNERS.items():
             if key in {field.name for field in fields(entry.configuration)}:
+                by, it = ("", "it") if preset is None else (f"the preset {preset}: ", "that preset")
                 raise UsageError(
-                    f"learner.{key} is of the learner {name}, and this is {algorithm}: leave it "
-                    f"out, or choose the other with --algorithm {name}"
+                    f"{by}learner.{key} is of the learner {name}, and this is {algorithm}: leave "
+                    f"{it} out, or choose the other with --algorithm {name}"
                 )
 
 
