@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,20 @@ def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
     again = library(tmp_path, "sway").stream("sway", 0).frames
     assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns > stamp
     np.testing.assert_array_equal(again, frames)
+
+
+@pytest.mark.parametrize("size", [0, 40, 20_000])
+def test_a_stream_that_was_cut_short_is_made_anew(tmp_path: Path, size: int) -> None:
+    made, wanted = Library(tmp_path), Wanted("sway", 0, ())
+    made.prepare(wanted)
+    frames = made.stream("sway", 0).frames.copy()
+    os.truncate(tmp_path / "sway-0" / "frames.npy", size)
+    with pytest.raises(UsageError, match="sway-0 is damaged: delete it, and it is made anew"):
+        made.stream("sway", 0)
+    assert not made.has(wanted)
+    made.prepare(wanted)
+    assert made.has(wanted)
+    np.testing.assert_array_equal(made.stream("sway", 0).frames, frames)
 
 
 def test_a_stream_that_was_not_made_is_refused(tmp_path: Path) -> None:

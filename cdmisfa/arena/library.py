@@ -27,6 +27,9 @@ from replay.storage.arrays import read_arrays
 RECIPE: Final = 2
 """Rises when streams are made in another way, so that those on disk are made anew."""
 
+_DAMAGED: Final = (OSError, EOFError, ValueError)
+"""What is raised for files that hold no array, or less of it than they say."""
+
 Float = NDArray[np.float64]
 
 
@@ -102,7 +105,7 @@ class Library:
     def has(self, wanted: Wanted) -> bool:
         """Whether nothing of it is left to make."""
         learnable = parse(wanted.name)[0].learnable
-        return _recipe(self._folder(wanted.name, wanted.seed)) == RECIPE and all(
+        return _is_made(self._folder(wanted.name, wanted.seed)) and all(
             self._reference(wanted.name, wanted.seed, *each).is_file()
             for each in wanted.references
             if learnable
@@ -130,8 +133,8 @@ class Library:
         """
         folder = self._folder(name, seed)
         try:
-            frames, state = (np.load(folder / f"{n}.npy", "r") for n in ("frames", "state"))
-        except (OSError, ValueError) as error:
+            frames, state = _mapped(folder)
+        except _DAMAGED as error:
             raise UsageError(f"{folder} is damaged: delete it, and it is made anew") from error
         (signal,) = parse(name)
         return Stream(name, np.asarray(frames), np.asarray(state), STREAMS[signal.kind].loops)
@@ -153,7 +156,7 @@ class Library:
 
     def _make(self, name: str, seed: int) -> None:
         folder = self._folder(name, seed)
-        if _recipe(folder) == RECIPE:
+        if _is_made(folder):
             return
         (signal,) = parse(name)
         plain = None
@@ -228,9 +231,16 @@ def _save(path: Path, found: Reference) -> None:
         )
 
 
-def _recipe(folder: Path) -> Any:
-    """How the stream in a folder was made; None where there is none."""
+def _is_made(folder: Path) -> bool:
+    """Whether a folder holds a whole stream that was made as streams are now."""
     try:
-        return read_json(folder / "about.json", "delete it")["recipe"]
-    except (CdmisfaError, KeyError, TypeError):
-        return None
+        recipe = read_json(folder / "about.json", "delete it")["recipe"]
+        _mapped(folder)
+    except (CdmisfaError, KeyError, TypeError, *_DAMAGED):
+        return False
+    return bool(recipe == RECIPE)
+
+
+def _mapped(folder: Path) -> tuple[NDArray[Any], ...]:
+    """Frames and states of the stream in a folder; a file that was cut short is refused."""
+    return tuple(np.load(folder / f"{name}.npy", "r") for name in ("frames", "state"))
