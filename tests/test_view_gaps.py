@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import rerun as rr
 from run_data import IMAGE, block_of, having, run_of
 from test_view import rows_of
 from test_view_layout import Built
@@ -20,6 +21,7 @@ from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
+from replay.view.columns import Column, line_column
 from replay.viewer.moments import frame_at
 
 ITERATIONS, TAU, EVERY = 15, 40, 20
@@ -128,3 +130,32 @@ def test_axes_reach_to_the_end_of_the_run(shown):
     axes = {time["end"] for _, _, time, *_ in Built(folder / "run.rrd").views("TimeSeries")}
     assert max(axes) >= end
     assert frame_at(folder, str(end - 1)) == end - 1
+
+
+@pytest.mark.parametrize("entity", ["/world/truth", "/signals/y", "/learned/1/followed"])
+def test_a_line_of_every_frame_ends_where_a_gap_begins(shown, entity):
+    _, _, rows = shown
+    frames, values = rows[entity]["frame"], rows[entity]["Scalars:scalars"]
+    assert frames == sorted(set(frames))
+    here = frames.index(GAP_AFTER * TAU)
+    assert frames[here + 1] == GAP_AFTER * TAU + GAP
+    assert np.isnan(values[here]).all()
+    if entity != "/signals/y":  # which nothing is there of at first
+        assert np.isfinite([values[here - 1], values[here + 1]]).all()
+
+
+def test_a_line_of_blocks_leads_from_one_to_the_next(shown):
+    _, records, rows = shown
+    assert rows["/signals/eta"]["frame"] == [record.t for record in records]
+
+
+def test_a_gap_between_two_handfuls_of_rows_ends_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = []
+    monkeypatch.setattr(Column, "send", lambda self, times, values: sent.append(values[:, 0]))
+    with rr.RecordingStream("test") as recording:
+        column = line_column(recording, IMAGE, "a", ["a"], every_frame=True)
+        for frames in ([0, 1], [2], [5, 6, 9]):
+            column.add(np.array(frames), None, np.array(frames)[:, None])
+            column.flush()
+    nan = np.nan
+    np.testing.assert_equal(np.concatenate(sent), [0, 1, 2, nan, 5, 6, nan, 9])

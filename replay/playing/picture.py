@@ -66,7 +66,9 @@ def play_in_rerun(
         recording.send_recording_name(label(paths[0].resolve().stem))
         recording.send_blueprint(recording_layout(spec, first + count))
         columns = [frames_column(recording, spec, entity) for entity in view_entities(spec)]
-        truth = line_column(recording, spec, "world/truth", spec.truth) if spec.truth else None
+        truth = None
+        if spec.truth:
+            truth = line_column(recording, spec, "world/truth", spec.truth, every_frame=True)
         every = [*columns, *([truth] if truth is not None else [])]
         broadcast.hand_over()
         announce(broadcast.address)

@@ -76,13 +76,23 @@ class Column:
         spec: of the source, for the log time of a frame.
         path: the entity.
         style: what is said of it once.
+        every_frame: its rows are of every frame that there is, so that where frames are missing
+            there is a gap; a row of NaN there ends lines, which would lead across.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, style: Any = None
+        self,
+        recording: rr.RecordingStream,
+        spec: SourceSpec,
+        path: str,
+        style: Any = None,
+        *,
+        every_frame: bool = False,
     ) -> None:
         self.path = path
         self._style, self._begun = style, False
+        self._every_frame = every_frame
+        self._last: tuple[Frames, Frames | None] | None = None
         self._recording = recording
         self._spec = spec
         self._frames: list[Frames] = []
@@ -111,11 +121,29 @@ class Column:
             if self._style is not None and not self._begun:
                 self._recording.log(self.path, self._style, static=True)
             self._begun = True
+            frames = _joined(self._frames)
             iterations = _joined(self._iterations) if self._iterations else None
-            times = time_columns(self._spec, _joined(self._frames), iterations)
-            self.send(times, values)
+            if self._every_frame:
+                frames, iterations, values = self._ended_at_gaps(frames, iterations, values)
+            self.send(time_columns(self._spec, frames, iterations), values)
         self._frames, self._iterations, self._values = [], [], []
         self._waiting = self._bytes = 0
+
+    def _ended_at_gaps(
+        self, frames: Frames, iterations: Frames | None, values: NDArray[Any]
+    ) -> tuple[Frames, Frames | None, NDArray[Any]]:
+        """Rows with one more of NaN where each gap begins, at the iteration before."""
+        last, last_iteration = self._last or (frames[:1], iterations)
+        self._last = frames[-1:], None if iterations is None else iterations[-1:]
+        before = np.concatenate([last, frames[:-1]])
+        gaps = np.flatnonzero(frames - before > 1)
+        if not len(gaps):
+            return frames, iterations, values
+        if iterations is not None and last_iteration is not None:
+            of_before = np.concatenate([last_iteration[:1], iterations[:-1]])
+            iterations = np.insert(iterations, gaps, of_before[gaps])
+        values = np.insert(values.astype(np.float64), gaps, np.nan, axis=0)
+        return np.insert(frames, gaps, before[gaps] + 1), iterations, values
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand (n, ...) values over as rows of scalars."""
@@ -140,6 +168,7 @@ def line_column(
     width: float | None = None,
     *,
     steps: bool = False,
+    every_frame: bool = False,
 ) -> Column:
     """A column that is drawn as lines, whose names and colours are said once.
 
@@ -151,6 +180,7 @@ def line_column(
         rgbs: their colours.
         width: of a line.
         steps: a value holds until the next one; there is nothing between two values.
+        every_frame: see `Column`.
     """
     modes = rr.components.InterpolationMode
     style = rr.SeriesLines(
@@ -160,7 +190,7 @@ def line_column(
         aggregation_policy=AGGREGATION,
         interpolation_mode=modes.StepAfter if steps else modes.Linear,
     )
-    return Column(recording, spec, path, style)
+    return Column(recording, spec, path, style, every_frame=every_frame)
 
 
 def frames_column(
@@ -170,7 +200,7 @@ def frames_column(
     if spec.images:
         return ImageColumn(recording, spec, path)
     names = [f"value {i + 1}" for i in range(int(np.prod(spec.frame_shape)))]
-    return line_column(recording, spec, path, names, width=width)
+    return line_column(recording, spec, path, names, width=width, every_frame=True)
 
 
 class ImageColumn(Column):

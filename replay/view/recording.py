@@ -97,7 +97,7 @@ def write_views(
     columns = [frames_column(recording, spec, view) for view in view_entities(spec)]
     truth = None
     if spec.truth and blocks is None:
-        truth = line_column(recording, spec, "world/truth", spec.truth)
+        truth = line_column(recording, spec, "world/truth", spec.truth, every_frame=True)
     for t in range(first, first + count, BLOCK):
         stop = min(t + BLOCK, first + count)
         for stream, column in enumerate(columns):

@@ -1,7 +1,8 @@
 """A run as rows of a Rerun recording: every signal as it is, and what eyes need besides.
 
 `/signals/<name>` holds each signal's values for every iteration, read back they are
-those of run.mcap; of a signal that the run never tells there is nothing. `/world`, `/lanes`,
+those of run.mcap; of a signal that the run never tells there is nothing. Where frames are missing,
+lines of values a frame have a row of NaN. `/world`, `/lanes`,
 `/decision`, `/gate`, `/abstraction`, `/streams` and `/modules` show the same for a person.
 """
 
@@ -165,7 +166,7 @@ class RunView:
     def _truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Take (n, D) of what the world knows at n frames, and the learner does not."""
         if self._spec.truth:
-            line = self._line("world/truth", self._spec.truth)
+            line = self._line("world/truth", self._spec.truth, every_frame=True)
             line.add(at, self._blocks.iteration(at), values)
 
     def weights(self, path: str, t: int, iteration: int, phi: NDArray[np.float64]) -> None:
@@ -200,7 +201,8 @@ class RunView:
             value, path = columns[signal.name], f"signals/{signal.name}"
             if value.dtype.kind == "i" and not told(signal.name, value):
                 continue
-            frames, iterations = columns.times("T" in signal.dims)
+            every_frame = "T" in signal.dims
+            frames, iterations = columns.times(every_frame)
             if signal.show == "heat":
                 self._tensor(signal, path, columns, value)
             elif signal.dims == "S":
@@ -210,12 +212,12 @@ class RunView:
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
                     labels = _labels(signal, i + 1, outputs)
-                    line = self._line(
-                        f"{path}/{i + 1}", labels, rgbs=self._of_module(i + 1, labels)
-                    )
+                    own, place = self._of_module(i + 1, labels), f"{path}/{i + 1}"
+                    line = self._line(place, labels, rgbs=own, every_frame=every_frame)
                     line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
             else:
-                line = self._line(path, _labels(signal, 0, outputs), BESIDE.get(signal.name, 0))
+                labels, number = _labels(signal, 0, outputs), BESIDE.get(signal.name, 0)
+                line = self._line(path, labels, number, every_frame=every_frame)
                 line.add(frames, iterations, value.reshape(len(frames), -1))
 
     def _tensor(
@@ -351,16 +353,17 @@ class RunView:
         *,
         rgbs: Sequence[Rgb] | None = None,
         width: float = WIDTH,
+        every_frame: bool = False,
     ) -> Column:
         """The column of a line or several, in the colours from `number` on."""
         one = len(set(labels)) == 1
         rgbs = rgbs or [pale(number + (0 if one else i)) for i in range(len(labels))]
-        return self._column(path, line_column, labels, rgbs, width)
+        return self._column(path, line_column, labels, rgbs, width, every_frame=every_frame)
 
-    def _column(self, path: str, make: Callable[..., Column], *how: Any) -> Column:
+    def _column(self, path: str, make: Callable[..., Column], *how: Any, **more: bool) -> Column:
         """The column of an entity, made when it is first needed."""
         if path not in self._columns:
-            self._columns[path] = make(self._recording, self._spec, path, *how)
+            self._columns[path] = make(self._recording, self._spec, path, *how, **more)
         return self._columns[path]
 
 

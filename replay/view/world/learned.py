@@ -87,7 +87,7 @@ def write_learned(
             ),
         )
         for path, name, rgb, width, line in shown:
-            column = line_column(recording, spec, path, [name], [rgb], width)
+            column = line_column(recording, spec, path, [name], [rgb], width, every_frame=True)
             column.add(frames, iterations, line)
             column.flush()
         both = np.concatenate([followed, output.y])
