@@ -179,7 +179,7 @@ def test_side_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", [b'{"id":"%d","status":"done","point":{},"a":%b}\n', b"%d%b"])
 def test_rows(tmp_path: Path, line: bytes) -> None:
     (tmp_path / REQUEST).write_text('{"trials": []}')
-    (tmp_path / ROWS).write_bytes(b"".join(line % (i, LISTS) for i in range(4)))
+    (tmp_path / ROWS).write_bytes(b"".join(line % (i, LISTS) for i in range(8)))
 
     def read() -> None:
         with pytest.raises(LogDamagedError, match=rf"{ROWS}.*(MiB of memory|remove the line)"):
