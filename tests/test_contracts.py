@@ -6,7 +6,8 @@ Those of sources and sinks are derived from where these are tested.
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from cdmisfa.features.incsfa.abstraction import IncSFA
 from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
 from recorder.cameras.camera import Camera
 from recorder.cameras.words import CAMERAS
+from recorder.images.pixels import Shown
 from recorder.world.oscillatory import OscillatorySource
 from replay.export.forms import FORMS
 
@@ -54,6 +56,52 @@ class TestVideo(CameraContract):
 
     def open(self) -> Camera:
         return CAMERAS["av"].open("av:lavfi:testsrc=rate=100:size=64x48", "bars")
+
+
+class TestColours(TestVideo):
+    def open(self) -> Camera:
+        return CAMERAS["av"].open("av:lavfi:testsrc=rate=100:size=64x48", "bars", color=True)
+
+
+class Readings:
+    """A camera of whatever it is given."""
+
+    name, finite, rate = "readings", True, 50.0
+
+    def __init__(self, *shown: Shown) -> None:
+        self._shown = shown
+
+    def pictures(self) -> Iterator[tuple[int, Shown]]:
+        return ((0, shown) for shown in self._shown)
+
+    def describe(self) -> Mapping[str, Any]:
+        return {"kind": "readings"}
+
+
+class TestNumbers(CameraContract):
+    def open(self) -> Camera:
+        return Readings(*np.ones((3, 7)))
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [
+        [np.ones((4, 4))] * 3,
+        [np.ones(7, np.float32)] * 3,
+        [np.full(7, np.nan)] * 3,
+        [np.ones(7), np.ones(7), np.ones(6)],
+        [np.ones((4, 4), np.uint8), np.ones((4, 4, 3), np.uint8), np.ones((4, 4), np.uint8)],
+        [np.ones((4, 4, 2), np.uint8)] * 3,
+        [np.ones((0, 4), np.uint8)] * 3,
+    ],
+)
+def test_a_camera_that_shows_something_else_breaks_its_contract(shown: list[Shown]) -> None:
+    class Wrong(CameraContract):
+        def open(self) -> Camera:
+            return Readings(*shown)
+
+    with pytest.raises(AssertionError):
+        Wrong().test_its_pictures_are_of_one_kind_and_no_older_than_now()
 
 
 class TestParquet(FormContract):

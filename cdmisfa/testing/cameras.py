@@ -28,13 +28,20 @@ class CameraContract:
         """Make a camera of the kind under test."""
         raise NotImplementedError
 
-    def test_its_pictures_are_gray_and_no_older_than_now(self) -> None:
+    def test_its_pictures_are_of_one_kind_and_no_older_than_now(self) -> None:
         taken = list(itertools.islice(self.open().pictures(), self.count))
         assert len(taken) == self.count
         for age, image in taken:
             assert age >= 0
-            assert image.dtype == np.uint8
-            assert image.ndim == 2
+            if image.ndim == 1:
+                assert image.dtype == np.float64, "numbers are (I,) float64"
+                assert np.isfinite(image).all(), "numbers are finite"
+            else:
+                assert image.dtype == np.uint8
+                assert image.shape[2:] in ((), (3,)), "gray (height, width), or with 3 colours"
+            assert image.size
+        assert len({(image.ndim, image.shape[2:]) for _, image in taken}) == 1
+        assert len({image.shape for _, image in taken if image.ndim == 1}) <= 1
 
     def test_it_can_be_opened_again(self) -> None:
         camera = self.open()

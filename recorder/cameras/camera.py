@@ -13,7 +13,8 @@ class Picture(NamedTuple):
 
     Attributes:
         time_ns: when it was taken or came, by the clock that all cameras share.
-        image: gray, (height, width) uint8; or numbers, (I,) float64.
+        image: gray, (height, width) uint8, or in colours, (height, width, 3); or numbers, (I,)
+            float64.
     """
 
     time_ns: int
@@ -41,7 +42,8 @@ class Camera(Protocol):
 
         Yields:
             How many nanoseconds ago the image was taken, 0 where only its coming is known; and
-            the image, gray, (height, width) uint8, at its own size.
+            the image at its own size, gray, (height, width) uint8, or in colours, (height, width,
+            3) uint8; or numbers, (I,) float64, finite and as many each time.
 
         Raises:
             Exception: it cannot be opened, or is gone.
