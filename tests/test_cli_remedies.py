@@ -33,6 +33,34 @@ def test_verify_says_its_schema(cdmisfa: Cdmisfa, oscillatory_recording: Path) -
     assert cdmisfa("verify", oscillatory_recording, "--json").json["schema"] == 1
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info",),
+        ("verify",),
+        ("recover", "-o", "out.mcap"),
+        ("learn",),
+        ("convert", "-o", "out"),
+        ("view", "--save", "out.rrd"),
+        ("play",),
+        ("check",),
+        ("plot",),
+        ("compare", "numbers.npz"),
+        ("export", "--to", "csv", "-o", "out.csv"),
+        ("export", "--to", "images", "-o", "out"),
+    ],
+)
+def test_a_file_of_another_kind_is_a_wrong_word_and_no_damage(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "numbers.npz").write_bytes(b"PK" + bytes(100))
+    done = cdmisfa(*words, "numbers.npz")
+    assert (done.code, done.err.count("\n")) == (2, 1), done.err
+    assert "numbers.npz is no MCAP file: name a recording" in done.err
+    assert [path.name for path in tmp_path.iterdir()] == ["numbers.npz"]
+
+
 def test_export_writes_no_file_named_dash(
     cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 from waiting import wait_for
 
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)
@@ -96,6 +97,35 @@ def test_a_part_may_lack_a_topic(parts: list[Path]) -> None:
         ForeignSource(parts[0].parent, ["/up"], size=SIZE)
     with pytest.raises(UsageError, match="name one --topic or more; it has images on"):
         ForeignSource(parts[0].parent, size=SIZE)
+
+
+def test_a_part_that_was_cut_before_its_first_message_is_left_out_and_said(
+    parts: list[Path],
+) -> None:
+    os.truncate(parts[3], 42)
+    options: dict[str, Any] = {"size": SIZE, "align": "time", "rate": 50}
+    with contextlib.closing(ForeignSource(parts[0].parent, ["/r*"], **options)) as source:
+        assert source.alignment["/right"]["messages"] == 110
+        assert f"{parts[3]}: " in source.warnings[1]
+        assert source.warnings[1].endswith("there is no message before: left out")
+    for part in parts:
+        os.truncate(part, 42)
+    with pytest.raises(LogDamagedError, match="there is no message before"):
+        ForeignSource(parts[0].parent, ["/right"], size=SIZE)
+
+
+@pytest.mark.parametrize("length", [8, 42, 95])
+def test_a_log_that_was_cut_before_its_first_message_is_damaged(
+    cdmisfa: Cdmisfa, parts: list[Path], length: int
+) -> None:
+    os.truncate(parts[0], length)
+    out = parts[0].parent / "out"
+    for words in (["learn"], ["convert", "-o", out], ["view", "--save", out]):
+        done = cdmisfa(*words, parts[0])
+        assert (done.code, done.err.count("\n")) == (3, 1), done.err
+        assert f"{parts[0]}: " in done.err
+        assert "there is no message before" in done.err
+    assert not out.exists()
 
 
 def test_a_killed_conversion_goes_on(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

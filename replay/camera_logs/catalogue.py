@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from replay.camera_logs.formats.picture_folder import FolderImages
 from replay.camera_logs.formats.table import is_table, table_channels
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.opening import is_bag, is_picture_folder, is_split, is_video
-from replay.camera_logs.stream import ChannelFacts, holds_none
+from replay.camera_logs.stream import ChannelFacts, NothingLoggedError, holds_none
 from replay.storage.location import Location
 
 ALL = ("*",)
@@ -35,8 +36,11 @@ def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
         if is_bag(path):
             return bag_topics(path, reading)
         if is_split(path):
-            parts = [mcap_topics(part, reading) for part in sorted(path.glob("*.mcap"))]
-            return list(dict.fromkeys(topic for part in parts for topic in part))
+            topics: dict[str, None] = {}
+            for part in sorted(path.glob("*.mcap")):
+                with contextlib.suppress(NothingLoggedError):
+                    topics |= dict.fromkeys(mcap_topics(part, reading))
+            return list(topics)
         if is_picture_folder(path):
             return [path.resolve().name]
         if is_video(path) or is_table(path):

@@ -4,31 +4,37 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.framing import Size
 from recorder.images.pixels import MalformedImage, Shown
-from replay.camera_logs.alignment import Times, even_times
+from replay.camera_logs.alignment import Times, even_times, step_of
+from replay.camera_logs.formats.table import TableNumbers
 from replay.camera_logs.stream import ImageStream, sorted_times
 from replay.mcap.records import MalformedRecord
 from replay.storage.location import Location
 
 Found = TypeVar("Found")
 
+_COUNTED: Final = "say what its times count, as --time COLUMN:s (or ms, us, ns)"
+"""What to do where the times of a table are of another unit."""
+
 
 class JoinedImages(ImageStream):
     """The images on one topic of several logs, by their times, ties in the order of the logs."""
 
-    def __init__(self, path: Location, parts: Sequence[ImageStream]) -> None:
+    def __init__(
+        self, path: Location, parts: Sequence[ImageStream], warnings: Sequence[str] = ()
+    ) -> None:
         self.path = path
         self.recipe, self.fields = parts[0].recipe, parts[0].fields
         self.topic = parts[0].topic
         joined = f"{path}: {self.topic} is joined from {len(parts)} logs, by time"
-        self.warnings = [joined] if len(parts) > 1 else []
+        self.warnings = [joined, *warnings] if len(parts) > 1 else [*warnings]
         self.warnings += [warning for part in parts for warning in part.warnings]
         self.parts = list(parts)
         self.decode = getattr(parts[0], "decode", None)
@@ -190,3 +196,27 @@ def _joined(streams: Sequence[ImageStream]) -> list[ImageStream]:
     if len(streams) < 2 or not follow:
         return list(streams)
     return [JoinedImages(ordered[0].path, ordered)]
+
+
+def rate_of(streams: Sequence[ImageStream]) -> float:
+    """Images a second of the first stream that has times.
+
+    Raises:
+        UsageError: none has, or they tell no rate that is taken.
+    """
+    timed = next((s for s in streams if len(s.times)), streams[0])
+    step = step_of(timed.times)
+    table = isinstance(timed, TableNumbers)
+    if not step > 0:
+        what = f"{timed.path}: {timed.topic}" if len(timed.times) else timed.path
+        remedy = ", or name the column of its times with --time" if table else ""
+        if table and len(timed.times):
+            what = f"{timed.path}: most of its rows are of the time of the row before, which"
+            remedy = f", or {_COUNTED}"
+        raise UsageError(f"{what} tells no rate: set one with --rate{remedy}")
+    if table and 1 / step > RECORDED_FPS[1]:
+        raise UsageError(
+            f"{timed.path}: {1 / step:.6g} rows a second are more than the {RECORDED_FPS[1]:.0f} "
+            f"that are taken: {_COUNTED}, or set a rate with --rate"
+        )
+    return float(f"{1 / step:.6g}")

@@ -16,7 +16,7 @@ from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by
 from replay.camera_logs.formats.table import TableNumbers, is_table
 from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
-from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.stream import ImageStream, NothingLoggedError
 from replay.camera_logs.video_messages import in_order
 from replay.mcap.identity import identity
 from replay.storage.checksum import sha256
@@ -112,17 +112,25 @@ def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any
 
 
 def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
-    """Open the images on a topic of a log in parts; a part may lack a topic that is named."""
+    """Open the images on a topic of a log in parts.
+
+    A part may lack a topic that is named, and one that has nothing in it is left out.
+    """
     parts: list[ImageStream] = []
     refusal: UsageError | None = None
+    empty: list[NothingLoggedError] = []
     try:
         for file in sorted(path.glob("*.mcap"), key=by_number):
             try:
                 parts.append(McapImages(file, topic, salvage=salvage, reading=reading))
+            except NothingLoggedError as error:
+                empty.append(error)
             except UsageError as error:
                 refusal = refusal or error
         if refusal is not None and (topic is None or not parts):
             raise refusal
+        if not parts:
+            raise empty[0]
         topics = {part.topic for part in parts}
         if len(topics) > 1:
             raise UsageError(
@@ -132,7 +140,7 @@ def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Readin
         for part in parts:
             part.close()
         raise
-    return JoinedImages(path, parts)
+    return JoinedImages(path, parts, [f"{error}: left out" for error in empty])
 
 
 def is_video(path: Path) -> bool:

@@ -32,8 +32,7 @@ from replay.camera_logs.alignment import (
     with_gaps,
 )
 from replay.camera_logs.catalogue import named_streams
-from replay.camera_logs.formats.table import TableNumbers
-from replay.camera_logs.joined import excerpts, join_parts, known_times
+from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import fingerprint, image_logs, open_images
 from replay.camera_logs.options import Align, Gaps
@@ -144,7 +143,7 @@ class ForeignSource(StoredSource):
             if len({bool(stream.fields) for stream in self._streams}) > 1:  # whatever the clock
                 framings([self._image(i, 0) for i in range(len(self._streams))], None, fit)
             self._align_by = align
-            self._fps = rate or _rate(self._streams)
+            self._fps = rate or rate_of(self._streams)
             self._times = known_times(self._streams, self._fps)
             if start or stop is not None:
                 self._streams = excerpts(self._streams, self._times, start, stop)
@@ -169,10 +168,11 @@ class ForeignSource(StoredSource):
             self.close()
             raise
         self._count = len(self._rows[0])
+        held_back: list[list[Span]] = self._gaps if gaps == "skip" else [[] for _ in self._gaps]
         names, length = stream_names(self._streams), None if loop else self._count
         self._spec = SourceSpec(names, shape, dtype, (), self._fps, start_ns, length)
         self.alignment = dict(
-            zip(names, map(counts, self._times, self._rows, self._gaps), strict=True)
+            zip(names, map(counts, self._times, self._rows, held_back), strict=True)
         )
         self.pauses = dict(zip(names, self._gaps, strict=True))
         self.gaps = gaps == "skip" and any(self._gaps)
@@ -300,7 +300,7 @@ class ForeignSource(StoredSource):
         except (MalformedImage, MalformedRecord) as error:
             raise LogDamagedError(f"{images.where(row)}: {error}") from None
         except UsageError as error:
-            raise UsageError(f"{images.path}: {error}") from None
+            raise UsageError(f"{images.where(row)}: {error}") from None
 
     def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Span]]]:
         """When frame 0 is, which image of each stream every frame shows, and each one's gaps."""
@@ -382,15 +382,3 @@ class ForeignSource(StoredSource):
         words += ["--gaps", "hold"] if self._asked_gaps == "hold" else []
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
-
-
-def _rate(streams: Sequence[ImageStream]) -> float:
-    """Images a second of the first stream that has times."""
-    timed = next((s for s in streams if len(s.times)), streams[0])
-    step = step_of(timed.times)
-    if not step > 0:
-        what = f"{timed.path}: {timed.topic}" if len(timed.times) else timed.path
-        named = ", or name the column of its times with --time"
-        remedy = named if isinstance(timed, TableNumbers) and not len(timed.times) else ""
-        raise UsageError(f"{what} tells no rate: set one with --rate{remedy}")
-    return float(f"{1 / step:.6g}")

@@ -18,6 +18,7 @@ from recorder.images.framing import Size
 from recorder.images.messages import SCHEMAS
 from recorder.images.pixels import RECIPE, Shown
 from recorder.images.reading import MessageKind, Reading
+from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
 
 LAST_NS: Final = 2**62
@@ -148,6 +149,11 @@ def choose_images(
         return found[0]
     known = ", ".join(sorted({name for name, _, _ in readable})) or "none"
     what = "messages with fields" if reading.fields else "images"
+    if not readable and any(said.startswith(VECTOR_SCHEMA) for said in others.values()):
+        raise UsageError(
+            f"{path}: it is a recording of values, not of images: learn, view, export and play "
+            "take it without options of images; to convert it, name them with --field values"
+        )
     if not readable and topic is None:
         raise UsageError(holds_none(path, reading))
     if topic is None:
@@ -159,6 +165,10 @@ def choose_images(
     if topic in others:
         raise UsageError(f"{path}: {topic} holds {others[topic]}, images are {', '.join(SCHEMAS)}")
     raise UsageError(f"{path}: no topic {topic}; it has {what} on: {known}")
+
+
+class NothingLoggedError(LogDamagedError):
+    """A log that was cut before its first message."""
 
 
 def holds_none(path: Location, reading: Reading) -> str:

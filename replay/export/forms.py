@@ -67,6 +67,7 @@ def export(
     force: bool = False,
     lossless: bool = False,
     cameras: CameraOptions | None = None,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> int:
     """Write a run's signals, or a recording's frames, in another form.
 
@@ -77,6 +78,7 @@ def export(
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
         cameras: which streams of camera logs; by default all of images.
+        warn: told what the user should know of a recording or of camera logs.
 
     Returns:
         The number of iterations, or of images or frames, written.
@@ -101,9 +103,14 @@ def export(
         if not named.exists():
             raise UsageError(f"{named}: no such file or folder")
     if described.of == "recording":
-        return _export_recording(paths, out, form, lossless, cameras)
+        return _export_recording(paths, out, form, lossless, cameras, warn)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
+    if not all(map(holds_run, paths)):
+        frames = " or ".join(name for name, other in FORMS.items() if other.of == "recording")
+        raise UsageError(
+            f"{paths[0]} is no run, {form} is for the signals of one: choose {frames} with --to"
+        )
     if len(paths) > 1:
         raise UsageError(f"signals are of one run, {len(paths)} were named")
     if form in TABLES:  # one of them is two files
@@ -113,12 +120,19 @@ def export(
 
 
 def _export_recording(
-    paths: list[Path], out: Path, form: str, lossless: bool, cameras: CameraOptions | None
+    paths: list[Path],
+    out: Path,
+    form: str,
+    lossless: bool,
+    cameras: CameraOptions | None,
+    warn: Callable[[str], None],
 ) -> int:
     path = paths[0]
     if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
     with contextlib.closing(open_to_look(paths, cameras)) as source:
+        for warning in source.warnings:
+            warn(warning)
         if form in ("images", "mp4") and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():

@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.storage.location import Location
 
 RECORD_HEADER: Final = struct.Struct("<BQ")
 MAX_CHUNK: Final = 144 * 1024 * 1024
@@ -41,6 +42,13 @@ Bytes = NDArray[np.uint8]
 
 class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where
     """Bytes that are not what MCAP says they are; the reader adds file and place."""
+
+
+def no_log(path: Location) -> CdmisfaError:
+    """What is wrong with a file that begins otherwise: damage, where its name is that of a log."""
+    if ".mcap" in path.name:
+        return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")
+    return UsageError(f"{path} is no MCAP file: name a recording, a run, or logs of cameras")
 
 
 @dataclass(frozen=True, slots=True)

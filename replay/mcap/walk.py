@@ -22,6 +22,7 @@ from replay.mcap.records import (
     RECORD_HEADER,
     Fields,
     MalformedRecord,
+    no_log,
 )
 from replay.mcap.resync import leave_chunks, next_chunk, own_end, stands
 from replay.mcap.segments import Attachment, Definitions, IndexPart, Metadata, Refuse, Segment
@@ -93,11 +94,10 @@ class LogStructure:
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
         self._at = len(MAGIC)
-        start = file.read(0, len(MAGIC))
-        if not start:
+        if not (start := file.read(0, len(MAGIC))):
             raise LogDamagedError(f"{file.path}: empty, nothing was written")
         if start != MAGIC:
-            raise LogDamagedError(f"{file.path}: not an MCAP file (its first bytes are not MCAP's)")
+            raise no_log(file.path)
         self._read_end()
         if not by_index or not self._take_index():
             self._walk_data()

@@ -16,7 +16,13 @@ from recorder.images.messages import holds_distances
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
 from recorder.images.stamps import stamp_of
-from replay.camera_logs.stream import ImageStream, choose_images, explained, sorted_times
+from replay.camera_logs.stream import (
+    ImageStream,
+    NothingLoggedError,
+    choose_images,
+    explained,
+    sorted_times,
+)
 from replay.mcap.reader import LogReader
 from replay.mcap.records import Channel, MalformedRecord
 from replay.mcap.segments import Segment
@@ -51,6 +57,7 @@ class McapImages(ImageStream):
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
         self.reader = LogReader(path, salvage=salvage)
         try:
+            _refuse_nothing(self.reader)
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
             self._channel, self.decode = choose_images(path, topic, channels, reading)
             self.topic = self._channel.topic
@@ -146,12 +153,20 @@ def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
     """The topics of an MCAP log with what is wanted.
 
     Raises:
-        LogDamagedError: it is no MCAP file.
+        LogDamagedError: it is no MCAP file, or has nothing in it.
     """
     with LogReader(path, salvage=True) as reader:
+        _refuse_nothing(reader)
         channels = reader.channels.values()
         found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)
         return list(dict.fromkeys(found))
+
+
+def _refuse_nothing(reader: LogReader) -> None:
+    """Refuse a log that was cut before its first message."""
+    there = reader.channels and any(segment.size for segment in reader.segments)
+    if not reader.complete and not there:
+        raise NothingLoggedError(f"{reader.path}: {reader.missing}: there is no message before")
 
 
 def _kind(reader: LogReader, channel: Channel) -> MessageKind:
