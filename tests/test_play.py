@@ -28,6 +28,7 @@ from cdmisfa.core.errors import UsageError
 from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
+from replay.camera_logs.options import CameraOptions
 from replay.playing.feed import Told, Topic, opened_feed
 from replay.playing.pace import Played, paced, rounds
 from replay.playing.robot import play_as_robot
@@ -189,6 +190,29 @@ def test_others_logs_are_played_as_they_are(tmp_path: Path) -> None:
     with opened_feed([tmp_path / "log.mcap"]) as feed:
         order = [(told.topic.name, told.time_ns // 10**6 - 1000) for told in feed.messages()]
     assert order == [("/a", 0), ("/b", 0), ("/a", 40), ("/b", 60), ("/a", 80)]
+
+
+def test_topics_are_played_as_they_are_and_fields_as_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_cameras(path, {"/a": (3, 40), "/b": (2, 60)})
+    with opened_feed([path]) as feed:
+        every = [told for told in feed.messages() if told.topic.name == "/b"]
+    with opened_feed([path], cameras=CameraOptions(topics=("/b*",))) as feed:
+        assert list(feed.messages()) == every
+    with (
+        pytest.raises(UsageError, match="no topic /c; it has: /a, /b"),
+        opened_feed([path], cameras=CameraOptions(topics=("/b", "/c"))),
+    ):
+        pass
+    (tmp_path / "t.csv").write_text("stamp,a\n0,1\n1,2\n2,n/a\n3,4\n")
+    said: list[str] = []
+    cameras = CameraOptions(time="stamp", fields=("a",))
+    with opened_feed([tmp_path / "t.csv"], None, cameras, said.append) as feed:
+        told = list(feed.messages())
+    assert [(each.topic.schema_name, each.time_ns // 10**9) for each in told] == [
+        ("cdmisfa.Vector", second) for second in (0, 1, 2)
+    ]
+    assert ["row 2 is left out: a holds no number" in line for line in said] == [True]
 
 
 def test_the_viewer_is_handed_every_frame(

@@ -72,10 +72,14 @@ def _near_and_far(
 ) -> tuple[float, float] | None:
     if value is None:
         return None
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,6})?):(\d{1,6}(?:\.\d{1,6})?)", value, re.ASCII)
+    number = r"(-?\d{1,9}(?:\.\d{1,9})?)"
+    found = re.fullmatch(f"{number}:{number}", value, re.ASCII)
     if found is None or not float(found[1]) < float(found[2]):
         raise click.BadParameter(
-            f"{value!r} is no range: write NEAR:FAR in metres, as 0.3:5", ctx, param
+            f"{value!r} is no range: write NEAR:FAR in metres, as 0.3:5, or LOW:HIGH of numbers, "
+            "as -3.2:3.2",
+            ctx,
+            param,
         )
     return float(found[1]), float(found[2])
 
@@ -84,8 +88,9 @@ range_option = click.option(
     "--range",
     "depth",
     callback=_near_and_far,
-    metavar="NEAR:FAR",
-    help="Show distances of depth cameras, in metres, from black to white; keep numbers within.",
+    metavar="LOW:HIGH",
+    help="Show distances of depth cameras, in metres, from black to white, as 0.3:5; keep numbers "
+    "within, as -3.2:3.2.",
 )
 
 topic_option = click.option(
@@ -116,7 +121,7 @@ number_options = options.together(
 )
 """Which numbers of logs and tables are taken."""
 
-look_options = options.together(topic_option, number_options, rate_option)
+look_options = options.together(topic_option, number_options, rate_option, range_option)
 """What of camera logs is shown or exported."""
 
 color_option = click.option(
@@ -206,6 +211,11 @@ def tell(line: str) -> None:
     click.echo(line, err=True)
 
 
+def warn(line: str) -> None:
+    """Say on stderr what the user should know of a source."""
+    tell(f"warning: {line}")
+
+
 def say_counts(source: FrameSource) -> None:
     """Say on stderr what became of each live stream's pictures."""
     for name, counts in getattr(source, "alignment", {}).items():
@@ -220,7 +230,7 @@ def say_counts(source: FrameSource) -> None:
 def say_about(source: FrameSource) -> None:
     """Say on stderr what the user should know of a source, and how images became frames."""
     for warning in getattr(source, "warnings", ()):
-        click.echo(f"warning: {warning}", err=True)
+        warn(warning)
     for name, shape in getattr(source, "shapes", {}).items():
         if "," in shape:  # not the image itself
             click.echo(f"{name}: {shape}", err=True)
@@ -236,7 +246,7 @@ def say_about(source: FrameSource) -> None:
 def say_changes(source: FrameSource) -> None:
     """Say on stderr which streams changed the size of their images while they were read."""
     for line in getattr(source, "changes", {}).values():
-        click.echo(f"warning: {line}", err=True)
+        warn(line)
 
 
 def print_plan(source: FrameSource, *, as_json: bool) -> None:
@@ -271,7 +281,7 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
         said = "whether images change their size shows when they are read"
         click.echo(f"{said}: {' '.join(unknown)}")
     for warning in warnings:
-        click.echo(f"warning: {warning}", err=True)
+        warn(warning)
 
 
 @contextlib.contextmanager

@@ -56,6 +56,13 @@ class Field:
         if not self._steps:
             raise UsageError("--field is empty: name a field of the messages")
 
+    @classmethod
+    def named(cls, name: str) -> Field:
+        """The field of this name, whatever its name is made of."""
+        field = cls.__new__(cls)
+        field.path, field._steps = name, [name]
+        return field
+
     @property
     def first(self) -> str:
         """The name that it begins with."""
@@ -87,8 +94,10 @@ class Field:
             return field_value(value, step)
         if not _is_list(value):
             raise UsageError(f"--field {self.path}: what the index is of is no list")
-        if isinstance(step, int) and step >= len(value):
-            raise UsageError(f"--field {self.path}: there are {len(value)} members only")
+        last = (step.stop or step.start + 1) if isinstance(step, slice) else step + 1
+        if last > len(value):
+            remedy = ", all of them are [0:]" if isinstance(step, slice) else ""
+            raise UsageError(f"--field {self.path}: there are {len(value)} members only{remedy}")
         return value[step]
 
 

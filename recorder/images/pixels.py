@@ -187,6 +187,8 @@ def _bayer_colors(pixels: Bytes, order: str) -> Bytes:
 def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> Bytes:
     """Distances as gray; 0, infinity and NaN, which are none, as black."""
     near, far = depth
+    if near < 0:
+        raise UsageError("--range: no distance is below 0, write NEAR:FAR in metres, as 0.3:5")
     found = np.empty(values.shape, np.uint8)
     for band in _bands(*values.shape):
         distance = values[band].astype(np.float64) * metres

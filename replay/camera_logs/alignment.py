@@ -29,7 +29,7 @@ Rows = NDArray[np.int64]
 def counts(times: Times, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
     """Images of a stream, frames that show one again, and images that no frame shows.
 
-    Frames within gaps are not counted.
+    Frames within gaps, which are left out, are not counted.
     """
     shown = int(np.count_nonzero(np.diff(rows))) + (len(rows) > 0)
     held = sum(stop - start for start, stop in gaps)

@@ -11,6 +11,7 @@ from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
 from replay.camera_logs.catalogue import channels_of
+from replay.camera_logs.formats.table import is_table, table_notes
 from replay.camera_logs.opening import only_foreign, open_images
 from replay.camera_logs.stream import ImageStream
 from replay.inputs.words import places
@@ -106,6 +107,8 @@ def _check_images(path: Path) -> LogCheck:
     problems: list[Problem] = []
     notes: dict[str, None] = {}
     try:
+        if is_table(path):
+            notes |= dict.fromkeys(table_notes(path))
         for channel in channels_of(path, whole=True):
             if channel.images and channel.messages:
                 with contextlib.closing(open_images(path, channel.topic)) as images:

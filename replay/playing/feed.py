@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fnmatch
 import heapq
-import shlex
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -78,31 +78,41 @@ class Feed(Protocol):
 
 
 @contextlib.contextmanager
-def opened_source(paths: Sequence[Path], fps: float | None) -> Iterator[Logged]:
+def opened_source(
+    paths: Sequence[Path],
+    fps: float | None,
+    cameras: CameraOptions | None = None,
+    warn: Callable[[str], None] = lambda line: None,
+) -> Iterator[Logged]:
     """The frames of a recording, or of camera logs of others, from the first on.
 
     Args:
         paths: see `play_as_robot`.
         fps: frames a second of logs that tell none.
+        cameras: what else is taken of camera logs of others, and how.
+        warn: told what the user should know of them.
 
     Raises:
         UsageError: there is no such log, or it is a run.
         LogDamagedError: it is damaged.
     """
     try:
-        source = open_to_look(paths, CameraOptions(rate=fps))
-    except UsageError as error:  # where --rate is how fast it is played, and there is no --time
-        said = str(error).replace("set one with --rate", "set one with --fps")
-        files = shlex.join(map(str, paths))
-        convert = f"play what cdmisfa convert {files} --time COLUMN -o REC writes"
-        said = said.replace("name the column of its times with --time", convert)
-        raise UsageError(said) from None
+        source = open_to_look(paths, replace(cameras or CameraOptions(), rate=fps))
+    except UsageError as error:  # where --rate is how fast it is played
+        raise UsageError(str(error).replace("with --rate", "with --fps")) from None
     with contextlib.closing(source):
+        for warning in source.warnings:
+            warn(warning)
         yield source
 
 
 @contextlib.contextmanager
-def opened_feed(paths: Sequence[Path], fps: float | None = None) -> Iterator[Feed]:
+def opened_feed(
+    paths: Sequence[Path],
+    fps: float | None = None,
+    cameras: CameraOptions | None = None,
+    warn: Callable[[str], None] = lambda line: None,
+) -> Iterator[Feed]:
     """The messages of a recording, or of camera logs of others; see `opened_source`.
 
     Raises:
@@ -111,12 +121,15 @@ def opened_feed(paths: Sequence[Path], fps: float | None = None) -> Iterator[Fee
     """
     for path in paths:
         refuse_what_is_no_log(path)
+    cameras = cameras or CameraOptions()
+    as_they_are = replace(cameras, topics=()) == CameraOptions()
     with contextlib.ExitStack() as stack:
-        if all(_is_mcap(path) for path in paths):
+        if as_they_are and all(_is_mcap(path) for path in paths):
             files = log_files(paths)
-            yield LoggedFeed([stack.enter_context(LogReader(file)) for file in files])
+            readers = [stack.enter_context(LogReader(file)) for file in files]
+            yield LoggedFeed(readers, cameras.topics)
         else:
-            yield FrameFeed(stack.enter_context(opened_source(paths, fps)))
+            yield FrameFeed(stack.enter_context(opened_source(paths, fps, cameras, warn)))
 
 
 def _is_mcap(path: Path) -> bool:
@@ -130,14 +143,24 @@ class LoggedFeed:
 
     Args:
         readers: of the files.
+        topics: those that are played, or patterns of them; without any all.
 
     Raises:
-        UsageError: there are no messages.
+        UsageError: there are no messages, or no such topic.
     """
 
-    def __init__(self, readers: Sequence[LogReader]) -> None:
+    def __init__(self, readers: Sequence[LogReader], topics: Sequence[str] = ()) -> None:
         self._readers = readers
         self._known = [_topics(reader) for reader in readers]
+        there = sorted({topic.name for known in self._known for topic in known.values()})
+        for asked in topics:
+            if not any(_fits(name, asked) for name in there):
+                raise UsageError(f"{readers[0].path}: no topic {asked}; it has: {', '.join(there)}")
+        if topics:
+            self._known = [
+                {n: t for n, t in known.items() if any(_fits(t.name, asked) for asked in topics)}
+                for known in self._known
+            ]
         self.topics = tuple(dict.fromkeys(t for known in self._known for t in known.values()))
         segments = [s for reader in readers for s in reader.segments if s.size]
         if not segments:
@@ -169,7 +192,12 @@ def _topics(reader: LogReader) -> dict[int, Topic]:
 
 def _told(reader: LogReader, known: dict[int, Topic]) -> Iterator[Told]:
     for message in reader.messages():
-        yield Told(message.log_time, known[message.channel.id], message.data)
+        if message.channel.id in known:
+            yield Told(message.log_time, known[message.channel.id], message.data)
+
+
+def _fits(name: str, asked: str) -> bool:
+    return name == asked or fnmatch.fnmatchcase(name, asked)
 
 
 class FrameFeed:

@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 
 from cdmisfa.core.clock import NANOSECONDS
+from replay.camera_logs.options import CameraOptions
 from replay.playing.feed import frames_of, opened_source
 from replay.playing.pace import Played, paced, rounds
 from replay.view.columns import frames_column, line_column
@@ -33,6 +34,8 @@ def play_in_rerun(
     rate: float = 1.0,
     loop: bool = False,
     fps: float | None = None,
+    cameras: CameraOptions | None = None,
+    warn: Callable[[str], None] = lambda line: None,
     port: int | None = None,
     announce: Callable[[str], None] = lambda address: None,
     stop: Callable[[], bool] = lambda: False,
@@ -44,6 +47,8 @@ def play_in_rerun(
         paths: the recording's folder, or files; or camera logs of others.
         rate: how many seconds of the recording pass in one.
         fps: frames a second of logs that tell none, as folders of pictures.
+        cameras: what is taken of camera logs of others; their rate is `fps`.
+        warn: told what the user should know of what is played frame by frame.
         loop: begin again at the end, at a later time.
         port: to listen at; by default a free one.
         announce: called with the address.
@@ -57,7 +62,7 @@ def play_in_rerun(
     """
     played = Played()
     with contextlib.ExitStack() as stack:
-        source = stack.enter_context(opened_source(paths, fps))
+        source = stack.enter_context(opened_source(paths, fps, cameras, warn))
         spec, first, count = source.spec, source.t, source.frames
         recording = rr.RecordingStream(APPLICATION, recording_id=f"played-{os.getpid()}")
         recording.set_log_time_enabled(False)

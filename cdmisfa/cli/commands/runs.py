@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import look_options
+from cdmisfa.cli.cameras import look_options, warn
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.experiments.documents import markdown
 
@@ -140,11 +140,12 @@ def export_command(
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
-    rows = export(path, out, form, force=force, lossless=lossless, cameras=CameraOptions(**cameras))
+    chosen = CameraOptions(**cameras)
+    rows = export(path, out, form, force=force, lossless=lossless, cameras=chosen, warn=warn)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)
-    if form in ("mp4", "lerobot") and not lossless:
+    if form in ("mp4", "lerobot") and not lossless and _is_film(out):
         click.echo("H.264 changes pixels a little: --lossless keeps them all", err=True)
     if as_json:
         options.print_json(
@@ -157,6 +158,11 @@ def export_command(
         )
         return
     click.echo(f"{rows} {FORMS[form].unit} written to {out}")
+
+
+def _is_film(out: Path) -> bool:
+    """Whether there is a video in what was exported: a dataset of numbers has none."""
+    return out.is_file() or next(out.rglob("*.mp4"), None) is not None
 
 
 @click.command("signals")

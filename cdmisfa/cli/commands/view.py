@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import look_options, tell
+from cdmisfa.cli.cameras import look_options, number_options, range_option, tell, topic_option, warn
 from cdmisfa.cli.commands.learn import announce
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
@@ -59,6 +59,7 @@ def view_command(
     fields: tuple[str, ...],
     time: str | None,
     rate: float | None,
+    depth: tuple[float, float] | None,
     size: str | None,
     port: int | None,
     memory_limit: str,
@@ -82,7 +83,7 @@ def view_command(
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)
-    cameras = CameraOptions(topics, rate=rate, fields=fields, time=time)
+    cameras = CameraOptions(topics, rate=rate, fields=fields, time=time, depth=depth)
     path, *beside = run
     if not beside and runs_in(path):
         if save is not None:
@@ -167,6 +168,9 @@ def _view_sweep(
     metavar="HZ",
     help="Frames a second of what tells none, as folders of pictures.",
 )
+@topic_option
+@number_options
+@range_option
 @click.option("--loop", is_flag=True, help="Start again at its end, until Ctrl-C.")
 @click.option(
     "--wait",
@@ -184,6 +188,7 @@ def _view_sweep(
 @click.pass_context
 def play_command(
     ctx: click.Context,
+    /,
     recording: tuple[Path, ...],
     target: str,
     rate: float,
@@ -192,6 +197,7 @@ def play_command(
     wait: int | None,
     port: int | None,
     as_json: bool,
+    **chosen: Any,
 ) -> None:
     """Show a recording as it was seen, in real time.
 
@@ -201,6 +207,9 @@ def play_command(
     """
     if wait is not None and target != "foxglove":
         raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
+    from replay.camera_logs.options import CameraOptions
+
+    cameras = CameraOptions(**chosen)
     with bar("playing", "s") as shown, stoppable(notice="") as stop:
         if target == "foxglove":
             from replay.playing.robot import PORT, play_as_robot
@@ -209,6 +218,8 @@ def play_command(
                 recording,
                 rate=rate,
                 fps=fps,
+                cameras=cameras,
+                warn=warn,
                 loop=loop,
                 port=PORT if port is None else port,
                 wait=1 if wait is None else wait,
@@ -223,6 +234,8 @@ def play_command(
                 recording,
                 rate=rate,
                 fps=fps,
+                cameras=cameras,
+                warn=warn,
                 loop=loop,
                 port=port,
                 announce=announce,

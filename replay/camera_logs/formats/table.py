@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +15,7 @@ from cdmisfa.core.untrusted.regular import check_regular
 from recorder.images.fields import NUMBERS_RECIPE, Field, bounded
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, Reading
+from replay.camera_logs.formats.csv_table import Words, read_csv
 from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,
@@ -41,7 +44,7 @@ class TableNumbers(ImageStream):
     column `reading.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`.
     Without it the rows are at an even rate.
 
-    Rows without a number or a time are left out.
+    Rows without a finite number or a time are left out.
 
     Raises:
         UsageError: no such column, or no numbers in it.
@@ -55,20 +58,24 @@ class TableNumbers(ImageStream):
         self.encoding = path.suffix[1:]
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a table has no topics, leave {topic} out; see --field")
-        table = _table(path)
+        table, words = _table(path)
+        if not table.num_rows:
+            raise UsageError(f"{path}: it has names of columns, and no rows")
         times, of_times = _times(path, table, reading.time)
         numeric = [n for n in table.column_names if _is_numeric(table[n]) and n != of_times]
         names = reading.fields or numeric
         if not names:
-            raise UsageError(f"{path}: it has no column of numbers")
+            raise UsageError(f"{path}: it has no column of numbers{_said_instead(table)}")
         with arrow_explained(path, remedy="take fewer columns, with --field"):
             columns = [_column(path, table, name) for name in names]
         numbers = bounded(np.concatenate(columns, axis=1), reading.depth)
         whole = np.all(np.isfinite(numbers), axis=1)
+        lacks = partial(_lacking, table, words, names, columns)
         if times is None:
             if not whole.all():
+                row = int(np.argmin(whole))
                 raise UsageError(
-                    f"{path}: row {int(np.argmin(whole))} lacks a number: name the column of its "
+                    f"{path}: row {row} lacks a number ({lacks(row)}): name the column of its "
                     "times with --time, so that it can be left out, or keep numbers in a range"
                 )
             times = np.empty(0, np.int64)
@@ -88,11 +95,16 @@ class TableNumbers(ImageStream):
             self.times = sorted_times(str(path), times.astype(np.uint64))
         else:
             self.times = np.empty(0, np.uint64)
+        used = {of_times, *names} if reading.fields else set(table.column_names)
+        self.warnings = [f"{path}: {said}" for name, said in words.items() if name in used]
         left = len(whole) - len(self._numbers)
         if left:
-            rows = "a row that lacks a number or its time is"
-            many = f"{left} of {len(whole)} rows lack a number or their time and are"
-            self.warnings = [f"{path}: {rows if left == 1 else many} left out"]
+            row = int(np.argmin(whole))
+            rows = f"row {row} is left out"
+            if left > 1:
+                rows = f"{left} of {len(whole)} rows lack a number or their time and are left out"
+                rows += f", the first is row {row}"
+            self.warnings += [f"{path}: {rows}: {lacks(row)}"]
 
     @property
     def count(self) -> int:
@@ -116,30 +128,63 @@ def is_table(path: Path) -> bool:
 
 def table_channels(path: Path) -> list[ChannelFacts]:
     """What is in each column of a table; raises as `TableNumbers`."""
-    table, kind = _table(path), path.suffix[1:]
+    (table, _), kind = _table(path), path.suffix[1:]
     return [
         ChannelFacts(n, kind, str(c.type), len(c) - c.null_count, None, None, images=False)
         for n, c in zip(table.column_names, table.columns, strict=True)
     ]
 
 
-def _table(path: Path) -> Any:
+def table_notes(path: Path) -> list[str]:
+    """What the user should know of a table that can be read; raises as `TableNumbers`."""
+    table, words = _table(path)
+    return [
+        *(f"{path}: {said}" for said in words.values()),
+        f"{path}: {table.num_rows} rows of {table.num_columns} columns can be read; a table has "
+        "no checksums, changed numbers would go unnoticed",
+    ]
+
+
+def _table(path: Path) -> tuple[Any, dict[str, Words]]:
+    """A table, and of its columns of numbers those with words."""
     check_regular(path, MAX_BYTES)
     with arrow_explained(path, remedy="write fewer columns or rows into a file"):
         if path.suffix.lower() == ".csv":
-            import pyarrow.csv
-
-            table = pyarrow.csv.read_csv(path)
+            table, words = read_csv(path)
         else:
             import pyarrow.parquet
 
-            table = pyarrow.parquet.ParquetFile(path).read()
+            table, words = pyarrow.parquet.ParquetFile(path).read(), {}
         if table.num_rows > max(MAX_ROWS, path.stat().st_size):
             raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for its few bytes")
         twice = [n for n in table.column_names if table.column_names.count(n) > 1]
         if twice:
             raise LogDamagedError(f"{path}: two columns are called {twice[0]!r}")
-        return table
+        return table, words
+
+
+def _said_instead(table: Any) -> str:
+    """Of what kinds the columns of a table are, in words."""
+    kinds = [f"{name} of {table[name].type}" for name in table.column_names[:20]]
+    return f", but {', '.join(kinds)}"
+
+
+def _lacking(
+    table: Any,
+    words: Mapping[str, Words],
+    names: Sequence[str],
+    columns: Sequence[NDArray[np.float64]],
+    row: int,
+) -> str:
+    """What a row lacks, in words."""
+    for name, numbers in zip(names, columns, strict=True):
+        wrong = numbers[row][~np.isfinite(numbers[row])]
+        if name in words and words[name].row == row:
+            return f"{name} holds {words[name].text!r}"
+        if len(wrong):
+            held = "no number" if np.isnan(wrong[0]) else f"{wrong[0]}, which is not finite"
+            return f"{name} holds {held}"
+    return "it has no time"
 
 
 def _is_numeric(column: Any) -> bool:
@@ -163,9 +208,13 @@ def _column(path: Path, table: Any, name: str) -> NDArray[np.float64]:
         there = ", ".join(table.column_names[:20])
         raise UsageError(f"{path}: there is no column {name}; it has {there}")
     if first == name:  # whatever its name is made of
-        field = Field("column")
-    rows = [None if v is None else {field.first: v} for v in table[first].to_pylist()]
-    found = [None if row is None else field.numbers(row) for row in rows]
+        field = Field.named(name)
+    found: list[list[float] | None] = []
+    for place, value in enumerate(table[first].to_pylist()):
+        try:
+            found.append(None if value is None else field.numbers({first: value}))
+        except UsageError as error:
+            raise UsageError(f"{path}: row {place}: {error}") from None
     size = next((len(own) for own in found if own is not None), 1)
     for place, own in enumerate(found):
         if own is not None and len(own) != size:
@@ -207,7 +256,11 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64]
     elif _is_numeric(column):
         whole, scale = column, UNITS[unit]
     else:
-        raise UsageError(f"{path}: {name} holds {column.type}, neither dates nor numbers")
+        example = f", as {column[0].as_py()!r}" if kinds.is_string(column.type) else ""
+        raise UsageError(
+            f"{path}: {name} holds {column.type}{example}, neither numbers nor dates such as "
+            "2024-12-31 23:59:59.5"
+        )
     rough = _floats(whole) * scale
     known = np.isfinite(rough)
     if (np.abs(rough[known]) >= LAST_NS).any():

@@ -1,0 +1,211 @@
+"""Tables as people have them: other separators, words among numbers, nothing where a number was."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import Cdmisfa
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.source import ForeignSource
+
+ROWS = 12
+
+
+def written(folder: Path, rows: Mapping[int, str], *, names: str = "t,a,b") -> Path:
+    """A table of three columns at 10 Hz, with other lines instead of some."""
+    lines = [f"{i / 10},{i},{2 * i}.5" for i in range(ROWS)]
+    for row, line in rows.items():
+        lines[row] = line
+    path = folder / "t.csv"
+    path.write_text("\n".join([names, *lines]) + "\n")
+    return path
+
+
+def taken(path: Path, **options: Any) -> tuple[list[list[float]], tuple[str, ...]]:
+    """All frames of a table, and what is said of it."""
+    with contextlib.closing(ForeignSource(path, **{"time": "t", **options})) as source:
+        return source.take(0, source.frames).frames.tolist(), source.warnings
+
+
+@pytest.mark.parametrize(
+    "cell", ["", " ", "NA", "n/a", " n/a", "-", "--", "None", "nan", "NaN", "?"]
+)
+def test_words_for_what_is_missing_are_no_words(tmp_path: Path, cell: str) -> None:
+    frames, said = taken(written(tmp_path, {7: f"0.7,7,{cell}"}))
+    assert frames == [[i, 2 * i + 0.5] for i in range(ROWS) if i != 7]
+    assert len(said) == 1
+    assert said[0].endswith("t.csv: row 7 is left out: b holds no number")
+
+
+@pytest.mark.parametrize("cell", ["broken", "'1'", "1,2", "0x1F", "1.2.3", "12 V"])
+def test_a_word_among_numbers_is_said_and_its_row_is_left_out(tmp_path: Path, cell: str) -> None:
+    path = written(tmp_path, {7: f'0.7,7," {cell}"', 9: "0.9,9,"})
+    frames, said = taken(path)
+    assert frames == [[i, 2 * i + 0.5] for i in range(ROWS) if i not in (7, 9)]
+    holds = f"b holds words, no numbers, in 1 of 12 rows, the first is {' ' + cell!r} in row 7"
+    assert [line.partition("t.csv: ")[2] for line in said] == [
+        holds,
+        "2 of 12 rows lack a number or their time and are left out, the first is row 7: b holds "
+        f"{' ' + cell!r}",
+    ]
+    assert taken(path, fields=["a"])[1] == ()
+    with pytest.raises(UsageError, match=r"row 7 lacks a number \(b holds"):
+        taken(path, time=None, rate=5)
+
+
+def test_a_column_of_words_is_left_out_and_said_where_it_has_numbers(tmp_path: Path) -> None:
+    path = written(tmp_path, {i: f"{i / 10},{i},ok" for i in range(2, 8)})
+    frames, said = taken(path)
+    assert frames == [[i] for i in range(ROWS)]
+    (line,) = said
+    assert line.endswith("in 6 of 12 rows, the first is 'ok' in row 2, and is left out")
+    with pytest.raises(UsageError, match="row 0: --field b is no number but str"):
+        taken(path, fields=["b"])
+    assert taken(written(tmp_path, {i: f"{i / 10},{i},ok" for i in range(ROWS)}))[1] == ()
+
+
+def test_a_row_of_units_and_a_time_that_is_none_are_left_out(tmp_path: Path) -> None:
+    frames, said = taken(written(tmp_path, {0: "[s],[rad],[m]", 5: "late,5,1", 6: ",6,1"}))
+    assert [a for a, _ in frames] == [1, 2, 3, 4, 7, 8, 9, 10, 11]
+    assert "t holds words, no numbers, in 2 of 12 rows, the first is '[s]' in row 0" in said[0]
+    assert said[-1].endswith(
+        "3 of 12 rows lack a number or their time and are left out, the first "
+        "is row 0: a holds '[rad]'"
+    )
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
+    tmp_path: Path, name: str
+) -> None:
+    values = np.arange(ROWS) - 4.0
+    values[3] = np.inf
+    path = tmp_path / name
+    if path.suffix == ".csv":
+        path.write_text("t,a\n" + "".join(f"{i / 10},{a}\n" for i, a in enumerate(values)))
+    else:
+        pq.write_table(pa.table({"t": np.arange(ROWS) / 10, "a": values}), path)
+    frames, said = taken(path)
+    assert [a for (a,) in frames] == [*range(-4, -1), *range(8)]
+    assert said[0].endswith("row 3 is left out: a holds inf, which is not finite")
+    kept, said = taken(path, depth=(-3.0, 5.0))
+    assert [a for (a,) in kept] == [-3, -3, -2, -3, *range(6), 5, 5]
+    assert said == ()
+    with pytest.raises(UsageError, match=r"row 3 lacks a number \(a holds inf"):
+        taken(path, time=None, rate=5)
+
+
+@pytest.mark.parametrize(("separator", "decimal"), [(";", ","), (";", "."), ("\t", ",")])
+def test_semicolons_tabs_and_decimal_commas_are_read(
+    tmp_path: Path, separator: str, decimal: str
+) -> None:
+    path = written(tmp_path, {})
+    text = path.read_text().replace(",", separator).replace(".", decimal)
+    path.write_text(text.replace("a", '"a, of all"', 1))
+    frames, said = taken(path)
+    assert frames == [[i, 2 * i + 0.5] for i in range(ROWS)]
+    assert said == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "error", "why"),
+    [
+        ("", {}, LogDamagedError, "it is empty"),
+        ("t,a\n", {}, UsageError, "it has names of columns, and no rows"),
+        ("t,a\n", {"time": None, "rate": 5}, UsageError, "names of columns, and no rows"),
+        ("t;a\n0,5;1.5\n", {}, UsageError, r"decimal comma \(0,5\) and with a point \(1.5\)"),
+        ("t,a\xb5\n0,1\n", {}, UsageError, "its line of names is no UTF-8: save it as CSV UTF-8"),
+        ("t,a\n1.2.24 10:00,1\n", {}, UsageError, r"t holds string, as '1.2.24 10:00', neither"),
+        ("t,a\nx,y\n", {"time": None, "rate": 5}, UsageError, "but t of string, a of string"),
+        ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "1e.09 rows a second.*--time COL"),
+        ("t,a\n0,1\n.1,2\n.2,3\n", {"time": "t:ns"}, UsageError, "say what its times count, as"),
+    ],
+)
+def test_what_is_wrong_with_a_table_is_said(
+    tmp_path: Path, text: str, options: Any, error: type[CdmisfaError], why: str
+) -> None:
+    path = tmp_path / "t.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(error, match=why):
+        taken(path, **options)
+
+
+@pytest.mark.parametrize(
+    ("field", "why"),
+    [
+        ("state[3]", r"t.parquet: row 0: --field state\[3\]: there are 3 members only"),
+        (
+            "state[1:4]",
+            r"row 0: --field state\[1:4\]: there are 3 members only, all of them are \[",
+        ),
+        ("word", "t.parquet: row 0: --field word is no number but str: name another"),
+        ("a.b", "t.parquet: row 0: --field a.b is no number but dict: name one of its fields: x"),
+        ("n[0]", r"t.parquet: row 0: --field n\[0\]: what the index is of is no list"),
+    ],
+)
+def test_a_field_that_is_none_is_named_as_it_was_written(
+    tmp_path: Path, field: str, why: str
+) -> None:
+    columns = {"state": [[1, 2, 3]] * 2, "word": ["x", "y"], "a.b": [{"x": 1}] * 2, "n": [1, 2]}
+    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
+    with pytest.raises(UsageError, match=why):
+        ForeignSource(tmp_path / "t.parquet", rate=5, fields=[field])
+
+
+def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    path = written(tmp_path, {7: "0.7,7,broken"})
+    left_out = f"warning: {path}: row 7 is left out: b holds 'broken'"
+    outs = {name: tmp_path / name for name in ("set", "rec", "v.rrd")}
+    every = [
+        ["learn", path, "--time", "t", "--range", "-3:3", "--dry-run"],
+        ["convert", path, "--time", "t", "-o", outs["rec"]],
+        ["export", path, "--time", "t", "--to", "lerobot", "-o", outs["set"]],
+        ["view", path, "--time", "t", "--range", "-3:3", "--save", outs["v.rrd"]],
+        ["play", path, "--time", "t", "--to", "foxglove", "--wait", 0, "--port", 0, "--rate", 99],
+    ]
+    for words in every:
+        done = cdmisfa(*words)
+        assert done.code == 0, done.err
+        if "--range" not in words:
+            assert left_out in done.err, words[0]
+        assert "H.264" not in done.err
+    checked = cdmisfa("verify", path)
+    assert (checked.code, "b holds words" in checked.out) == (0, True)
+    assert "12 rows of 3 columns can be read; a table has no checksums" in checked.out
+    refused = cdmisfa("export", path, "--time", "t", "--to", "npz", "-o", tmp_path / "a.npz")
+    assert refused.code == 2
+    assert f"{path} is no run, npz is for the signals of one: choose images or mp4" in refused.err
+
+
+def test_a_recording_of_values_says_how_it_is_taken(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    rec, again = tmp_path / "rec", tmp_path / "again"
+    assert cdmisfa("convert", written(tmp_path, {}), "--time", "t", "-o", rec).code == 0
+    for words in (["convert", rec, "-o", again], ["learn", rec, "--color"]):
+        done = cdmisfa(*words)
+        assert done.code == 2
+        assert "it is a recording of values, not of images: learn, view, export" in done.err
+    assert cdmisfa("convert", rec, "--field", "values", "-o", again).code == 0
+
+
+def test_frames_that_are_held_in_a_gap_are_counted(tmp_path: Path) -> None:
+    path = written(tmp_path, {ROWS - 1: "5.0,1,1"})
+    with contextlib.closing(ForeignSource(path, time="t", gaps="hold")) as source:
+        assert (source.frames, source.alignment["t"]["repeated"]) == (51, 39)
+    with contextlib.closing(ForeignSource(path, time="t")) as source:
+        assert (source.frames, source.alignment["t"]["repeated"]) == (51, 0)
+
+
+@pytest.mark.parametrize("value", ["-3.2:3.2", "-10:-5", "0:1"])
+def test_a_range_of_numbers_may_begin_below_0(cdmisfa: Cdmisfa, tmp_path: Path, value: str) -> None:
+    path = written(tmp_path, {})
+    assert cdmisfa("learn", path, "--time", "t", "--range", value, "--dry-run").code == 0
+    done = cdmisfa("learn", path, "--time", "t", "--range", "5:-5", "--dry-run")
+    assert (done.code, "or LOW:HIGH of numbers" in done.err) == (2, True)
