@@ -1,7 +1,7 @@
 """Writing MCAP: chunked, compressed, indexed, with every checksum.
 
-The bytes are those that the mcap package writes, in a quarter of its time a message: of a message
-nothing is done until its chunk ends but to keep it.
+The bytes are those that the mcap package writes, but for how lz4 is told to compress, in a quarter
+of its time a message: of a message nothing is done until its chunk ends but to keep it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ _FOOTER: Final = struct.Struct("<BQQQ")
 
 _COMPRESS: Final[Mapping[Compression, tuple[str, Callable[[memoryview], bytes]]]] = {
     "zstd": ("zstd", zstandard.compress),
-    "lz4": ("lz4", lz4.frame.compress),
+    # Blocks that do not know those before take a third less time, and 3 % more room.
+    "lz4": ("lz4", partial(lz4.frame.compress, block_linked=False)),
     "none": ("", bytes),
 }
 
@@ -142,11 +143,11 @@ class McapWriter:
         )
         start = at + _MESSAGE_SIZE
         stop = start + length
-        records = self._records
-        if stop > len(records):
-            records.extend(bytes(stop - len(records)))
-        records[at:start] = header
-        records[start:stop] = data
+        if stop > len(self._records):
+            self._records.extend(bytes(stop - len(self._records)))
+        with memoryview(self._records) as records:  # takes bytes at once, a bytearray a copy
+            records[at:start] = header
+            records[start:stop] = data
         self._size = stop
         pairs = self._index.get(channel)
         if pairs is None:
@@ -245,16 +246,13 @@ class McapWriter:
             stored, crc = self._compress(records), crc32(records)
         name = self._compression.encode()
         length = _CHUNK.size - 9 + 4 + len(name) + 8 + len(stored)
-        chunk = b"".join(
-            (
-                _CHUNK.pack(Opcode.CHUNK, length, first, last, size, crc),
-                len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little"),
-                stored,
-            )
-        )
+        head = _CHUNK.pack(Opcode.CHUNK, length, first, last, size, crc)
+        head += len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little")
+        chunk = len(head) + len(stored)
         offset = self._out.tell()
-        self._append(chunk)
-        offsets, parts, at = {}, [], offset + len(chunk)
+        self._append(head)
+        self._append(stored)
+        offsets, parts, at = {}, [], offset + chunk
         for channel, pairs in index.items():
             offsets[channel] = at
             length = 8 * len(pairs)
@@ -267,12 +265,12 @@ class McapWriter:
         self._append(b"".join(parts))
         self._chunks.append(
             ChunkIndex(
-                chunk_length=len(chunk),
+                chunk_length=chunk,
                 chunk_start_offset=offset,
                 compression=self._compression,
                 compressed_size=len(stored),
                 message_end_time=last,
-                message_index_length=at - offset - len(chunk),
+                message_index_length=at - offset - chunk,
                 message_index_offsets=offsets,
                 message_start_time=first,
                 uncompressed_size=size,
