@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.whole import PARTIAL
 from replay.mcap.reader import LogReader
-from replay.mcap.records import Channel
+from replay.mcap.records import Channel, MalformedRecord
 from replay.mcap.tables import MessageTable
 from replay.runs.columns import Blocks, SignalColumns, columns_of_messages
 from replay.runs.folders import run_log
@@ -30,7 +31,7 @@ from replay.runs.log import (
     RunHeader,
     read_header,
 )
-from replay.runs.messages import decode_matrices, decode_matrix, decode_signals, parsed
+from replay.runs.messages import decode_matrices, decode_matrix, decode_signals, parsed, spans
 
 ITERATIONS = 500
 """Most iterations of a stretch."""
@@ -42,6 +43,12 @@ TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
 
 Frames = tuple[NDArray[np.int64], NDArray[Any]]
 """(n,) frames and (n, ...) what belongs to them."""
+
+_TIMESTAMP, _LONG = b"\x0a", b"\x80"
+"""The tag of an image's time, which comes first; its length, where that takes more than a byte."""
+
+_LAYOUTS = 64
+"""Most layouts of images that are remembered: one for each stream and size."""
 
 _ITERATION = re.compile(r"iteration (\d{1,18})")
 
@@ -207,12 +214,13 @@ class _Waiting:
         data = self._data[WATCHED_TOPIC]
         if not data:
             return ()
-        shape = self.header.spec.frame_shape
-        pixels = np.empty((len(data), *shape), dtype=np.uint8)
-        for place, entry in zip(pixels, data, strict=True):
-            image = parsed(RawImage_pb2.RawImage, entry, f"{self._log} {WATCHED_TOPIC}")
-            place[:] = _reshaped(np.frombuffer(image.data, np.uint8), shape, self._log)
-        return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), pixels),)
+        shape, images = self.header.spec.frame_shape, _Images(f"{self._log} {WATCHED_TOPIC}")
+        found = [images.pixels(entry) for entry in data]
+        for pixels in found:
+            if len(pixels) != math.prod(shape):
+                _reshaped(np.frombuffer(pixels, np.uint8), shape, self._log)
+        whole = np.frombuffer(b"".join(found), np.uint8).reshape(len(data), *shape)
+        return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), whole),)
 
     def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
         """Rows of matrix messages with a frame each, all of one size together."""
@@ -221,6 +229,44 @@ class _Waiting:
             for _, group in groupby(self._data[topic], key=len)
             for frames, values in decode_matrices(list(group), f"{self._log} {topic}")
         )
+
+
+class _Images:
+    """Finds the pixels in `foxglove.RawImage` messages, most of which differ in them and in time.
+
+    Args:
+        where: what is said of a message that is none.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._around: list[tuple[bytes, int, bytes]] = []
+
+    def pixels(self, entry: bytes) -> memoryview:
+        """The bytes of an image, where they lie in its message."""
+        if entry[:1] == _TIMESTAMP and entry[1:2] < _LONG:
+            rest = 2 + sum(entry[1:2])
+            for i, (before, size, after) in enumerate(self._around):
+                start = rest + len(before)
+                stop = start + size
+                if entry[rest:start] == before and entry[stop:] == after:
+                    if i:  # the next one is of the same stream most of the time
+                        self._around.insert(0, self._around.pop(i))
+                    return memoryview(entry)[start:stop]
+        image = parsed(RawImage_pb2.RawImage, entry, self._where)
+        self._learn(entry)
+        return memoryview(image.data)
+
+    def _learn(self, entry: bytes) -> None:
+        """Remember what stands around the pixels, where nothing but the time stands before."""
+        try:
+            places = spans(entry)
+        except MalformedRecord:
+            return
+        time, pixels = places.get(1, (0, 0)), places.get(6, (0, 0))
+        if time[0] == 2 and pixels[0] > time[1] and time[1] - 2 < 0x80:
+            around = entry[time[1] : pixels[0]], pixels[1] - pixels[0], entry[pixels[1] :]
+            self._around = [around, *self._around[: _LAYOUTS - 1]]
 
 
 def _checked(columns: SignalColumns, streams: int, where: str) -> SignalColumns:

@@ -62,11 +62,11 @@ class WallView:
         blocks = stretch.blocks
         for frames, images in stretch.watched if len(blocks.starts) else ():
             places = blocks.places(frames)
-            for i in np.flatnonzero(np.diff(places, append=len(blocks.starts))).tolist():
-                column = self._pictures.get(int(blocks.streams[places[i]]))
-                if column is not None:
-                    iteration = int(blocks.iterations[places[i]])
-                    column.add(frames[i : i + 1], iteration, images[i : i + 1])
+            last = np.flatnonzero(np.diff(places, append=len(blocks.starts)))
+            for s in np.unique(blocks.streams[places[last]]).tolist():
+                if (column := self._pictures.get(s)) is not None:
+                    shown = last[blocks.streams[places[last]] == s]
+                    column.add(frames[shown], blocks.iterations[places[shown]], images[shown])
 
     def flush(self) -> None:
         """Hand over what waits."""
