@@ -21,7 +21,7 @@ from PIL import Image, ImageOps
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.testing.sources import SourceContract
-from recorder.images.messages import image_decoder
+from recorder.images.messages import holds_distances, image_decoder
 from recorder.images.pixels import (
     ENCODINGS,
     MalformedImage,
@@ -170,6 +170,66 @@ def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
         decoder = image_decoder(*which)
         assert decoder is not None
         assert abs(decoder(message) - expected).max() <= (0 if kind == "PNG" else 6)
+
+
+def ros_compressed(form: str, data: bytes) -> dict[tuple[str, str], bytes]:
+    """A message of ROS 2 and one of ROS 1."""
+    name = form.encode() + b"\0"
+    two = b"\0\1\0\0" + struct.pack("<iII", 5, 6, 4) + b"cam\0"
+    two += struct.pack("<I", len(name)) + name + bytes(-len(name) % 4)
+    one = struct.pack("<IIII", 1, 5, 6, 3) + b"cam" + struct.pack("<I", len(form)) + form.encode()
+    return {
+        (f"sensor_msgs/{part}CompressedImage", encoding): message
+        + struct.pack("<I", len(data))
+        + data
+        for part, encoding, message in (("msg/", "cdr", two), ("", "ros1", one))
+    }
+
+
+def test_compressed_distances_are_shown_in_a_range() -> None:
+    metres = np.array([[0.0, 0.5, 1.0], [1.5, 3.0, 1.02]])
+    shown = np.array([[0, 0, 0], [128, 255, 5]], np.uint8)
+    plain = encoded((metres * 1000).astype(np.uint16), "PNG")
+    scale, offset = 20000.0, -3.0  # a metre is a step of 1 in 20000
+    with np.errstate(divide="ignore"):
+        inverse = np.where(metres > 0, scale / metres + offset, 0)
+    packed = encoded(np.round(inverse).astype(np.uint16), "PNG")
+    head = struct.pack("<iff", 0, scale, offset)
+    for form, data in (
+        ("16UC1; png compressed ", plain),
+        ("16UC1; compressedDepth", head + plain),
+        ("16UC1; compressedDepth png", head + plain),
+        ("32FC1; compressedDepth png", head + packed),
+    ):
+        for kind, message in ros_compressed(form, data).items():
+            assert holds_distances(*kind, message)
+            decoder, without = image_decoder(*kind, depth=(1.0, 2.0)), image_decoder(*kind)
+            assert decoder is not None
+            assert without is not None
+            np.testing.assert_array_equal(decoder(message), shown)
+            if form.startswith("16"):
+                high = (metres * 1000).astype(np.uint16) >> 8
+                np.testing.assert_array_equal(without(message), high)
+            else:
+                with pytest.raises(UsageError, match="--range"):
+                    without(message)
+
+
+@pytest.mark.parametrize(
+    ("form", "data", "why"),
+    [
+        ("16UC1; compressedDepth rvl", bytes(40), "packed as rvl, which is not read"),
+        ("16UC1; compressedDepth png", bytes(12), "cut short"),
+        ("16UC1; compressedDepth png", bytes(40), "PNG is broken"),
+        ("16UC1; png compressed", encoded(GRAY, "PNG"), "packed as L, not in 16 bit"),
+    ],
+)
+def test_compressed_distances_that_are_none_are_named(form: str, data: bytes, why: str) -> None:
+    for kind, message in ros_compressed(form, data).items():
+        decoder = image_decoder(*kind, depth=(1.0, 2.0))
+        assert decoder is not None
+        with pytest.raises(MalformedImage, match=why):
+            decoder(message)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])

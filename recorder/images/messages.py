@@ -10,10 +10,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.pixels import (
@@ -22,6 +24,7 @@ from recorder.images.pixels import (
     Depth,
     MalformedImage,
     compressed_gray,
+    compressed_words,
     gray,
 )
 from recorder.images.videos import Packet, VideoPackets
@@ -44,6 +47,20 @@ class Pixels(NamedTuple):
     big_endian: bool = False
 
 
+class Compressed(NamedTuple):
+    """What a message with a JPEG or PNG says.
+
+    Attributes:
+        data: of the image; of compressed_depth_image_transport, behind a header.
+        encoding: of the pixels that were compressed, where ROS says it; else nothing of use.
+        depth: whether it is of compressed_depth_image_transport.
+    """
+
+    data: bytes
+    encoding: str = ""
+    depth: bool = False
+
+
 def image_decoder(
     schema: str, encoding: str, depth: Depth | None = None, *, color: bool = False
 ) -> Decoder | None:
@@ -59,14 +76,15 @@ def image_decoder(
         return lambda data: gray(**pixels(data)._asdict(), depth=depth, color=color)
     if (packet := _PACKETS.get((schema, encoding))) is not None:
         return VideoPackets(packet, color=color)
-    packed = _COMPRESSED.get((schema, encoding))
-    return None if packed is None else partial(packed, color=color)
+    if (packed := _COMPRESSED.get((schema, encoding))) is not None:
+        return lambda data: _unpacked(packed(data), depth, color=color)
+    return None
 
 
 def holds_distances(schema: str, encoding: str, data: bytes | memoryview) -> bool:
     """Whether a message of such a kind holds distances; raises MalformedImage."""
-    pixels = _RAW.get((schema, encoding))
-    return pixels is not None and pixels(data).encoding in DISTANCES
+    found = _RAW.get((schema, encoding)) or _COMPRESSED.get((schema, encoding))
+    return found is not None and found(data).encoding in DISTANCES
 
 
 def _foxglove_raw(data: bytes | memoryview) -> Pixels:
@@ -74,8 +92,31 @@ def _foxglove_raw(data: bytes | memoryview) -> Pixels:
     return Pixels(m.data, m.height, m.width, m.encoding, m.step)
 
 
-def _foxglove_compressed(data: bytes | memoryview, *, color: bool) -> Bytes:
-    return compressed_gray(_parse(CompressedImage, data).data, color=color)
+def _unpacked(image: Compressed, depth: Depth | None, *, color: bool) -> Bytes:
+    """What a compressed image shows; see `gray`."""
+    if image.encoding not in DISTANCES:
+        return compressed_gray(image.data, color=color)
+    words = compressed_words(image.data[_DEPTH_HEADER.size :] if image.depth else image.data)
+    distances: NDArray[Any] = words.astype("<u2")
+    if image.encoding == "32FC1":
+        distances = _metres(words, image.data).astype("<f4")
+    height, width = words.shape
+    return gray(distances.tobytes(), height, width, image.encoding, depth=depth)
+
+
+def _metres(words: NDArray[np.uint16], data: bytes) -> NDArray[np.float32]:
+    """Distances that were stored by their inverses, rounded; NaN where none was measured.
+
+    Source: compressed_depth_image_transport, whose header holds the two numbers of the rounding.
+    """
+    _, scale, offset = _DEPTH_HEADER.unpack_from(data)
+    inverse = words.astype(np.float32) - np.float32(offset)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(words > 0, np.float32(scale) / inverse, np.float32(np.nan))
+
+
+def _foxglove_compressed(data: bytes | memoryview) -> Compressed:
+    return Compressed(_parse(CompressedImage, data).data)
 
 
 def _parse(kind: Any, data: bytes | memoryview) -> Any:
@@ -94,8 +135,8 @@ def _json_raw(data: bytes | memoryview) -> Pixels:
     return Pixels(_base64(fields), height, width, str(fields.get("encoding")), step)
 
 
-def _json_compressed(data: bytes | memoryview, *, color: bool) -> Bytes:
-    return compressed_gray(_base64(_json(data)), color=color)
+def _json_compressed(data: bytes | memoryview) -> Compressed:
+    return Compressed(_base64(_json(data)))
 
 
 def _json(data: bytes | memoryview) -> Mapping[str, Any]:
@@ -171,10 +212,16 @@ def _ros_raw(data: bytes | memoryview, *, ros1: bool) -> Pixels:
     return Pixels(fields.data(), height, width, encoding, step, big_endian)
 
 
-def _ros_compressed(data: bytes | memoryview, *, ros1: bool, color: bool) -> Bytes:
+def _ros_compressed(data: bytes | memoryview, *, ros1: bool) -> Compressed:
     fields = _RosFields(data, ros1=ros1)
-    fields.text()
-    return compressed_gray(bytes(fields.data()), color=color)
+    encoding, _, how = fields.text().partition(";")
+    packed, depth = bytes(fields.data()), "compressedDepth" in how
+    if depth and len(packed) <= _DEPTH_HEADER.size:
+        raise MalformedImage("a compressed image of distances is cut short")
+    if depth and "rvl" in how:
+        raise MalformedImage("its distances are packed as rvl, which is not read: png is")
+    plain = "32FC1" in encoding and not depth
+    return Compressed(packed, "" if plain else encoding.strip(), depth)
 
 
 def _foxglove_video(data: bytes | memoryview) -> Packet:
@@ -208,7 +255,10 @@ _RAW: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Pixels]]] = 
 }
 """What messages say that hold pixels, which may be distances."""
 
-_COMPRESSED: Final[Mapping[tuple[str, str], Callable[..., Bytes]]] = {
+_DEPTH_HEADER: Final = struct.Struct("<iff")
+"""How compressed_depth_image_transport packed distances, and with which two numbers."""
+
+_COMPRESSED: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Compressed]]] = {
     ("foxglove.CompressedImage", "protobuf"): _foxglove_compressed,
     ("foxglove.CompressedImage", "json"): _json_compressed,
     ("sensor_msgs/msg/CompressedImage", "cdr"): partial(_ros_compressed, ros1=False),

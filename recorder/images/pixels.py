@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -44,6 +45,9 @@ _TURNS: Final = {
     8: Image.Transpose.ROTATE_90,
 }
 """What puts an image upright, by its orientation; 1 is."""
+
+_WORDS: Final = ("I;16", "I;16B", "I")
+"""Pillow's modes of 16 bit."""
 
 _LAYOUTS: Final[Mapping[str, tuple[int, str]]] = {
     "mono8": (1, "gray"),
@@ -247,6 +251,29 @@ def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
     Raises:
         MalformedImage: it is neither, broken, or too large.
     """
+    with _opened(data) as image:
+        if image.mode in _WORDS:
+            return _high_bytes(np.asarray(image))
+        if image.mode not in ("L", "RGB"):
+            image = image.convert("RGB")
+        return np.array(image if color else image.convert("L"), np.uint8)
+
+
+def compressed_words(data: bytes) -> NDArray[np.uint16]:
+    """Decode a PNG of 16 bit, as distances are packed in, into (height, width).
+
+    Raises:
+        MalformedImage: it is none, broken, or too large.
+    """
+    with _opened(data) as image:
+        if image.mode not in _WORDS:
+            raise MalformedImage(f"its distances are packed as {image.mode}, not in 16 bit")
+        return np.asarray(image).astype(np.uint16)
+
+
+@contextmanager
+def _opened(data: bytes) -> Iterator[Image.Image]:
+    """A JPEG or PNG, upright; Pillow decodes it when it is asked for."""
     try:
         with budget(), warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -260,11 +287,7 @@ def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
                 )
             if (orientation := _orientation(image)) in _TURNS:
                 image = image.transpose(_TURNS[orientation])
-            if image.mode in ("I;16", "I;16B", "I"):
-                return _high_bytes(np.asarray(image))
-            if image.mode not in ("L", "RGB"):
-                image = image.convert("RGB")
-            return np.array(image if color else image.convert("L"), np.uint8)
+            yield image
     except MalformedImage:
         raise
     except MemoryError:
