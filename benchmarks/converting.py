@@ -69,7 +69,7 @@ def converting(path: Path, folder: Path) -> Callable[[], int]:
 def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/converting.json."""
     del full
-    rounds, n = (2, 60) if quick else (5, 200)
+    rounds, n = (2, 60) if quick else (5, 400)
     rows = []
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)

@@ -21,8 +21,8 @@ VIDEO_RECIPE: Final = (
 
 _FULL_RANGE: Final = 2
 _LUMA: Final = ("yuv", "yuvj", "gray", "nv12", "nv21")
-_STRETCH: Final[Bytes] = (((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8)
-"""Luma of limited range as full range, a value for each byte, (256,)."""
+_STRETCH: Final = bytes((((np.arange(256) - 16) * 510 + 219) // 438).clip(0, 255).astype(np.uint8))
+"""Luma of limited range as full range, a value for each byte."""
 
 
 COLOR_RECIPE: Final = (
@@ -96,4 +96,6 @@ def _luma(frame: Any) -> Bytes:
     plane = frame.planes[0]
     luma = gray(memoryview(plane), frame.height, frame.width, "mono8", plane.line_size)
     full = form.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
-    return luma if full else _STRETCH[luma]
+    if full:
+        return luma
+    return np.frombuffer(luma.tobytes().translate(_STRETCH), np.uint8).reshape(luma.shape)
