@@ -6,10 +6,9 @@ code, in memory that is used again; all others by their tables, which say what i
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,6 @@ from replay.mcap.segments import Segment
 from replay.mcap.tables import MessageTable
 from replay.recordings.channel_rows import own_messages
 from replay.storage.location import Location
-
-_KEPT: Final = 2
 
 Places = NDArray[np.int64]
 
@@ -94,28 +91,29 @@ class ChunkScanner:
         for c, layout in enumerate(layouts):
             self._places[c, : len(layout.marks)] = layout.places
             self._marks[c, : len(layout.marks)] = layout.marks
-        self._kept: OrderedDict[int, ScannedChunk] = OrderedDict()
+        self._kept: tuple[int, ScannedChunk] | None = None
         self._tabled: set[int] = set()
 
     def chunk(self, segment: Segment) -> ScannedChunk:
         """Decode and check a chunk.
 
-        What it gives is good until two other chunks are asked for.
+        What it gives is good until another chunk is asked for: fewer buffers stay in the CPU's
+        cache, and frames are read in the order of the file.
 
         Raises:
             LogDamagedError: it is damaged, or a message of the view is not laid out like others.
         """
-        key = segment.offset
-        if key not in self._kept:
-            buffer = np.empty(0, np.uint8)
-            if len(self._kept) >= _KEPT:
-                buffer = self._kept.popitem(last=False)[1].buffer
-            found = None if key in self._tabled else self.scanned(segment, buffer)
-            if found is None:
-                found = self.tabled(segment, buffer)
-                self._tabled.add(key)
-            self._kept[key] = found
-        return self._kept[key]
+        key, kept = segment.offset, self._kept
+        if kept is not None and kept[0] == key:
+            return kept[1]
+        self._kept = None
+        buffer = np.empty(0, np.uint8) if kept is None else kept[1].buffer
+        found = None if key in self._tabled else self.scanned(segment, buffer)
+        if found is None:
+            found = self.tabled(segment, buffer)
+            self._tabled.add(key)
+        self._kept = key, found
+        return found
 
     def copy(self, chunk: ScannedChunk, which: int, low: int, out: NDArray[Any]) -> None:
         """Copy the values of a channel's messages from the `low`th of a chunk on, as bytes."""

@@ -70,7 +70,7 @@ class Either:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the form for the arithmetic of the moment."""
-        return self.meant(*args, **kwargs)
+        return (self._portable() if _PORTABLE.get() else self._fast)(*args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         """What compilers and tests ask of a compiled function."""
