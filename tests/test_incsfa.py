@@ -311,16 +311,18 @@ def test_strict_bits_do_not_depend_on_how_frames_are_cut():
     assert a.phi.tobytes() == b.phi.tobytes()
 
 
+@pytest.mark.parametrize("pixels", [False, True])
 @pytest.mark.parametrize("portable", [False, True])
 @pytest.mark.parametrize(("rows", "size", "n"), [(4, 1300, 9), (7, 1024, 67), (3, 544, 5)])
-def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it(rows, size, n, portable):
+def test_outputs_of_a_row_do_not_depend_on_the_rows_beside_it(rows, size, n, portable, pixels):
     """Nor do those of a frame on its block: neither tells where it is paired, or alone."""
     rng = np.random.default_rng(0)
     phi, offset = rng.standard_normal((rows, size)), rng.standard_normal(rows)
-    frames = rng.standard_normal((n, size))
+    frames = rng.integers(0, 256, (n, size), np.uint8) if pixels else rng.normal(size=(n, size))
     with portable_bits(portable):
         stacked = project(phi, offset, frames)
-        np.testing.assert_allclose(stacked, frames @ phi.T - offset, rtol=1e-10, atol=1e-10)
+        values = frames * PIXEL if pixels else frames
+        np.testing.assert_allclose(stacked, values @ phi.T - offset, rtol=1e-10, atol=1e-10)
         for row in range(rows):
             for first, stop in ((0, n), (1, 2), (2, 5)):
                 some = phi[row : row + 2], offset[row : row + 2], frames[first:stop]

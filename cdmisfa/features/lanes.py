@@ -110,6 +110,16 @@ def multiply_add(typing: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @_intrinsic
+def times(typing: Any, x: Any, y: Any) -> Any:
+    """Return x * y."""
+
+    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.fmul(*args)
+
+    return _LANES(_LANES, _LANES), emit
+
+
+@_intrinsic
 def total(typing: Any, x: Any) -> Any:
     """Return the sum of a value's numbers, of neighbours first."""
 

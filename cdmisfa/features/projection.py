@@ -12,7 +12,7 @@ from cdmisfa.core.arithmetic.compiled import compiled, inlined, reordered
 from cdmisfa.core.blocks import PIXEL, UINT8, as_frames
 from cdmisfa.core.errors import UsageError
 from cdmisfa.features.inner_products import ROWS, measure_tile
-from cdmisfa.features.lanes import LANES, folded, load, multiply_add, plus, zeros
+from cdmisfa.features.lanes import LANES, folded, load, multiply_add, plus, spread, times, zeros
 
 Float = NDArray[np.float64]
 
@@ -63,6 +63,21 @@ def _product(v: Float, r: int, column: int, width: int, u: Float, t: int) -> flo
         b = multiply_add(b, load(u, t, i + LANES), load(v, r, at + LANES))
         c = multiply_add(c, load(u, t, i + 2 * LANES), load(v, r, at + 2 * LANES))
         d = multiply_add(d, load(u, t, i + 3 * LANES), load(v, r, at + 3 * LANES))
+    return float(folded(plus(d, plus(c, plus(b, a)))))
+
+
+@inlined
+def _product_alone(
+    v: Float, column: int, width: int, frames: NDArray[Any], t: int, scale: float
+) -> float:
+    """`_product` of the first row, with a frame that is scaled as it is read."""
+    a, b, c, d, s = zeros(), zeros(), zeros(), zeros(), spread(scale)
+    for i in range(0, width, STEP):
+        at = column + i
+        a = multiply_add(a, times(s, load(frames, t, at)), load(v, 0, at))
+        b = multiply_add(b, times(s, load(frames, t, at + LANES)), load(v, 0, at + LANES))
+        c = multiply_add(c, times(s, load(frames, t, at + 2 * LANES)), load(v, 0, at + 2 * LANES))
+        d = multiply_add(d, times(s, load(frames, t, at + 3 * LANES)), load(v, 0, at + 3 * LANES))
     return float(folded(plus(d, plus(c, plus(b, a)))))
 
 
@@ -142,6 +157,58 @@ add_products = Either(_add_products, lambda: _add_in_order)
 
 
 @reordered
+def _add_alone(
+    v: Float,
+    column: int,
+    width: int,
+    frames: NDArray[Any],
+    first: int,
+    count: int,
+    scale: float,
+    e: Float,
+) -> bool:
+    """`_add_products` of a single row, with frames that need no copy for it.
+
+    Args:
+        v: (1, I) the row.
+        column: first of the chunk's columns.
+        width: columns.
+        frames: (n, I) values or pixels.
+        first: index of the first of the frames.
+        count: frames.
+        scale: factor of what they hold.
+        e: (1, n) in place.
+
+    Returns:
+        Whether that was done, which not every width allows.
+    """
+    if width % STEP > 0:
+        return False
+    for t in range(count):
+        e[0, t] += _product_alone(v, column, width, frames, first + t, scale)
+    return True
+
+
+@compiled
+def _leave_alone(
+    v: Float,
+    column: int,
+    width: int,
+    frames: NDArray[Any],
+    first: int,
+    count: int,
+    scale: float,
+    e: Float,
+) -> bool:
+    """See `_add_alone`; there is no such way in the order of `measure_tile`."""
+    return False
+
+
+add_alone = Either(_add_alone, lambda: _leave_alone)
+"""See `_add_alone`."""
+
+
+@reordered
 def outputs(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
     """`project` for frames that were checked: compiled, and without a float copy of them.
 
@@ -167,6 +234,8 @@ def outputs(phi: Float, offset: Float, frames: NDArray[Any]) -> Float:
         e[:] = 0.0
         for start in range(0, size, CHUNK):
             width = min(CHUNK, size - start)
+            if rows == 1 and add_alone(phi, start, width, frames, first, count, scale, e):
+                continue
             for t in range(count):
                 frame, scaled = frames[first + t, start : start + width], x[t, :width]
                 for i in range(width):
