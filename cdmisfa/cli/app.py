@@ -25,8 +25,8 @@ from cdmisfa.core.registry import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "record": ("record", "Record what a scene or cameras show, one MCAP file per view."),
-    "learn": ("learn", "Learn slow feature modules from a scene or a recording."),
-    "view": ("view", "Open a run in the Rerun viewer, or save, serve or picture it."),
+    "learn": ("learn", "Learn slow feature modules from a scene, a recording, logs or cameras."),
+    "view": ("view", "Open a run or a recording in the Rerun viewer, or save, serve or draw it."),
     "play": ("view", "Show a recording as it was seen, in real time."),
     "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),
     "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
@@ -103,8 +103,11 @@ class LazyGroup(click.Group):
 def cli() -> None:
     """Record what a curious robot sees, learn from it live or from the log, and look.
 
-    Every command that prints takes --json: one document on stdout, nothing else.
-    An error is one line on stderr, with --json too.
+    cdmisfa COMMAND --help explains a command. Each that prints takes --json: one document on
+    stdout, nothing else. An error is one line on stderr, with --json too.
+
+    Exit codes: 0 ok, 1 failed, 2 wrong usage, 3 log damaged or only partly recovered, 4 not
+    reproduced or not the same, 130 interrupted (143 by SIGTERM, 129 when its terminal is closed).
     """
 
 

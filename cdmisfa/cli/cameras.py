@@ -187,15 +187,15 @@ live_options = options.together(
     options.seconds(
         "--hold",
         0.25,
-        "How long a camera's picture stands for those that are missing; then it has a gap.",
+        "How long a picture of a live stream stands for those that are missing; then it has a gap.",
         least=0,
     ),
     options.one_of(
         "--lost",
         ("reconnect", "wait", "end"),
-        "What to do about a camera that stalls or goes away.",
+        "What to do about a live stream that stalls or goes away.",
     ),
-    options.seconds("--stall", 5.0, "A camera without a picture for so long has stalled."),
+    options.seconds("--stall", 5.0, "A live stream without a picture for so long has stalled."),
 )
 
 

@@ -149,9 +149,9 @@ engine = together(
     one_of(
         "--engine",
         ("local", "dask"),
-        "Where to compute.",
+        "Where to compute: in processes of this machine, or in workers of dask.",
     ),
-    click.option("--scheduler", metavar="ADDRESS", help="A dask scheduler that runs."),
+    click.option("--scheduler", metavar="ADDRESS", help="Address of a dask scheduler that runs."),
 )
 
 

@@ -22,7 +22,8 @@ ALL = "all"
     default="0:10",
     show_default=True,
     metavar="FIRST:END",
-    help="Seeds of learners and streams: a range without its end, or numbers with commas.",
+    help="Seeds of learners and streams: a range without its end, or numbers with commas, as "
+    "1,5,9.",
 )
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
 @click.option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")

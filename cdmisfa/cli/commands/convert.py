@@ -60,9 +60,10 @@ def convert_command(
 ) -> None:
     """Write camera logs of others as a recording.
 
-    SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, or a video or a folder of
-    pictures for each stream; several, or a pattern such as 'logs/*.mcap'. What was
-    interrupted is resumed with --resume. Live streams are recorded, as by cdmisfa record.
+    SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, tables of numbers (CSV,
+    Parquet), or a video or a folder of pictures for each stream; several, or a pattern such as
+    'logs/*.mcap'. What was interrupted is resumed with --resume. Live streams are recorded, as by
+    cdmisfa record.
     """
     from cdmisfa.experiments.convert import convert
     from recorder.cameras.words import is_live

@@ -58,11 +58,12 @@ TICK = 0.1
 @click.option(
     "--max-modules",
     type=click.IntRange(1),
-    help="End after so many modules; by default, the paper's learners, as many as streams.",
+    help="End after so many modules; by default the paper's learners end after as many as there "
+    "are streams.",
 )
-@click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
 @click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
-@click.option("--salvage", is_flag=True, help="Pass over damaged parts of a recording.")
+@click.option("--salvage", is_flag=True, help="Pass over damaged parts of a recording or log.")
 @click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 @click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
@@ -112,15 +113,19 @@ def learn_command(
     stall: float,
     **cameras: Any,
 ) -> None:
-    """Learn slow feature modules from a scene or a recording.
+    """Learn slow feature modules from a scene, a recording, logs or cameras.
 
     SOURCE is a live scene (icub, oscillatory), the folder of a recording, or the MCAP
     files of its views. The same seed gives the same signals, bit for bit, from each.
-    It may also be other people's logs of cameras: MCAP files, ROS bags, or a video or a
-    folder of pictures for each stream. Logs may be URLs: s3://, http:// and https://.
-    With --resume it is that of the run, and need not be given.
+
+    Or it is other people's logs: MCAP files, ROS bags, LeRobot datasets, tables of numbers (CSV,
+    Parquet), or a video or a folder of pictures for each stream. Logs may be URLs: s3://, http://
+    and https://.
+
     Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
     av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
+
+    With --resume it is that of the run, and need not be given.
     """
     if resume and out is None:
         raise click.UsageError("--resume needs -o RUN, the run to resume")

@@ -104,7 +104,8 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
 def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_json: bool) -> None:
     """Save what can be read of a damaged log as a whole one.
 
-    Exits with 3 when something could not be saved.
+    PATH is an MCAP file, as a view of a recording or the run.mcap of a run, or its URL. Exits with
+    3 when something could not be saved.
     """
     from replay.integrity.recover import recover_log
 

@@ -48,9 +48,9 @@ def at_command(
 ) -> None:
     """Say what a learner was after K iterations of a run, exactly.
 
-    It is put where a keyframe in the run's log says and learns on from there, from what
-    the run learned from. Right after a keyframe no source is needed. --json prints all of
-    its memory.
+    K is the number of iterations that were done, from 0 on. The learner is put where a keyframe in
+    the run's log says and learns on from there, from what the run learned from. Right after a
+    keyframe no source is needed. --json prints all of its memory.
     """
     from cdmisfa.core.signals import ACTIONS
     from cdmisfa.experiments.recompute.check import learner_after
@@ -107,8 +107,16 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
 
 @click.command("check")
 @options.path_argument("run")
-@click.option("--from", "start", type=click.IntRange(0), default=0, metavar="K", help="Begin here.")
-@click.option("--to", "stop", type=click.IntRange(1), metavar="L", help="End before this one.")
+@click.option(
+    "--from", "start", type=click.IntRange(0), default=0, metavar="K", help="First iteration."
+)
+@click.option(
+    "--to",
+    "stop",
+    type=click.IntRange(1),
+    metavar="L",
+    help="End before this one; else at the end.",
+)
 @source
 @options.server_limits
 @options.as_json
@@ -141,7 +149,11 @@ def check_command(
 @click.command("fork")
 @options.path_argument("run")
 @click.option(
-    "--at", type=click.IntRange(0), required=True, metavar="K", help="Iterations kept of the run."
+    "--at",
+    type=click.IntRange(0),
+    required=True,
+    metavar="K",
+    help="Go on after so many iterations of the run.",
 )
 @options.out("Folder of the fork.", required=True)
 @click.option(
@@ -156,8 +168,16 @@ def check_command(
     type=click.IntRange(0, 2**63 - 1),
     help="Seed of the random choices from there on; the world stays.",
 )
-@click.option("--max-iterations", type=click.IntRange(1), help="End there; else as the run.")
-@click.option("--max-modules", type=click.IntRange(1), help="End there; else as the run.")
+@click.option(
+    "--max-iterations",
+    type=click.IntRange(1),
+    help="End after so many iterations in all; by default as the run.",
+)
+@click.option(
+    "--max-modules",
+    type=click.IntRange(1),
+    help="End after so many modules in all; by default as the run.",
+)
 @source
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 @options.keyframes

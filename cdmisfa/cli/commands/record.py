@@ -87,9 +87,11 @@ def record_command(
 ) -> None:
     """Record what a scene or cameras show, one MCAP file per view.
 
-    SOURCE is icub or oscillatory; --resume knows it, the seed and the split of what was begun. The
-    same seed gives the same bytes. Or it is live streams, one or several: camera:/dev/video0,
-    rtsp://, http://.../x.mjpg, tcp://, av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
+    SOURCE is a scene, icub or oscillatory; the same seed gives the same bytes. With --resume it
+    need not be given, nor the seed or the split: they are those of what was begun.
+
+    Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
+    av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK. Logs of others are written by cdmisfa convert.
     """
     from cdmisfa.experiments.sources import configure, is_scene
     from recorder.cameras.words import is_live

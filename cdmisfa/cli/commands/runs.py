@@ -77,7 +77,7 @@ def compare_command(
 
 @click.command("plot")
 @options.fetched_argument("run")
-@options.out("Folder of the figures; by default the run's own folder figures.")
+@options.out("Folder of the figures; by default figures in the run's folder.")
 @options.server_limits
 @options.force
 @options.as_json

@@ -32,13 +32,15 @@ MOST_SEEDS = 1_000_000
     default="0:20",
     show_default=True,
     metavar="FIRST:END",
-    help="Seeds of every point: a range without its end, or numbers with commas.",
+    help="Seeds of every point: a range without its end, or numbers with commas, as 1,5,9.",
 )
 @options.preset
 @options.settings
-@click.option("--max-iterations", type=click.IntRange(1), help="End each trial after so many.")
-@click.option("--max-modules", type=click.IntRange(1), help="End each trial after so many.")
-@click.option("--loop", is_flag=True, help="Start a recording again at its end.")
+@click.option(
+    "--max-iterations", type=click.IntRange(1), help="End each trial after so many iterations."
+)
+@click.option("--max-modules", type=click.IntRange(1), help="End each trial after so many modules.")
+@click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
 @log_options
 @options.jobs
 @options.engine
@@ -172,7 +174,7 @@ def parse_seeds(text: str) -> list[int]:
 def results_command(folder: Path, as_csv: bool, as_latex: bool, as_json: bool) -> None:
     """Print mean and standard deviation over seeds at each point of a sweep.
 
-    The trials are those that the sweep was asked for last.
+    FOLDER is that of the sweep, the trials are those that it was asked for last.
     """
     from cdmisfa.experiments import results
 

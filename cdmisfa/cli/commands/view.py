@@ -19,17 +19,20 @@ from cdmisfa.core.errors import UsageError
 
 @click.command("view")
 @options.fetched_argument("run", nargs=-1)
-@click.option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file and end.")
+@click.option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file.")
 @click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
 @click.option(
-    "--screenshot", type=options.OUT, metavar="F.png", help="Draw the view without a screen."
+    "--screenshot",
+    type=options.OUT,
+    metavar="F.png",
+    help="Draw the view into a file, without a screen.",
 )
 @click.option(
     "--at",
     metavar="WHEN",
     help='Moment of the screenshot: a frame, "iteration 500", or words of an event, as "module 2".',
 )
-@click.option("--tab", metavar="NAME", help="The tab that is open; by default the first.")
+@click.option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
 @click.option("--size", metavar="WxH", help="Size of the window or screenshot, as 1600x1000.")
 @click.option("--port", type=click.IntRange(1, 65535), help="Where --web, or a sweep, is served.")
 @click.option(
@@ -37,7 +40,8 @@ from cdmisfa.core.errors import UsageError
     type=click.IntRange(1),
     default=10,
     show_default=True,
-    help="Show every so many watched frames.",
+    metavar="N",
+    help="Show the images of every Nth frame; numbers are all shown.",
 )
 @click.option(
     "--all-views",
@@ -45,7 +49,13 @@ from cdmisfa.core.errors import UsageError
     metavar="RECORDING",
     help="Also show what was not watched, from the recording that the run learned from.",
 )
-@click.option("--memory-limit", default="2GB", show_default=True, help="Most the viewer keeps.")
+@click.option(
+    "--memory-limit",
+    default="2GB",
+    show_default=True,
+    metavar="SIZE",
+    help="Most memory that the viewer takes for what it keeps.",
+)
 @look_options
 @options.server_limits
 @options.force
@@ -66,7 +76,7 @@ def view_command(
     force: bool,
     **shown: Any,
 ) -> None:
-    """Open a run in the Rerun viewer, or save, serve or picture it.
+    """Open a run or a recording in the Rerun viewer, or save, serve or draw it.
 
     RUN is the folder of a run, or its run.mcap, a recording, an .rrd file, or one or several
     camera logs; of a log behind a URL a copy is made. A sweep that kept its logs is served as a
@@ -202,8 +212,8 @@ def play_command(
     """Show a recording as it was seen, in real time.
 
     RECORDING is the folder of a recording, files of its views, or camera logs of others; of one
-    behind a URL a copy is made. As a robot, other tools and cdmisfa itself see it live at
-    ws://127.0.0.1:8765: record foxglove://127.0.0.1:8765/view/left
+    behind a URL a copy is made. With --to foxglove other tools see it at ws://127.0.0.1:8765, as
+    if it were a running robot, cdmisfa, too: cdmisfa record foxglove://127.0.0.1:8765/view/left
     """
     if wait is not None and target != "foxglove":
         raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
