@@ -26,7 +26,7 @@ def test_chunks_that_are_held_stay_as_they_are_while_others_are_decoded_ahead(
 ) -> None:
     path = tmp_path / "log.mcap"
     random = np.random.default_rng(1)
-    payloads = [random.integers(0, 256, 3000, np.uint8).tobytes() for _ in range(60)]
+    payloads = [random.integers(0, 9, 3000, np.uint8).tobytes() for _ in range(60)]
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=8192, compression=compression)
         writer.start()
@@ -46,23 +46,54 @@ def test_chunks_that_are_held_stay_as_they_are_while_others_are_decoded_ahead(
 
 
 @pytest.mark.parametrize("number", [0, 5, 19])
-def test_a_damaged_chunk_is_refused_where_it_is_decoded_ahead(tmp_path: Path, number: int) -> None:
+@pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.NONE])
+def test_a_damaged_chunk_is_refused_where_it_is_decoded_ahead(
+    tmp_path: Path, number: int, compression: CompressionType
+) -> None:
     path = tmp_path / "log.mcap"
+    random = np.random.default_rng(number)
+    noise = [random.integers(0, 256, 100, np.uint8).tobytes() for _ in range(20)]
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1000, compression=CompressionType.NONE)
+        writer = Writer(file, chunk_size=1000, compression=compression)
         writer.start()
         channel = writer.register_channel("a", "b", 0)
         for i in range(20):
-            writer.add_message(channel, i, bytes([i]) * 1000, i)
+            writer.add_message(channel, i, noise[i] + bytes(900), i)
         writer.finish()
     raw = bytearray(path.read_bytes())
-    raw[raw.index(bytes([number]) * 500)] ^= 1
+    raw[raw.index(noise[number])] ^= 1
     path.write_bytes(raw)
     with LogReader(path) as reader:
         messages = reader.messages()
         assert [next(messages).log_time for _ in range(number)] == list(range(number))
         with pytest.raises(LogDamagedError, match="its CRC does not match"):
             next(messages)
+
+
+@pytest.mark.parametrize(
+    ("compression", "most", "ahead"),
+    [
+        (CompressionType.ZSTD, 9, True),
+        (CompressionType.LZ4, 2, True),
+        (CompressionType.ZSTD, 256, False),
+        (CompressionType.NONE, 2, False),
+    ],
+)
+def test_only_what_is_compressed_is_read_by_other_threads(
+    tmp_path: Path, compression: CompressionType, most: int, ahead: bool
+) -> None:
+    path = tmp_path / "log.mcap"
+    random = np.random.default_rng(1)
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4000, compression=compression)
+        writer.start()
+        channel = writer.register_channel("a", "b", 0)
+        for i in range(8):
+            writer.add_message(channel, i, random.integers(0, most, 5000, np.uint8).tobytes(), i)
+        writer.finish()
+    with LogReader(path) as reader:
+        assert len(list(reader.messages())) == len(reader.segments) == 8
+        assert (reader._chunks._threads is not None) == ahead
 
 
 class Held(Store):

@@ -38,6 +38,8 @@ Few, because reading moves forward, and memory that is used again is still in th
 """
 AHEAD: Final = 2
 """Chunks that are decompressed ahead at once, each in a thread, while others are looked at."""
+_PACKED: Final = 0.9
+"""How small what is stored of a chunk is against its size where it is decompressed ahead."""
 _LARGE: Final = 8 * 1024 * 1024
 """Bytes of a chunk that is not decompressed ahead, because of the memory that this takes."""
 
@@ -175,9 +177,10 @@ class Chunks:
             return
         self._next = at + 1
         for one in expected[at + 1 : at + 1 + AHEAD] if isinstance(self._file, FileStore) else ():
-            # What is not compressed is read in less time than another thread takes it over.
-            packed = one.compression and not one.cut and max(one.size, one.stored) <= _LARGE
-            if packed and one.offset not in self._cache and one.offset not in self._ahead:
+            # What is hardly compressed is read in less time than another thread takes it over.
+            packed = one.compression and not one.cut and one.stored < _PACKED * one.size
+            known = one.offset in self._cache or one.offset in self._ahead
+            if packed and not known and one.size <= _LARGE:
                 self._threads = self._threads or ThreadPoolExecutor(AHEAD)
                 self._ahead[one.offset] = self._threads.submit(self._records, one, self._file)
 
