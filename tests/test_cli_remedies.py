@@ -290,9 +290,7 @@ def test_doctor_names_the_folders_of_the_compiled_kernels(tmp_path: Path) -> Non
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run(words, capture_output=True, check=True, env=environment)
     details = {check["what"]: check["detail"] for check in json.loads(done.stdout)["checks"]}
-    folders = [Path(folder) for folder in details["kernel cache"].split(", ")]
-    assert {folder.parent for folder in folders} == {tmp_path}
-    assert all(folder.is_dir() for folder in folders)
+    assert details["kernel cache"] == str(tmp_path)
 
 
 @pytest.mark.parametrize("form", ["images", "mp4", "csv"])

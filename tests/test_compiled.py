@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numba
 import pytest
@@ -19,12 +18,15 @@ from cdmisfa.core.arithmetic.kept import MARKS
 def test_without_a_folder_for_results_it_compiles_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def no_folder(**options: object) -> object:
+    njit = numba.njit
+
+    def no_folder(*functions: object, **options: object) -> object:
         if options.pop("cache", False):
             raise RuntimeError("cannot cache function: no locator available")
-        return numba.njit(**options)
+        return njit(*functions, **options)
 
-    monkeypatch.setattr("cdmisfa.core.arithmetic.compiled.numba", SimpleNamespace(njit=no_folder))
+    monkeypatch.setattr(numba, "njit", no_folder)
+    monkeypatch.setattr("cdmisfa.core.arithmetic.kept.folder_of", lambda source: None)
 
     @compiled
     def double(x: float) -> float:
@@ -77,7 +79,6 @@ def test_what_is_kept_is_loaded_without_the_compiler(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(
         "import sys\n"
-        "import numba\n"
         "import numpy as np\n"
         "from cdmisfa.core.arithmetic.compiled import compiled\n"
         "@compiled\n"
@@ -86,11 +87,12 @@ def test_what_is_kept_is_loaded_without_the_compiler(tmp_path: Path) -> None:
         "        raise ValueError('too long', len(x))\n"
         "    return np.min(x)\n"
         "assert least(np.array([2.0, 1.0])) == 1.0\n"
+        "print('numba' in sys.modules, 'scipy.linalg' in sys.modules)\n"
         "try:\n"
         "    least(np.zeros(4))\n"
         "except ValueError as error:\n"
         "    assert error.args == ('too long', 4)\n"
-        "print('numba.np.arraymath' in sys.modules, 'scipy.linalg' in sys.modules)\n"
+        "import numba\n"
         "assert numba.njit(lambda x: np.min(x) + 1.0)(np.array([2.0, 1.0])) == 2.0\n"
     )
     kept = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
@@ -122,7 +124,70 @@ def test_what_was_kept_before_a_class_moved_is_made_again(tmp_path: Path) -> Non
         )
         assert (done.stdout, done.stderr) == ("3.0\n", "")
         (tmp_path / f"{home}.py").unlink()
-    assert list((tmp_path / "kept").rglob("*.nbi"))
+    assert list((tmp_path / "kept").rglob("*.kept"))
+
+
+KINDS = """
+import sys
+from typing import NamedTuple
+import numpy as np
+from cdmisfa.core.arithmetic.compiled import compiled
+class Pair(NamedTuple):
+    a: np.ndarray
+    b: float
+@compiled
+def total(x, pair):
+    x[0] += 1.0
+    return x * pair.b + pair.a.sum()
+@compiled
+def half(n):
+    return n / 2
+def same(made, expected):
+    return made.dtype == expected.dtype and (made == expected).all()
+table = np.arange(12.0).reshape(4, 3)
+for x, a in (
+    (table[0].copy(), np.ones(2, np.uint8)),
+    (table[:, 1], np.array([True, False])),
+    (np.arange(4), np.ones(3)),
+):
+    copy = x.copy()
+    made = total(x, Pair(a, 2.0))
+    copy[0] += 1.0
+    assert same(made, copy * 2.0 + a.sum())
+    assert (x == copy).all()
+assert [half(3), half(True), half(np.float32(3))] == [1.5, 0.5, 1.5]
+sys.stderr.write(str('numba.core' in sys.modules))
+"""
+
+
+def test_arguments_of_each_type_have_code_of_their_own_also_when_it_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(KINDS)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    words = [sys.executable, str(tmp_path / "program.py")]
+    for compiler in ("True", "False"):
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+        assert done.stderr == compiler
+    damaged = next((tmp_path / "kept").glob("program.*.kept"))
+    damaged.write_bytes(damaged.read_bytes()[:-1000])
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.stderr == "True"
+
+
+def test_the_processor_is_named_as_the_compiler_names_it(tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "from cdmisfa.core.arithmetic.compiled import compiled_for\n"
+        "said = compiled_for()\n"
+        "print('numba' in sys.modules)\n"
+        "from numba.core.registry import cpu_target\n"
+        "assert said == cpu_target.target_context.codegen().magic_tuple()[1:]\n"
+    )
+    other = {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""}
+    for settings, compiler in ((other, "True"), ({}, "True"), ({}, "False")):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), **settings}
+        words = [sys.executable, "-c", program]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+        assert (done.stdout, done.stderr) == (f"{compiler}\n", "")
 
 
 @pytest.mark.parametrize(

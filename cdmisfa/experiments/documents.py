@@ -58,9 +58,10 @@ def machine() -> dict[str, str]:
     Where arithmetic is not portable, the last bits of a result may depend on each.
     """
     import numpy as np
-    from numba.core.registry import cpu_target
 
-    _, compiled_for, features = cpu_target.target_context.codegen().magic_tuple()
+    from cdmisfa.core.arithmetic.compiled import compiled_for
+
+    processor, features = compiled_for()
     numpy_built: Any = np.show_config(mode="dicts")
     blas = numpy_built.get("Build Dependencies", {}).get("blas", {})
     return {
@@ -68,7 +69,7 @@ def machine() -> dict[str, str]:
         "machine": platform.machine(),
         "libc": " ".join(platform.libc_ver()).strip(),
         "cpu": _cpu(),
-        "compiled_for": compiled_for,
+        "compiled_for": processor,
         "cpu_features": " ".join(f[1:] for f in features.split(",") if f.startswith("+")),
         "numpy_features": " ".join(numpy_built.get("SIMD Extensions", {}).get("found", ())),
         "blas": f"{blas.get('name', 'unknown')} {blas.get('version', '')}".strip(),

@@ -9,13 +9,12 @@ Indices are not checked and must not be negative; arrays are two-dimensional and
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, cast
 
 from llvmlite import ir
-from numba.core import types
-from numba.core.datamodel.models import PrimitiveModel
-from numba.core.datamodel.registry import register_default
-from numba.extending import intrinsic
+
+from cdmisfa.core.arithmetic.compiled import before_the_first
 
 LANES = 8
 """Numbers in one value: a cache line."""
@@ -24,22 +23,52 @@ _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _INDEX = ir.IntType(32)
 
 
-class _Lanes(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="Lanes")
+@cache
+def _lanes() -> Any:
+    """The compiler's type of a value."""
+    from numba.core import types
+    from numba.core.datamodel.models import PrimitiveModel
+    from numba.core.datamodel.registry import register_default
+
+    class Lanes(types.Type):
+        def __init__(self) -> None:
+            super().__init__(name="Lanes")
+
+    @register_default(Lanes)
+    class LanesModel(PrimitiveModel):
+        def __init__(self, manager: Any, of: Any) -> None:
+            super().__init__(manager, of, _VECTOR)  # type: ignore[no-untyped-call]
+
+    return Lanes()
 
 
-@register_default(_Lanes)
-class _LanesModel(PrimitiveModel):
-    def __init__(self, manager: Any, of: Any) -> None:
-        super().__init__(manager, of, _VECTOR)  # type: ignore[no-untyped-call]
+def _types() -> Any:
+    from numba.core import types
+
+    return types
 
 
-_LANES = _Lanes()
+class _Word:
+    """A word of compiled code; only the compiler looks at it."""
+
+    def __init__(self, emitter: Callable[..., Any]) -> None:
+        self._emitter = emitter
+        before_the_first(self._prepare)
+
+    def _prepare(self) -> None:
+        from numba.extending import intrinsic
+
+        self._word = intrinsic(self._emitter)
+
+    @property
+    def _numba_type_(self) -> Any:
+        from numba.core.registry import cpu_target
+
+        return cpu_target.typing_context.resolve_value_type(self._word)
 
 
 def _intrinsic(emitter: Callable[..., Any]) -> Callable[..., Any]:
-    return cast(Callable[..., Any], intrinsic(emitter))
+    return cast(Callable[..., Any], _Word(emitter))
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
@@ -65,13 +94,13 @@ def load(typing: Any, array: Any, row: Any, column: Any) -> Any:
     """Return array[row, column : column + LANES]; of bytes, their values."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        if signature.args[0].dtype == types.uint8:
+        if signature.args[0].dtype == _types().uint8:
             pointer = _pointer(context, builder, signature.args[0], *args)
             few = builder.bitcast(pointer, ir.VectorType(ir.IntType(8), LANES).as_pointer())
             return builder.uitofp(builder.load(few, align=1), _VECTOR)
         return builder.load(_lanes_pointer(context, builder, signature.args[0], *args), align=8)
 
-    return _LANES(array, types.intp, types.intp), emit
+    return _lanes()(array, _types().intp, _types().intp), emit
 
 
 @_intrinsic
@@ -83,7 +112,7 @@ def store(typing: Any, array: Any, row: Any, column: Any, x: Any) -> Any:
         builder.store(args[3], pointer, align=8)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, types.intp, _LANES), emit
+    return _types().void(array, _types().intp, _types().intp, _lanes()), emit
 
 
 @_intrinsic
@@ -96,7 +125,7 @@ def add(typing: Any, x: Any, table: Any, row: Any, column: Any, y: Any) -> Any:
         pointer = _pointer(context, builder, signature.args[1], table, row, column)
         return builder.fadd(x, builder.fmul(_spread(builder, builder.load(pointer)), y))
 
-    return _LANES(_LANES, table, types.intp, types.intp, _LANES), emit
+    return _lanes()(_lanes(), table, _types().intp, _types().intp, _lanes()), emit
 
 
 @_intrinsic
@@ -106,7 +135,7 @@ def multiply_add(typing: Any, x: Any, y: Any, z: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fadd(args[0], builder.fmul(args[1], args[2]))
 
-    return _LANES(_LANES, _LANES, _LANES), emit
+    return _lanes()(_lanes(), _lanes(), _lanes()), emit
 
 
 @_intrinsic
@@ -130,7 +159,7 @@ def total(typing: Any, x: Any) -> Any:
             parts = [builder.fadd(first, second) for first, second in pairs]
         return parts[0]
 
-    return types.float64(_LANES), emit
+    return _types().float64(_lanes()), emit
 
 
 @_intrinsic
@@ -145,7 +174,7 @@ def folded(typing: Any, x: Any) -> Any:
             parts = [builder.fadd(first, second) for first, second in pairs]
         return parts[0]
 
-    return types.float64(_LANES), emit
+    return _types().float64(_lanes()), emit
 
 
 @_intrinsic
@@ -155,7 +184,7 @@ def plus(typing: Any, x: Any, y: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fadd(*args)
 
-    return _LANES(_LANES, _LANES), emit
+    return _lanes()(_lanes(), _lanes()), emit
 
 
 @_intrinsic
@@ -165,7 +194,7 @@ def minus(typing: Any, x: Any, y: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fsub(*args)
 
-    return _LANES(_LANES, _LANES), emit
+    return _lanes()(_lanes(), _lanes()), emit
 
 
 @_intrinsic
@@ -175,7 +204,7 @@ def spread(typing: Any, x: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _spread(builder, args[0])
 
-    return _LANES(types.float64), emit
+    return _lanes()(_types().float64), emit
 
 
 @_intrinsic
@@ -185,4 +214,4 @@ def zeros(typing: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return ir.Constant(_VECTOR, [0.0] * LANES)
 
-    return _LANES(), emit
+    return _lanes()(), emit

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import click
@@ -126,15 +127,16 @@ def _simulator() -> Iterator[Check]:
 
 def _kernel_cache() -> Iterator[Check]:
     try:
-        from cdmisfa.agents.iteration import think
-        from cdmisfa.features.incsfa import strict
-        from replay.recordings import kernels
+        from cdmisfa.core.arithmetic.kept import folder_of
     except ImportError:  # `_packages` says which package is missing
         return
-    compiled: tuple[Any, ...] = (think, strict.update, kernels.scan)
-    folders = [function.stats.cache_path for function in compiled]
+    root = Path(__file__).parents[3]
+    rooms = ("cdmisfa/agents", "cdmisfa/features/incsfa", "replay/recordings")
+    folders = [folder_of(root / room / "__init__.py") for room in rooms]
     kept = None not in folders
-    detail = ", ".join(folders) if kept else "no folder can be written: set NUMBA_CACHE_DIR to one"
+    detail = ", ".join(dict.fromkeys(map(str, folders)))
+    if not kept:
+        detail = "no folder can be written: set NUMBA_CACHE_DIR to one"
     yield Check("kernel cache", kept, detail, "a quick start the second time")
 
 

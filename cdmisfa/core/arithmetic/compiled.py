@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, cached_property, update_wrapper
+from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
-import numba
-from numba.core import event
-from numba.extending import overload
-
 from cdmisfa.core.arithmetic.choice import Either, portable
-from cdmisfa.core.arithmetic.kept import kept_while_sources_last
+from cdmisfa.core.arithmetic.kept import described, keep, kept_while_sources_last, recalled
+from cdmisfa.core.arithmetic.machine_code import fingerprint, loaded, machine_code
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -48,7 +48,17 @@ def in_compiled_code(function: Callable[..., Any]) -> Callable[[Function], Funct
     The decorated function gets the types of the arguments, and returns the function to compile
     for them, or None where it has none.
     """
-    return cast(Callable[[Function], Function], overload(function, strict=False, inline="always"))
+
+    def said(compiled_for: Function) -> Function:
+        def prepare() -> None:
+            from numba.extending import overload
+
+            overload(function, strict=False, inline="always")(compiled_for)
+
+        before_the_first(prepare)
+        return compiled_for
+
+    return said
 
 
 def _compile(function: Function, **options: Any) -> Function:
@@ -67,7 +77,8 @@ class _Compiled(Either):
         strict = {name: value for name, value in options.items() if name != "fastmath"}
         bare = {"no_cpython_wrapper": True}
         super().__init__(
-            _jit(function, options), lambda: _jit(_named_apart(function, "portable"), strict)
+            _ForPython(function, options),
+            lambda: _ForPython(_named_apart(function, "portable"), strict),
         )
         self._within = (
             cache(lambda: _jit(_named_apart(function, "within"), options | bare)),
@@ -77,10 +88,89 @@ class _Compiled(Either):
     @property
     def _numba_type_(self) -> Any:
         """The form for compiled code; see `Either`."""
-        return numba.typeof(self._within[portable()]())  # type: ignore[no-untyped-call]
+        from numba import typeof
+
+        return typeof(self._within[portable()]())  # type: ignore[no-untyped-call]
+
+
+class _ForPython:
+    """One form of a compiled function: from disk if it is there, without the compiler."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self._function, self._options = function, options
+        self._codes: dict[bytes, Callable[..., Any]] = {}
+        self._types: Callable[[tuple[Any, ...]], bytes] = _unseen
+        self._source = Path(function.__code__.co_filename)
+        update_wrapper(self, function, updated=())
+
+    @cached_property
+    def _dispatcher(self) -> Any:
+        return compiler().njit(**self._options)(self._function)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Run the machine code for arguments of these types."""
+        if kwargs:
+            return self._dispatcher(*args, **kwargs)
+        try:
+            code = self._codes[self._types(args)]
+        except (LookupError, NotImplementedError):
+            code = self._first(args)
+        return code(*args)
+
+    def __getattr__(self, name: str) -> Any:
+        """What compilers and tests ask of a compiled function."""
+        return getattr(self._dispatcher, name)
+
+    def __reduce__(self) -> Any:
+        """As the compiler tells it apart."""
+        return self._dispatcher.__reduce__()
+
+    def _first(self, args: tuple[Any, ...]) -> Callable[..., Any]:
+        """What runs arguments of these types from now on."""
+        code = self._from_disk(args) or self._compiled(args)
+        if code is None:
+            return cast(Callable[..., Any], self._dispatcher)
+        with contextlib.suppress(Exception):
+            self._types = fingerprint()
+            self._codes[self._types(args)] = code
+        return code
+
+    def _from_disk(self, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+        with contextlib.suppress(Exception):
+            kept = recalled(self._name(args), self._source)
+            return loaded(kept, self._function.__module__)
+        return None
+
+    def _compiled(self, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+        """What the compiler makes of it, which is kept; None where it says what is wrong."""
+        from numba.core.errors import NumbaError
+
+        if len(args) != self._function.__code__.co_argcount:
+            return None
+        try:
+            types = tuple(map(self._dispatcher.typeof_pyval, args))
+            code = cast(Callable[..., Any], self._dispatcher.compile(types))
+        except (NumbaError, ValueError):
+            return None
+        with contextlib.suppress(Exception):
+            made = machine_code(self._dispatcher.overloads[types])
+            if made is not None and self._function.__closure__ is None:
+                keep(self._name(args), self._source, made)
+        return code
+
+    def _name(self, args: tuple[Any, ...]) -> str:
+        function = self._function
+        place = f"{function.__qualname__}:{function.__code__.co_firstlineno}"
+        options = [(k, sorted(v) if isinstance(v, set) else v) for k, v in self._options.items()]
+        return f"{place} {options} {described(args)}"
+
+
+def _unseen(args: tuple[Any, ...]) -> bytes:
+    raise LookupError
 
 
 def _jit(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
+    numba = compiler()
     try:
         return kept_while_sources_last(numba.njit(cache=True, **options)(function))
     except RuntimeError:  # numba found no folder that it may write to
@@ -98,23 +188,59 @@ def _named_apart(function: Callable[..., Any], form: str) -> Callable[..., Any]:
     return copy
 
 
-class _OnFirst(event.Listener):
-    """Calls a function when the first of some events begins."""
+_PREPARATIONS: list[Callable[[], None]] = []
+_WAITING: list[Callable[[], None]] = []
 
-    def __init__(self, tell: Callable[[], None]) -> None:
-        self._tell: Callable[[], None] | None = tell
 
-    def on_start(self, event: Any) -> None:
-        if self._tell is not None:
-            tell, self._tell = self._tell, None
-            tell()
+@cache
+def compiler() -> Any:
+    """Numba, once all is prepared."""
+    import numba
+    from numba.core import event
 
-    def on_end(self, event: Any) -> None:
-        """Nothing."""
+    class Tell(event.Listener):
+        def on_start(self, event: Any) -> None:
+            while _WAITING:
+                _WAITING.pop()()
+
+        def on_end(self, event: Any) -> None:
+            """Nothing."""
+
+    event.register("numba:compile", Tell())  # type: ignore[no-untyped-call]
+    while _PREPARATIONS:
+        _PREPARATIONS.pop()()
+    return numba
+
+
+@cache
+def compiled_for() -> tuple[str, str]:
+    """The processor that code is compiled for, and its features, in the compiler's words."""
+    name, source = "compiled for", Path(__file__)
+    with contextlib.suppress(Exception):
+        return cast(tuple[str, str], recalled(name, source))
+    from numba.core.registry import cpu_target
+
+    _, processor, features = cpu_target.target_context.codegen().magic_tuple()
+    with contextlib.suppress(Exception):
+        keep(name, source, (processor, features))
+    return processor, features
+
+
+def before_the_first(prepare: Callable[[], None]) -> None:
+    """Call a function before anything is compiled, if anything is."""
+    _PREPARATIONS.append(prepare)
+    if compiler.cache_info().currsize:
+        _PREPARATIONS.pop()()
 
 
 @contextmanager
 def before_compiling(tell: Callable[[], None]) -> Iterator[None]:
     """Call a function once, as soon as something is compiled that is not on disk yet."""
-    with event.install_listener("numba:compile", _OnFirst(tell)):
+    if "numba" in sys.modules:  # others may compile, too
+        compiler()
+    _WAITING.append(tell)
+    try:
         yield
+    finally:
+        if tell in _WAITING:
+            _WAITING.remove(tell)

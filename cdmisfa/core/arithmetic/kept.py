@@ -1,15 +1,20 @@
-"""What is kept on disk of compiled functions: until when it counts, and how it is loaded."""
+"""What is kept on disk of compiled functions: where, and until when it counts."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
+import os
 import pickle
+import platform
 import sys
+import tempfile
 from collections.abc import Callable
 from functools import cache, partial
+from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 MARKS = (
     b"@compiled",
@@ -22,9 +27,6 @@ MARKS = (
 )
 """What files that hold compiled functions contain."""
 
-NEEDLESS = ("numba.np.", "numba.cpython.unicode", "numba.cpython.builtins", "numba.cpython.numbers")
-"""Beginnings of modules of which compiled code has all it needs when it is loaded."""
-
 
 def kept_while_sources_last(dispatcher: Any) -> Any:
     """Let a result on disk count only as long as no compiled function has changed.
@@ -32,13 +34,10 @@ def kept_while_sources_last(dispatcher: Any) -> Any:
     A compiled function holds what it calls in other files; numba by itself compiles it again
     only when its own file has changed.
     """
-    results: Any = getattr(dispatcher, "_cache", None)
-    kept: Any = getattr(results, "_cache_file", None)
+    kept: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if hasattr(kept, "_source_stamp"):
         kept._source_stamp = (kept._source_stamp, _sources())
         kept._load_index = partial(_index_or_none, kept._load_index)
-        kept._load_data = partial(_load_data, kept)
-        results.load_overload = partial(_load_first, results, results.load_overload)
     return dispatcher
 
 
@@ -54,51 +53,83 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
         return {}
 
 
-def _load_first(results: Any, load: Callable[[Any, Any], Any], signature: Any, context: Any) -> Any:
-    """What is on disk, or, where that is nothing, what numba says.
+def folder_of(source: Path) -> Path | None:
+    """Where numba and we keep what is compiled of a source file; None where nothing can be."""
+    wanted = os.environ.get("NUMBA_CACHE_DIR")
+    beside = source.resolve().parent / "__pycache__"
+    folders = [Path(wanted)] if wanted else [beside, Path.home() / ".cache" / "cdmisfa"]
+    for folder in folders if source.is_file() else ():
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return None
 
-    Numba itself imports all that its compiler can do, SciPy included, before it looks on disk:
-    half of the time of a run of one iteration.
+
+def keep(name: str, source: Path, value: Any) -> None:
+    """Keep a value that can be pickled, made from a source file.
+
+    Raises:
+        OSError: it cannot be written.
     """
-    with contextlib.suppress(Exception):  # then numba says what is wrong
-        from numba.core.runtime import nrt
-
-        memory: Any = nrt.rtsys  # what allocates arrays, which numba readies with its compiler
-        memory.initialize(context)
-        found = results._load_overload(signature, context)
-        if found is not None:
-            return found
-    return load(signature, context)
+    whole = pickle.dumps((_made_by(source), value))
+    folder = folder_of(source)
+    if folder is not None:
+        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+            file.write(whole)
+        Path(file.name).replace(folder / _file(name, source))
 
 
-def _load_data(kept: Any, name: str) -> Any:
-    with Path(kept._data_path(name)).open("rb") as file:
-        return _Unpickler(file).load()
+def recalled(name: str, source: Path) -> Any:
+    """A value that was kept.
+
+    Raises:
+        LookupError: it is not there, or counts no more.
+        Exception: it cannot be read.
+    """
+    folder = folder_of(source)
+    if folder is None:
+        raise LookupError(name)
+    with (folder / _file(name, source)).open("rb") as file:
+        made_by, value = pickle.load(file)
+    if made_by != _made_by(source):
+        raise LookupError(name)
+    return value
 
 
-class _Unpickler(pickle.Unpickler):
-    """Reads compiled code without importing what it was compiled from, where that is numba's."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == ("numba.core.environment", "_rebuild_env"):
-            return _environment
-        return super().find_class(module, name)
+def _file(name: str, source: Path) -> str:
+    text = "\n".join((str(source.resolve()), name, platform.python_version(), *_settings()))
+    return f"{source.stem}.{hashlib.sha256(text.encode()).hexdigest()[:20]}.kept"
 
 
-def _environment(module: str, constants: list[Any], name: str) -> Any:
-    """The constants of a piece of compiled code; its module's globals only if it may use them."""
-    from numba.core import environment
+@cache
+def _settings() -> tuple[str, ...]:
+    """The processor, and what numba was told from outside."""
+    import llvmlite.binding as llvm
 
-    as_numba_does: Any = environment._rebuild_env
-    if module in sys.modules or not module.startswith(NEEDLESS):
-        return as_numba_does(module, constants, name)
-    found = environment.Environment._memo.get(name)
-    if found is None:
-        found = environment.Environment({"__name__": module})
-        found.consts[:] = constants
-        found.env_name = name
-        environment.Environment._memo[name] = found
-    return found
+    told = {name: value for name, value in os.environ.items() if name.startswith("NUMBA_")}
+    for needless in ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS"):
+        told.pop(needless, None)
+    file = Path(".numba_config.yaml")
+    return (
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+        *(f"{name}={told[name]}" for name in sorted(told)),
+        file.read_text("utf-8", "replace") if file.is_file() else "",
+    )
+
+
+def _made_by(source: Path) -> tuple[str, ...]:
+    return (*_versions(), _sources(), hashlib.sha256(source.read_bytes()).hexdigest())
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    names = ("numba", "llvmlite", "numpy")
+    return (sys.version, *(metadata.version(name) for name in names))
 
 
 @cache
@@ -112,3 +143,28 @@ def _sources() -> str:
             if any(word in source for word in MARKS):
                 digest.update(source)
     return digest.hexdigest()
+
+
+def described(args: tuple[Any, ...]) -> str:
+    """The types of arguments in words, the same in every process.
+
+    Raises:
+        LookupError: there are none for one of them.
+    """
+    return ", ".join(map(_described, args))
+
+
+def _described(value: Any) -> str:
+    kind = type(value)
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    if kind is np.ndarray:
+        flags = value.flags
+        order = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
+        return f"{order}{flags.aligned:d}{flags.writeable:d}{value.ndim}{value.dtype!r}"
+    if isinstance(value, tuple):
+        return f"{name}({described(value)})"
+    if kind in (bool, float) or isinstance(value, np.number | np.bool):
+        return name
+    if kind is int and -(2**63) <= value < 2**63:
+        return name
+    raise LookupError(f"{name} is not known here")
