@@ -23,7 +23,7 @@ from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
 from replay.view import run as run_view
 from replay.view.build import build_view
-from replay.view.columns import ImageBatch, TensorBatch
+from replay.view.columns import ImageBatch, TensorBatch, tensors
 from replay.view.layouts.panels import Panels
 from replay.view.layouts.paper import feels
 from replay.view.summary import summary_text
@@ -278,6 +278,11 @@ def test_tensors_are_encoded_as_rerun_does():
     for row, tensor in zip(found.to_pylist(), block, strict=True):
         batch = rr.Tensor(tensor, dim_names=names).as_component_batches()[0]
         assert row == batch.as_arrow_array().to_pylist()
+    bars = [
+        rr.BarChart(values).as_component_batches()[0].as_arrow_array().to_pylist()
+        for values in (block.reshape(-1), tensors(block.reshape(1, -1)))
+    ]
+    assert bars[0] == bars[1]
 
 
 def test_images_are_encoded_as_rerun_does():

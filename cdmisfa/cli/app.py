@@ -21,6 +21,7 @@ import click
 
 from cdmisfa.cli.interrupts import end_at_once, interruptible
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.on_demand import names_on_demand
 from cdmisfa.core.registry import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
@@ -118,6 +119,7 @@ def main() -> NoReturn:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
     end_at_once()
+    names_on_demand("rerun")  # of 550 modules a view needs 200
     code = run(sys.argv[1:])
     end_at_once(code)
     # An interrupt inside of an exec, as imports have them, is remembered until the next one:

@@ -268,43 +268,53 @@ class TensorBatch:
     """
 
     def __init__(self, values: NDArray[np.float64], names: Sequence[str]) -> None:
-        self._values = values
-        self._names = names
-        self._one = rr.Tensor(np.zeros((1, 1))).as_component_batches()[0]
+        self._tensors = tensors(values, names)
 
     def component_descriptor(self) -> Any:
         """What the rows are to Rerun."""
-        return self._one.component_descriptor()
+        one = rr.Tensor.from_fields(data=self._tensors[:1]).as_component_batches()[0]
+        return one.component_descriptor()
 
     def as_arrow_array(self) -> pa.Array:
         """The rows in Rerun's type of a tensor."""
-        kind = self._one.as_arrow_array().type
-        union = kind.field("buffer").type
-        position = next(i for i in range(union.num_fields) if union.field(i).name == "F64")
-        count, shape = len(self._values), np.array(self._values.shape[1:], dtype=np.uint64)
-        children = [
-            pa.nulls(0) if pa.types.is_null(field.type) else pa.array([], field.type)
-            for field in map(union.field, range(union.num_fields))
-        ]
-        numbers = pa.array(self._values.reshape(-1).copy())
-        children[position] = _lists(count, int(np.prod(shape)), numbers, union.field(position).type)
-        buffer = pa.Array.from_buffers(
-            union,
-            count,
-            [
-                None,
-                pa.py_buffer(np.full(count, union.type_codes[position], dtype=np.int8)),
-                pa.py_buffer(np.arange(count, dtype=np.int32)),
-            ],
-            children=children,
-        )
-        names = pa.array([*self._names] * count, kind.field("names").type.value_type)
-        parts = [
-            _lists(count, len(shape), pa.array(np.tile(shape, count)), kind.field("shape").type),
-            _lists(count, len(shape), names, kind.field("names").type),
-            buffer,
-        ]
-        return _lists(count, 1, pa.StructArray.from_arrays(parts, fields=list(kind)))
+        return _lists(len(self._tensors), 1, self._tensors)
+
+
+def tensors(values: NDArray[np.float64], names: Sequence[str] = ()) -> pa.Array:
+    """(n, *shape) values as n tensors in Rerun's type.
+
+    Rerun's own conversion imports all that Arrow can compute: .06 s.
+    """
+    kind = rr.components.TensorDataBatch(None).as_arrow_array().type
+    union = kind.field("buffer").type
+    position = next(i for i in range(union.num_fields) if union.field(i).name == "F64")
+    count, shape = len(values), np.array(values.shape[1:], dtype=np.uint64)
+    children = [
+        pa.nulls(0) if pa.types.is_null(field.type) else pa.array([], field.type)
+        for field in map(union.field, range(union.num_fields))
+    ]
+    numbers = pa.array(values.reshape(-1).copy())
+    children[position] = _lists(count, int(np.prod(shape)), numbers, union.field(position).type)
+    buffer = pa.Array.from_buffers(
+        union,
+        count,
+        [
+            None,
+            pa.py_buffer(np.full(count, union.type_codes[position], dtype=np.int8)),
+            pa.py_buffer(np.arange(count, dtype=np.int32)),
+        ],
+        children=children,
+    )
+    of_names = kind.field("names").type
+    named = pa.nulls(count, of_names)
+    if names:
+        named = _lists(count, len(shape), pa.array([*names] * count, of_names.value_type), of_names)
+    parts = [
+        _lists(count, len(shape), pa.array(np.tile(shape, count)), kind.field("shape").type),
+        named,
+        buffer,
+    ]
+    return pa.StructArray.from_arrays(parts, fields=list(kind))
 
 
 def _lists(count: int, width: int, values: pa.Array, kind: pa.DataType | None = None) -> pa.Array:

@@ -34,6 +34,7 @@ from replay.view.columns import (
     frames_column,
     line_column,
     power_of_ten,
+    tensors,
     time_columns,
 )
 from replay.view.labels import label, part
@@ -337,7 +338,7 @@ class RunView:
         if self._spec.images and phi.shape[1] == shape[0] * shape[1]:
             return rr.Image(shade(phi.reshape(-1, shape[1])))
         if phi.size <= 256:
-            return rr.BarChart(phi.reshape(-1).copy(), color=packed(MIST))
+            return rr.BarChart(tensors(phi.reshape(1, -1)), color=packed(MIST))
         return rr.Tensor(phi.copy(), dim_names=("output", "input"))
 
     def _set_time(self, t: int, iteration: int) -> None:
