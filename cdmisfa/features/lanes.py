@@ -145,7 +145,7 @@ def times(typing: Any, x: Any, y: Any) -> Any:
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.fmul(*args)
 
-    return _LANES(_LANES, _LANES), emit
+    return _lanes()(_lanes(), _lanes()), emit
 
 
 @_intrinsic
