@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cdmisfa.core.on_demand import names_on_demand
+from cdmisfa.cli.on_demand import names_on_demand
 
 FILES = {
     "__init__": """

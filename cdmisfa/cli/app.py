@@ -20,8 +20,8 @@ from typing import NoReturn
 import click
 
 from cdmisfa.cli.interrupts import end_at_once, interruptible
+from cdmisfa.cli.on_demand import names_on_demand
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.on_demand import names_on_demand
 from cdmisfa.core.registry import did_you_mean
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
