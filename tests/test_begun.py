@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from cdmisfa.core.errors import LogWriteError
+from cdmisfa.core.errors import UsageError
 from recorder.log.begun import (
     RECORDING,
     Begun,
@@ -66,5 +66,5 @@ def test_what_makes_no_sense_in_it_is_passed_over(tmp_path: Path, noted: str) ->
 def test_a_disk_that_does_not_take_it_is_named(tmp_path: Path) -> None:
     values: dict[str, Any] = {"frames": {"a": 1}, "split": {}}
     (tmp_path / "nowhere").write_text("a file")
-    with pytest.raises(LogWriteError, match=r"nowhere/recording\.json cannot be written"):
+    with pytest.raises(UsageError, match="nowhere is a file: name a folder"):
         keep_recording(tmp_path / "nowhere", ["a"], Begun((), values))

@@ -248,7 +248,7 @@ def test_json_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         write_json(path, {"a": object()})
     assert json.loads(path.read_text()) == {"a": 1}
-    with pytest.raises(CdmisfaError, match="cannot be written"):
+    with pytest.raises(CdmisfaError, match="is a file: name a folder"):
         write_json(path / "b.json", {})
 
 

@@ -192,7 +192,7 @@ def run(
                     fsync_every=fsync_every,
                 )
             )
-            opened.enter_context(_telling_of_interrupts(folder, source))
+            opened.enter_context(_telling_of_interrupts(folder, source, view=rerun))
             told += [
                 _Unfinished(log, learner),
                 Keyframes(log, source, learner, versions, keyframes),
@@ -270,16 +270,17 @@ class _Unfinished(Sink):
 
 
 @contextlib.contextmanager
-def _telling_of_interrupts(run: Path, source: FrameSource) -> Iterator[None]:
-    """Let an interrupt say what is missing of a run, and how to go on."""
+def _telling_of_interrupts(run: Path, source: FrameSource, *, view: bool) -> Iterator[None]:
+    """Let an interrupt say what is missing of a run that may have a view, and how to go on."""
     from replay.integrity.run_files import view_again
-    from replay.runs.folders import RUN_FILE
+    from replay.runs.folders import RUN_FILE, VIEW_FILE
 
     try:
         yield
     except KeyboardInterrupt:
         if (run / RUN_FILE).is_file():
-            said = f"all of {run} is there but its view: {view_again(run)}"
+            but = "" if not view or (run / VIEW_FILE).is_file() else " but its view: "
+            said = f"all of {run} is there{but and but + view_again(run)}"
         elif isinstance(source, SeekableSource):
             said = f"{run} is not finished: go on with --resume"
         else:
