@@ -113,7 +113,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "iteration without a log. What limits an iteration: reading is zstd (33 us a block where "
         "nothing else runs) and the checksum of the chunk (6 us); projecting converts pixels to "
         "doubles; the digest is the getting of 42 signals (SHA-256 itself takes 0.7 us). Of a "
-        "log, LZ4 takes 13 us an iteration in the other thread.",
+        "log, LZ4 takes 10 us an iteration in the other thread.",
         [
             (["part", "of it"], table(times, "all", list(PARTS))),
             (

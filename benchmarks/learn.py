@@ -108,7 +108,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "Learning with and without logs",
         f"Whole runs of {long} iterations of 40 frames of the sample log (48 x 128 pixels), "
         "with opening and finishing the files, as the preset icub learns and with "
-        "K = 32, J = 5. The chunks of the log are compressed in a thread of their own (13 us of "
+        "K = 32, J = 5. The chunks of the log are compressed in a thread of their own (10 us of "
         "LZ4 an iteration, and 9 us of checksums, indexes and writing). The view is built after "
         "the run, in one pass over its log; half of its iteration is to take the pictures out of "
         "the log and hand them to Rerun, whose own threads compress them again. From runs of "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf import RawImage_pb2
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -26,6 +28,7 @@ from replay.runs.folders import is_run
 from replay.runs.log import read_header
 from replay.runs.messages import decode_matrix, decode_signals, encode_signals
 from replay.runs.modules import load_modules, save_modules
+from replay.runs.stretches import PixelFinder
 from replay.runs.writer import RunWriter
 
 
@@ -251,3 +254,25 @@ def test_damaged_modules_are_refused_in_words(data, tmp_path):
         load_modules(tmp_path)
     with pytest.raises(UsageError, match="does not exist"):
         load_modules(tmp_path / "elsewhere")
+
+
+def test_pixels_are_found_as_protobuf_finds_them():
+    """Whatever the messages before were, and in whatever order the fields of one stand."""
+    rng = random.Random(0)
+    entries = []
+    for _ in range(400):
+        image = RawImage_pb2.RawImage(width=4, height=2, encoding="mono8", step=4)
+        image.data = rng.randbytes(rng.choice([0, 1, 8, 8, 8, 200]))
+        image.frame_id = rng.choice(["", "left", "right", "straight"])
+        if rng.random() < 0.9:
+            image.timestamp.FromNanoseconds(rng.choice([0, 5, 10**9, rng.randrange(2**61)]))
+        parts = [image.SerializeToString()]
+        if rng.random() < 0.2:  # time last, or another image after the first: the last one counts
+            parts.append(RawImage_pb2.RawImage(data=b"late").SerializeToString())
+            rng.shuffle(parts)
+        entries.append(b"".join(parts))
+    finder = PixelFinder("here")
+    for entry in entries:
+        assert finder.pixels(entry) == RawImage_pb2.RawImage.FromString(entry).data
+    with pytest.raises(LogDamagedError, match=r"here: not a foxglove\.RawImage message"):
+        finder.pixels(b"\x0a\xff")

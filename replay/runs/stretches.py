@@ -214,7 +214,7 @@ class _Waiting:
         data = self._data[WATCHED_TOPIC]
         if not data:
             return ()
-        shape, images = self.header.spec.frame_shape, _Images(f"{self._log} {WATCHED_TOPIC}")
+        shape, images = self.header.spec.frame_shape, PixelFinder(f"{self._log} {WATCHED_TOPIC}")
         found = [images.pixels(entry) for entry in data]
         for pixels in found:
             if len(pixels) != math.prod(shape):
@@ -231,7 +231,7 @@ class _Waiting:
         )
 
 
-class _Images:
+class PixelFinder:
     """Finds the pixels in `foxglove.RawImage` messages, most of which differ in them and in time.
 
     Args:
