@@ -110,8 +110,8 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "with opening and finishing the files, as the preset icub learns and with "
         "K = 32, J = 5. The chunks of the log are compressed in a thread of their own (10 us of "
         "LZ4 an iteration, and 9 us of checksums, indexes and writing). The view is built after "
-        "the run, in one pass over its log; half of its iteration is to take the pictures out of "
-        "the log and hand them to Rerun, whose own threads compress them again. From runs of "
+        "the run, in one pass over its log; what other threads do is nearly all Rerun's, which "
+        "compress the pictures and the times of all rows again. From runs of "
         f"{short} iterations in the same round: what a further iteration takes, and what a run "
         "takes however short it is. Importing Rerun, once a process, is not in it.",
         tables,
