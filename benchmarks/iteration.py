@@ -110,10 +110,14 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         f"the learning thread, the median of {rounds} runs of {iterations} iterations, the "
         "clock included that is asked before and after each part. The second table is of "
         "run.mcap, whose chunks are compressed in a thread of their own, and in shares of an "
-        "iteration without a log. What limits an iteration: reading is zstd (33 us a block where "
-        "nothing else runs) and the checksum of the chunk (6 us); projecting converts pixels to "
-        "doubles; the digest is the getting of 42 signals (SHA-256 itself takes 0.7 us). Of a "
-        "log, LZ4 takes 10 us an iteration in the other thread.",
+        "iteration without a log. What limits an iteration: reading is zstd (50 us a chunk where "
+        "nothing else runs, 1.1 chunks an iteration) and the checksum of the chunk (6 us); "
+        "decompressing the next chunk in a thread took no time off the learning thread, which "
+        "holds the interpreter, and added a fifth to that of all threads. Projecting converts "
+        "pixels to doubles; the digest is the getting of 42 signals (SHA-256 itself takes 0.7 "
+        "us), which takes 11 us in a loop of its own and twice that here, because frames and "
+        "vectors have driven all else out of the CPU's cache. Of a log, LZ4 takes 10 us an "
+        "iteration in the other thread.",
         [
             (["part", "of it"], table(times, "all", list(PARTS))),
             (

@@ -19,7 +19,7 @@ from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.iteration import iterate
 from cdmisfa.agents.policy import action_values
 from cdmisfa.core.arithmetic.choice import in_own_arithmetic
-from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
+from cdmisfa.core.blocks import PIXEL, Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
@@ -96,6 +96,8 @@ class CuriousLearner:
         self.rules = rules(config, n_streams)
         self.agent = new_agent(config, n_streams, first)
         self.out = np.zeros(1, OUTCOME)
+        self._no_interest = freeze(np.full(n_streams, np.nan))
+        self._no_state = freeze(np.full(n_streams, NO_STATE))
         self._freeze()
         self.abstraction = self._new_abstraction()
 
@@ -257,8 +259,8 @@ class CuriousLearner:
             tested=math.nan,
             fitted=math.nan,
             learning_error=math.nan,
-            interest=np.full(len(agent.policy), np.nan),
-            state=np.full(len(agent.policy), NO_STATE),
+            interest=self._no_interest,
+            state=self._no_state,
             R=agent.dense / (scale or 1.0),
             Q=Q,
             policy=agent.policy.copy(),

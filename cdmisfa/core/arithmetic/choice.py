@@ -37,7 +37,10 @@ def in_own_arithmetic(function: Function) -> Function:
 
     @functools.wraps(function)
     def computing(first: Any, *args: Any, **kwargs: Any) -> Any:
-        with portable_bits(getattr(getattr(first, "config", first), "portable", False)):
+        wanted = getattr(getattr(first, "config", first), "portable", False)
+        if wanted == _PORTABLE.get():
+            return function(first, *args, **kwargs)
+        with portable_bits(wanted):
             return function(first, *args, **kwargs)
 
     return cast(Function, computing)
