@@ -135,8 +135,11 @@ def test_distances_are_shown_in_a_range(kind: tuple[str, str], encoding: str) ->
     decoder = image_decoder(*kind, depth=(1.0, 2.0))
     assert decoder is not None
     np.testing.assert_array_equal(decoder(made), expected)
-    plain = image_decoder(*kind)
+    below, plain = image_decoder(*kind, depth=(-1.0, 2.0)), image_decoder(*kind)
+    assert below is not None
     assert plain is not None
+    with pytest.raises(UsageError, match="--range: no distance is below 0"):
+        below(made)
     if encoding == "32FC1":
         with pytest.raises(UsageError, match="--range"):
             plain(made)
