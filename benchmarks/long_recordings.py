@@ -133,9 +133,9 @@ def _one(work: str, path: Path) -> None:
     print(seconds, int(peak.split()[1]) / 1000, read / MEGABYTE)
 
 
-def bytes_read() -> int:
-    """Bytes that this process has read so far."""
-    return int(Path("/proc/self/io").read_text(encoding="utf-8").split()[1])
+def bytes_read(who: str = "self") -> int:
+    """Bytes that this process, or `thread-self`, has read so far."""
+    return int(Path(f"/proc/{who}/io").read_text(encoding="utf-8").split()[1])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The first picture of a long log of others, whose pictures do not compress."""
+"""The first picture, and the first block learned, of a long log whose pictures do not compress."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,11 @@ from mcap.writer import CompressionType, Writer
 from benchmarks import foreign
 from benchmarks.long_recordings import MEGABYTE, bytes_read
 from benchmarks.report import middle, save
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.sources import open_source
 from replay.camera_logs.source import ForeignSource
 
 
@@ -42,6 +48,43 @@ def first_picture(path: Path) -> None:
         source.take(0, 1)
 
 
+class FirstBlockError(Exception):
+    """A block was learned: bytes that the learning thread had read by then."""
+
+
+class UntilFirst(Sink):
+    """Ends a run after its first block."""
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        raise FirstBlockError(bytes_read("thread-self"))
+
+    def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
+        """See `Sink`."""
+
+    def finish(self) -> None:
+        """See `Sink`."""
+
+
+def first_block(path: Path) -> int:
+    """Do as `learn LOG -o RUN` until it has learned a block; bytes that it read for that."""
+    before = bytes_read("thread-self")
+    with tempfile.TemporaryDirectory() as folder:
+        source, configuration = open_source([path])
+        with contextlib.closing(source):
+            try:
+                run(
+                    source,
+                    configuration.learner,
+                    Path(folder) / "run",
+                    sections=configuration.tables(),
+                    sinks=[UntilFirst()],
+                )
+            except FirstBlockError as reached:
+                return int(reached.args[0]) - before
+    raise SystemExit(f"{path} is too short for a block")
+
+
 def forget(path: Path) -> None:
     """Let the system forget what it has of a file in memory, where it can."""
     if hasattr(os, "posix_fadvise"):
@@ -49,21 +92,23 @@ def forget(path: Path) -> None:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
-def seconds(path: Path, rounds: int, *, cold: bool) -> float:
-    """The median of how long the first picture takes, by the wall's clock."""
+def seconds(
+    path: Path, rounds: int, *, cold: bool, work: Callable[[Path], object] = first_picture
+) -> float:
+    """The median of how long some work on a log takes, by the wall's clock."""
     found = []
     for _ in range(rounds):
         if cold:
             forget(path)
         start = time.perf_counter()
-        first_picture(path)
+        work(path)
         found.append(time.perf_counter() - start)
     return middle(found, 3)
 
 
 def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/opening.json; a log of 10 GB with `full`."""
-    rows = []
+    rows, learned = [], []
     for size in (100, 10_000) if full else (10, 100 if quick else 1000):
         with tempfile.TemporaryDirectory() as folder:
             path = write(Path(folder) / "log.mcap", size * MEGABYTE)
@@ -74,11 +119,21 @@ def main(*, quick: bool = False, full: bool = False) -> None:
             row: list[object] = [f"{size} MB"]
             row += [seconds(path, 5, cold=cold) for cold in (True, False)]
             rows.append([*row, f"{read / path.stat().st_size:.4f}x"])
+            first_block(path)
+            row = [f"{size} MB"]
+            row += [seconds(path, 5, cold=cold, work=first_block) for cold in (True, False)]
+            learned.append([*row, round(first_block(path) / MEGABYTE)])
     save(
         "opening",
         "Opening a log of others",
         "Opening a log of noise of 640x480 that mcap's own writer wrote, uncompressed, and taking "
         "its first frame: seconds by the wall's clock, the file not in memory, and in memory. "
-        "What is read is the file's end, the message index of each chunk, and one chunk.",
-        [(["log", "cold, seconds", "warm, seconds", "read of it"], rows)],
+        "What is read is the file's end, the message index of each chunk, and one chunk. Below, "
+        "all of `learn LOG -o RUN` after start-up until its first block of 40 frames is learned, "
+        "and what the learning thread has read by then; another one reads all of the log "
+        "meanwhile, for its SHA-256, and is ended with it.",
+        [
+            (["log", "cold, seconds", "warm, seconds", "read of it"], rows),
+            (["log", "learn: cold, seconds", "learn: warm, seconds", "read, MB"], learned),
+        ],
     )

@@ -190,8 +190,9 @@ def test_readers_of_logs_of_others(tmp_path: Path, case: foreign.Case) -> None:
 
 
 def test_opening(tmp_path: Path) -> None:
-    path = opening.write(tmp_path / "log.mcap", 5 * long_recordings.MEGABYTE)
+    path = opening.write(tmp_path / "log.mcap", 15 * long_recordings.MEGABYTE)
     assert 0 < opening.seconds(path, 1, cold=True) < 60
+    assert opening.first_block(path) > 40 * 640 * 480
 
 
 def test_live_streams(tmp_path: Path) -> None:

@@ -15,6 +15,9 @@ class Bar:
     def update(self, done: float, total: float | None = None, note: str = "") -> None:
         """So much is done, of so much where that is known; `note` stands behind the bar."""
 
+    def turn_to(self, title: str, unit: str) -> None:
+        """Show something else from now on."""
+
     def say(self, line: str) -> None:
         """A line that stays, above the bar."""
         click.echo(line, err=True)
@@ -70,6 +73,11 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
     class TerminalBar(Bar):
         def update(self, done: float, total: float | None = None, note: str = "") -> None:
             progress.update(task, completed=done, total=total, note=note)
+
+        def turn_to(self, title: str, what: str) -> None:
+            nonlocal unit
+            unit = what
+            progress.reset(task, description=title, total=None, note="")
 
         def say(self, line: str) -> None:
             progress.console.print(line, markup=False, highlight=False)

@@ -333,6 +333,16 @@ def ancestry_of(run: Path | None) -> Mapping[str, Any] | None:
     return ancestry if known else None
 
 
+def stated_whole(run: Path | None) -> bool:
+    """Whether a run that is to be resumed states the SHA-256 of all of a file."""
+    from replay.runs.final import stated_source, states_whole
+
+    try:
+        return run is not None and states_whole(stated_source(log_to_resume(run)))
+    except (LogDamagedError, UsageError):  # told where the run is resumed
+        return False
+
+
 def _has_header(log: Path) -> bool:
     from replay.runs.log import read_header
 
@@ -345,17 +355,26 @@ def _has_header(log: Path) -> bool:
 
 def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
     """Refuse to resume with another configuration, seed or source, naming the first difference."""
+    from replay.runs.final import known_to_both, stated_source
     from replay.runs.log import read_header
 
     header = read_header(log)
+    source_then, source_now = known_to_both(stated_source(log), _json(manifest["source"]))
     before = {
         "signals": header.schema,
         ARITHMETIC: 1,
         **header.manifest,
+        "source": source_then,
         "spec": dataclasses.asdict(header.spec),
         COMMAND: None,
     }
-    now = {"signals": SCHEMA_VERSION, **manifest, "spec": dataclasses.asdict(spec), COMMAND: None}
+    now = {
+        "signals": SCHEMA_VERSION,
+        **manifest,
+        "source": source_now,
+        "spec": dataclasses.asdict(spec),
+        COMMAND: None,
+    }
     streams = manifest["config"].get("scene", {}).get("kind")
     for key, old, new in differences(_json(before), _json(now)):
         if (key, old, new) == ("config.learner.portable", None, False):

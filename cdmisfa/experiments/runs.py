@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec, description
+from cdmisfa.core.blocks import (
+    Block,
+    FrameSource,
+    LongSource,
+    SeekableSource,
+    SourceSpec,
+    description,
+    description_waited_for,
+)
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
@@ -31,6 +39,7 @@ from cdmisfa.experiments.resume import (
     bring_back,
     go_back,
     set_aside,
+    stated_whole,
     take_over,
 )
 from cdmisfa.experiments.sources import versions_used
@@ -118,6 +127,7 @@ def run(
     announce: Callable[[str], None] | None = None,
     command: Mapping[str, Any] | None = None,
     fork: Fork | None = None,
+    hashing: Callable[[int, int], None] = lambda done, size: None,
 ) -> RunResult:
     """Learn from a source until nothing is left to learn, and log every signal.
 
@@ -142,6 +152,8 @@ def run(
         announce: called with the address of the live view.
         command: how the run is begun, kept with it; see `resume.command_of`.
         fork: go on from another run, whose iterations before are this one's, too.
+        hashing: told of bytes of the source that were hashed, and of how many, while that is
+            waited for: at the end, for what the run states of its source.
 
     Raises:
         UsageError: `folder` exists and `force` is not set; or `resume` is, and `folder` holds no
@@ -152,7 +164,10 @@ def run(
     learner = open_learner(config, source.spec, seed)
     digest = Digest()
     tables = {**(sections or {}), "learner": as_table(config)}
-    described = description(source)
+    if resume and stated_whole(folder):
+        described = description_waited_for(source, hashing)
+    else:
+        described = description(source, at_once=True)
     versions = versions_used(config, source, described)
     manifest: dict[str, Any] = {
         "config": tables,
@@ -215,6 +230,8 @@ def run(
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):
             shown.earlier(log.path.parent)
+        if isinstance(source, LongSource):
+            source.hash_meanwhile()
         try:
             ended = learn(
                 source,
@@ -228,7 +245,7 @@ def run(
             ended, exhausted = "log_exhausted", error
         result = RunResult(
             run=str(folder) if folder is not None else None,
-            source=source.describe(),
+            source=description_waited_for(source, hashing),
             streams=source.spec.streams,
             seed=seed,
             iterations=learner.iteration,

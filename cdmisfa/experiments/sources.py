@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.arithmetic.choice import portable_bits
-from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
+from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
@@ -233,7 +233,7 @@ def open_source(
         return configuration.open_scene(), configuration
     source = open_logs(words, loop=loop, salvage=salvage, cameras=cameras, follow=follow)
     try:
-        described = source.describe()
+        described = description(source, at_once=True)
         kind = scene_kind_for(source.spec, described, preset)
         streams = streams_of(described)
         configuration = configure(kind, preset, settings, seed, learner=learner_of(streams))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from cdmisfa.core.errors import UsageError
 from recorder.images.reading import IMAGES, Reading
@@ -18,8 +17,8 @@ from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream, NothingLoggedError
 from replay.camera_logs.video_messages import in_order
-from replay.mcap.identity import identity
-from replay.storage.checksum import sha256
+from replay.mcap.identity import hashed
+from replay.storage.hashing import Hashed, HashedFiles
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
 
@@ -94,21 +93,20 @@ def only_foreign(path: Location) -> bool:
     return is_video(path) or is_dataset(path) or is_bag(path) or is_picture_folder(path)
 
 
-def fingerprint(path: Location, streams: Sequence[ImageStream]) -> dict[str, Any]:
-    """What tells a log from others: see `identity`; of a folder, names and contents count.
+def hashed_log(path: Location, streams: Sequence[ImageStream]) -> Hashed:
+    """What tells a log from others: its bytes; of a folder, names and contents count.
 
-    One of the streams reads the log, where it is behind a URL.
+    The streams hold the log open, where it is an MCAP file.
     """
-    if isinstance(path, Url) or not path.is_dir():
-        reads = (s.reader for s in streams if isinstance(s, McapImages) and s.path == path)
-        return identity(path, next(reads, None))
-    whole = hashlib.sha256()
-    files = path.rglob("*") if is_dataset(path) else path.iterdir()
-    for file in sorted(p for p in files if p.is_file()):
-        whole.update(
-            f"{file.relative_to(path)}\0{sha256(file)}\n".encode("utf-8", "surrogateescape")
-        )
-    return {"file": path.name, "sha256": whole.hexdigest()}
+    readers = [s.reader for s in streams if isinstance(s, McapImages) and s.path == path]
+    if readers:
+        return hashed(*readers)
+    if isinstance(path, Url):
+        raise ValueError(f"{path} is not open")
+    if not path.is_dir():
+        return HashedFiles(path)
+    find = partial(path.rglob, "*") if is_dataset(path) else path.iterdir
+    return HashedFiles(path, lambda: (file for file in find() if file.is_file()))
 
 
 def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:

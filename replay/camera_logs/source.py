@@ -34,12 +34,13 @@ from replay.camera_logs.alignment import (
 from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
-from replay.camera_logs.opening import fingerprint, image_logs, open_images
+from replay.camera_logs.opening import hashed_log, image_logs, open_images
 from replay.camera_logs.options import Align, Gaps
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import MalformedRecord
+from replay.storage.hashing import Hashed, LoggedSource
 from replay.storage.location import Location, Url
-from replay.stored import Span, StoredSource, outside
+from replay.stored import Span, outside
 
 MANY: Final = 300
 """Frames of which what makes them small is loaded first, which takes as long as 200."""
@@ -49,7 +50,7 @@ class UnequalError(UsageError):
     """Streams that are on no common clock unless they are aligned."""
 
 
-class ForeignSource(StoredSource):
+class ForeignSource(LoggedSource):
     """What others logged, on one clock: images of cameras, gray and small, or numbers.
 
     Args:
@@ -127,7 +128,6 @@ class ForeignSource(StoredSource):
         named = [paths] if isinstance(paths, str | Path | Url) else paths
         self._files = image_logs(named)
         self._loop = loop
-        self._hashes: list[dict[str, Any]] | None = None
         self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp, color)
         self._asked_size, self._asked_gaps, self._part = size, gaps, (start, stop)
         self._goal = goal
@@ -186,22 +186,16 @@ class ForeignSource(StoredSource):
         """What was recorded: nobody says."""
         return {}
 
-    def describe(self) -> Mapping[str, Any]:
-        """The logs with their SHA-256, the topics, and how they became frames.
-
-        Raises:
-            LogDamagedError: a server has other logs by now than those that were opened.
-        """
+    def _logs(self) -> list[Hashed]:
         parts = [p for s in self._streams for p in getattr(s, "parts", [s])]
-        if self._hashes is None:
-            self._hashes = [fingerprint(path, parts) for path in self._files]
-        else:
-            for part in parts:
-                part.confirm()
+        return [hashed_log(path, parts) for path in self._files]
+
+    def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        """The logs, the topics, and how they became frames."""
         recipes = dict.fromkeys(s.recipe for s in self._streams)
         return {
             "kind": "foreign",
-            "files": self._hashes,
+            "files": list(logs),
             "topics": [s.topic for s in self._streams],
             "size": list(self._spec.frame_shape),
             "recipe": COLOR_RECIPE if self._reading.color else "; ".join(recipes),
@@ -262,6 +256,7 @@ class ForeignSource(StoredSource):
         return chosen
 
     def close(self) -> None:
+        super().close()
         for stream in self._streams:
             stream.close()
 

@@ -111,9 +111,6 @@ class ImageStream(ABC):
         """How an error names an image."""
         return f"{self.path}: {self.topic} at {self.times[row]} ns"
 
-    def confirm(self) -> None:  # noqa: B027 - for what is read over a network
-        """See that the log is still the one that was opened; raises `LogDamagedError`."""
-
     @abstractmethod
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""

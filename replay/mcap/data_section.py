@@ -11,6 +11,7 @@ from recorder.mcap.checksum import crc32
 from recorder.mcap.writer import MAGIC
 from replay.mcap.summary import FOOTER_BYTES
 from replay.mcap.walk import DATA_END_BYTES, LogStructure
+from replay.storage.hashing import PIECE, sampled
 from replay.storage.location import Url
 from replay.storage.store import Store
 
@@ -75,12 +76,42 @@ class DataSection:
 
     def sha256(self, start: int) -> str:
         """SHA-256 of the file from a place on, with its checksum checked where that is 0."""
-        sha256, crc, end = hashlib.sha256(), 0, self._structure.data_end
-        at = start
-        for block in self._file.blocks(at, self._file.size):
-            sha256.update(block)
-            crc = crc32(memoryview(block)[: max(end - at, 0)], crc)
-            at += len(block)
+        found, crc = self.hashed(start, memoryview(bytearray(1 << 20)), lambda count: None)
         if start == 0:
             self.check(crc)
-        return sha256.hexdigest()
+        return found
+
+    def hashed(
+        self, start: int, memory: memoryview, told: Callable[[int], None]
+    ) -> tuple[str, int]:
+        """SHA-256 of the file from a place on, and the checksum of the data behind that.
+
+        Nothing else of the log is touched, so that a thread of its own may do it.
+
+        Args:
+            start: the place.
+            memory: as many bytes as are read at once.
+            told: of bytes that were hashed; what it raises ends that.
+        """
+        sha256, crc, at = hashlib.sha256(), 0, start
+        end = self._structure.data_end if self._structure.data_crc else 0
+        for piece in self._file.pieces(start, self._file.size, memory):
+            sha256.update(piece)
+            crc = crc32(piece[: max(end - at, 0)], crc)
+            at += len(piece)
+            told(len(piece))
+        return sha256.hexdigest(), crc
+
+    def sample(self) -> str:
+        """SHA-256 of a few pieces of the file, and where it was opened by its index, of that."""
+        found, file = hashlib.sha256(), self._file
+        for place in sampled(file.size):
+            found.update(file.read(place, PIECE))
+        if self._structure.by_index:
+            for block in file.blocks(self._structure.data_end, file.size):
+                found.update(block)
+        return found.hexdigest()
+
+    def changed(self) -> bool:
+        """Whether the file may hold something else than when it was opened."""
+        return self._file.changed()

@@ -52,6 +52,7 @@ class LogReader:
         data_complete: every message is there, if not the summary behind them.
         metadata: the metadata records.
         statistics: what the summary says the file holds, or None.
+        data: all of its bytes.
     """
 
     def __init__(
@@ -90,12 +91,12 @@ class LogReader:
             by_index = remote or check == "chunks"
             found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
             self._structure = found
-            self._data = DataSection(self._file, found, self._refuse_data)
-            known, unproven = found.definitions, self._data.check_unproven
+            self.data = DataSection(self._file, found, self._refuse_data)
+            known, unproven = found.definitions, self.data.check_unproven
             self._chunks = Chunks(self._file, known, self._note, cache_bytes, unproven)
             self._settle()
             if not self.by_index and check != "pass":
-                self._data.check()
+                self.data.check()
             if remote and not (self.complete or salvage):
                 raise LogDamagedError(f"{self.path}: {self.missing}: {_SENT_LESS}")
         except BaseException as error:
@@ -170,11 +171,11 @@ class LogReader:
     def digest(self) -> str:
         """SHA-256 of the file, checked as it is read; of a URL opened by index of its end."""
         remote = self.by_index and isinstance(self.path, Url)
-        return self._data.sha256(self._structure.data_end if remote else 0)
+        return self.data.sha256(self._structure.data_end if remote else 0)
 
     def confirm(self) -> None:
         """See that a log behind a URL was not replaced; see `DataSection.confirm`."""
-        self._data.confirm()
+        self.data.confirm()
 
     def crc_absent(self) -> int:
         """Count the segments that no CRC protects."""
@@ -249,7 +250,7 @@ class LogReader:
                 store.pass_to(segment.offset)
                 yield segment, self.table(segment)
             store.pass_to(self._structure.data_end)
-        self._data.check(store.crc(0, self._structure.data_end))
+        self.data.check(store.crc(0, self._structure.data_end))
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""
@@ -311,7 +312,7 @@ class LogReader:
         self._failed &= same
         self._defined, self._searched = min(self._defined, kept), False
         self._settle()
-        self._data.check()
+        self.data.check()
         return True
 
     def close(self) -> None:

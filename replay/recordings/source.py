@@ -6,7 +6,7 @@ import bisect
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,12 +16,13 @@ import numpy as np
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.whole import PARTIAL
-from replay.mcap.identity import identity
+from replay.mcap.identity import hashed
 from replay.mcap.reader import LogReader
 from replay.recordings.view_file import ViewFile, intersection
+from replay.storage.hashing import Hashed, LoggedSource
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url
-from replay.stored import StoredSource, joined
+from replay.stored import joined
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
 _SMALLEST: Final = 64
@@ -34,7 +35,7 @@ class SeveralRecordingsError(UsageError):
     """Recordings of images that were named together; they can be taken as camera logs are."""
 
 
-class RecordedSource(StoredSource):
+class RecordedSource(LoggedSource):
     """The views of a recording on their common clock.
 
     Args:
@@ -68,7 +69,6 @@ class RecordedSource(StoredSource):
         self._loop = loop
         self._paths = paths
         self._files = [path for path in log_files(paths) if not _only_begun(path)]
-        self._hashes: list[dict[str, Any]] | None = None
         known = {view.path: view for view in opened}
         views: list[ViewFile] = []
         try:
@@ -115,7 +115,7 @@ class RecordedSource(StoredSource):
             for view in added:
                 view.close()
             raise
-        self._files, self._hashes, self._views = [v.path for v in opened + added], None, views
+        self._files, self._known, self._views = [v.path for v in opened + added], None, views
         self._set_clock()
         return True
 
@@ -123,34 +123,26 @@ class RecordedSource(StoredSource):
         """The frames that are there of each view, as ranges [start, stop)."""
         return {p[0].facts.view: [r for view in p for r in view.ranges] for p in self._views}
 
-    def describe(self) -> Mapping[str, Any]:
-        """The recording's views with the SHA-256 of their files, and what was recorded.
+    def _logs(self) -> list[Hashed]:
+        return [hashed(view.reader) for view in self._all()]
 
-        Raises:
-            LogDamagedError: a server has other files by now than those that were opened.
-        """
-        if self._hashes is None:
-            self._hashes = self._described(lambda view: identity(view.path, view.reader))
-        else:
-            for view in self._all():
-                view.reader.confirm()
+    def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        """The recording's views with their files, and what was recorded."""
         return {
             "kind": "recording",
             **self.scene(),
             "frames": self._count,
             "first_frame": self._first,
             "loop": self._loop,
-            "views": self._hashes,
+            "views": self._views_with(logs),
         }
 
     def describe_files(self) -> list[dict[str, Any]]:
         """The views' files as far as they are known, with the SHA-256 of these bytes."""
-
-        def identify(view: ViewFile) -> dict[str, Any]:
-            size, digest = view.reader.size, view.reader.digest()
-            return {"file": view.path.name, "bytes": size, "sha256": digest}
-
-        return self._described(identify)
+        readers = [view.reader for view in self._all()]
+        return self._views_with(
+            [{"file": r.path.name, "bytes": r.size, "sha256": r.digest()} for r in readers]
+        )
 
     def scene(self) -> Mapping[str, str]:
         """What was recorded: the scene, its seed and the checksum of its configuration."""
@@ -158,6 +150,7 @@ class RecordedSource(StoredSource):
         return {name: getattr(facts, name) for name in _SCENE if name in facts.values}
 
     def close(self) -> None:
+        super().close()
         for view in self._all():
             view.close()
 
@@ -171,8 +164,9 @@ class RecordedSource(StoredSource):
             at += count
         return Block(stream, t, freeze(frames), freeze(truth))
 
-    def _described(self, identify: Callable[[ViewFile], dict[str, Any]]) -> list[dict[str, Any]]:
-        return [{"name": v.facts.view, "frames": v.count, **identify(v)} for v in self._all()]
+    def _views_with(self, logs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        named = zip(self._all(), logs, strict=True)
+        return [{"name": view.facts.view, "frames": view.count, **log} for view, log in named]
 
     def _all(self) -> list[ViewFile]:
         return [view for parts in self._views for view in parts]

@@ -14,6 +14,7 @@ from cdmisfa.core.config import differences
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import SignalColumns
+from replay.runs.final import known_to_both, stated_source
 from replay.runs.folders import read_run_json, run_log
 from replay.runs.log import read_header
 from replay.runs.outline import Outline, read_outline
@@ -177,10 +178,9 @@ def _otherwise(key: str, first: str, second: str) -> str:
 
 def told_otherwise(first: Path, second: Path) -> tuple[tuple[str, Any, Any], ...]:
     """What of configuration, seed and source two runs were told otherwise: key and both values."""
-    a, b = (
-        {key: read_header(run).manifest.get(key) for key in ("config", "seed", "source")}
-        for run in (first, second)
-    )
+    logs = [run_log(run) for run in (first, second)]
+    a, b = ({key: read_header(log).manifest.get(key) for key in ("config", "seed")} for log in logs)
+    a["source"], b["source"] = known_to_both(*map(stated_source, logs))
     return tuple((key.removeprefix("config."), x, y) for key, x, y in differences(a, b))
 
 

@@ -1,15 +1,24 @@
-"""The final record of a run: the hashes of its signals and of what lies beside its log."""
+"""What a run states for good: what it learned from, its signals, and what lies beside its log."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from replay.runs.folders import MODULES_FILE
+from replay.runs.folders import MODULES_FILE, read_run_json
+from replay.runs.log import read_header
 from replay.storage.checksum import sha256
+
+_FILES: Final = ("files", "views")
+"""Where sources state their files, each as a table."""
+
+_WHOLE: Final = "sha256"
+_HASHES: Final = {_WHOLE, "sample_sha256"}
+_KNOWN: Final = {*_HASHES, "bytes"}
+"""What is known of a file before all of it was read, or only then."""
 
 
 def final_record(
@@ -37,3 +46,60 @@ def facts_sha256(document: Mapping[str, Any]) -> str:
     if isinstance(result := facts.get("result"), Mapping):
         facts["result"] = {key: value for key, value in result.items() if key != "run"}
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def stated_source(log: Path) -> Any:
+    """What a run states of its source: in its log, and of large files once it ended in run.json.
+
+    Args:
+        log: of the run.
+
+    Raises:
+        UsageError: it is no run's log.
+        LogDamagedError: it cannot be read.
+    """
+
+    def ended(file: Mapping[str, Any], at_end: Mapping[str, Any]) -> Mapping[str, Any]:
+        large = "sample_sha256" in file and _WHOLE in at_end
+        return {**file, _WHOLE: at_end[_WHOLE]} if large else file
+
+    stated = read_header(log).manifest.get("source")
+    return _of_each(stated, read_run_json(log.parent).get("source"), ended)
+
+
+def states_whole(source: Any) -> bool:
+    """Whether a source states the SHA-256 of all of a file."""
+    return any(_WHOLE in file for key in _FILES for file in _tables(source, key))
+
+
+def known_to_both(one: Any, other: Any) -> tuple[Any, Any]:
+    """What two sources state, less what only one of them knows of a file and the other does not."""
+
+    def known(file: Mapping[str, Any], to: Mapping[str, Any]) -> Mapping[str, Any]:
+        shared = file.keys() & to.keys()
+        left_out = _KNOWN - shared if shared & _HASHES else set()
+        return {key: value for key, value in file.items() if key not in left_out}
+
+    return _of_each(one, other, known), _of_each(other, one, known)
+
+
+def _of_each(
+    one: Any,
+    other: Any,
+    change: Callable[[Mapping[str, Any], Mapping[str, Any]], Mapping[str, Any]],
+) -> Any:
+    """A source, with each of its files changed by what another says of the same one."""
+    found = one
+    for key in _FILES:
+        own, others = _tables(one, key), _tables(other, key)
+        if own and len(own) == len(others):
+            changed = [change(file, like) for file, like in zip(own, others, strict=True)]
+            found = {**found, key: changed}
+    return found
+
+
+def _tables(source: Any, key: str) -> list[Mapping[str, Any]]:
+    files = source.get(key) if isinstance(source, Mapping) else None
+    if isinstance(files, list) and all(isinstance(file, Mapping) for file in files):
+        return files
+    return []

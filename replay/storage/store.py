@@ -72,6 +72,10 @@ class Store(ABC):
         """Whether a path leads to the very file that was opened."""
         return False
 
+    def changed(self) -> bool:
+        """Whether it was written to since it was opened, but to go on with it."""
+        return False
+
     def peek(self, offset: int, count: int) -> bytes:
         """Up to `count` (few) bytes, read ahead for the peeks that follow."""
         at = offset - self._window_at
@@ -112,6 +116,15 @@ class Store(ABC):
         while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
             yield part
             offset += len(part)
+
+    def pieces(self, offset: int, stop: int, memory: memoryview) -> Iterator[memoryview]:
+        """Give the bytes [offset, stop) in the same memory, one piece after the other."""
+        while offset < stop:
+            count = self.read_into(offset, memory[: stop - offset])
+            if not count:
+                raise self._was_cut()
+            yield memory[:count]
+            offset += count
 
     def crc(self, offset: int, stop: int) -> int:
         """CRC-32 of the bytes [offset, stop)."""
@@ -177,6 +190,16 @@ class FileStore(Store):
             return self in _OPEN or self._unchanged(now) or self._is_grown(_Descriptor(path))
         except OSError:
             return False
+
+    def changed(self) -> bool:
+        with _LOCK:
+            file = _OPEN.get(self)
+        try:
+            now = os.stat(str(self.path)) if file is None else os.fstat(file.number)
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+        same = os.path.samestat(now, self._seen) and self._unchanged(now)
+        return not same and self.path.suffix != PARTIAL
 
     def grow(self) -> bool:
         now = os.fstat(self._open().number)

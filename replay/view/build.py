@@ -171,7 +171,7 @@ def _write_run(
     recording.send_chunks([Chunk(c) for c in property_chunks(properties_of(outline, folder))])
     text = label(summary_text(outline, _name(log), events))
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
-    head = all_views is not None and write_unwatched(recording, all_views, outline, every)
+    head = all_views is not None and write_unwatched(recording, all_views, log, outline, every)
     world.flush()
     first = world.first(write_learned(recording, log, outline, truth, heard))
     recording.send_blueprint(

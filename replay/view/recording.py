@@ -18,6 +18,7 @@ from replay.inputs.opening import Logged, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
 from replay.runs.columns import Blocks
+from replay.runs.final import stated_source, states_whole
 from replay.runs.outline import Outline
 from replay.view.columns import FRAME, frames_column, line_column
 from replay.view.heads import gaze, write_gaze, write_heads
@@ -119,7 +120,7 @@ def write_views(
 
 
 def write_unwatched(
-    recording: rr.RecordingStream, path: Path, outline: Outline, every: int
+    recording: rr.RecordingStream, path: Path, log: Path, outline: Outline, every: int
 ) -> bool:
     """Write all views of the recording that a run learned from, also while not watched.
 
@@ -132,9 +133,11 @@ def write_unwatched(
         UsageError: the run learned from another recording, or from a live scene.
         LogDamagedError: it cannot be read.
     """
-    learned_from = _hashes(outline.header.manifest.get("source"))
+    learned_from = stated_source(log)
     with contextlib.closing(RecordedSource(path, loop=True)) as source:
-        if _hashes(source.describe()) != learned_from or not learned_from:
+        whole = states_whole(learned_from)
+        described = source.describe() if whole else source.describe_at_once()
+        if _hashes(described) != _hashes(learned_from) or not _hashes(learned_from):
             raise UsageError(
                 f"{path} is not the recording that this run learned from: the SHA-256 of its "
                 "files are others"
@@ -148,8 +151,10 @@ def write_unwatched(
 
 
 def _hashes(described: Any) -> list[str]:
+    """What tells the files of views from others: the SHA-256 of all of each, or of its sample."""
     views = described.get("views", ()) if isinstance(described, Mapping) else ()
-    return [str(view["sha256"]) for view in views if "sha256" in view]
+    found = (view.get("sha256", view.get("sample_sha256")) for view in views)
+    return [str(known) for known in found if known is not None]
 
 
 def view_entities(spec: SourceSpec) -> list[str]:

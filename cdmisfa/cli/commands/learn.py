@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from cdmisfa.experiments.runs import RunResult
     from recorder.cameras.readers import OnLoss
 
+MEGABYTE, GIGABYTE = 10**6, 10**9
+
 TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
 
@@ -209,6 +211,7 @@ def learn_command(
                     live=live_view,
                     announce=announce,
                     command=command_of(source, ctx.params, out or Path()),
+                    hashing=reporter.hashing,
                 )
         except RunExhaustedError as error:
             show(error.result, as_json=as_json)
@@ -254,7 +257,7 @@ class Reporter(Sink):
     """
 
     def __init__(self, shown: Bar, max_iterations: int | None) -> None:
-        self.told = False
+        self.told = self._hashing = False
         self._shown, self._max_iterations = shown, max_iterations
         self._next = 0.0
 
@@ -266,10 +269,22 @@ class Reporter(Sink):
         now = time.monotonic()
         if now >= self._next:
             self._next = now + TICK
+            if self._hashing:
+                self._hashing = False
+                self._shown.turn_to("learning", "blocks")
             learning = int((signals.state == 0).sum())
             left = f"{learning} being learned" if learning else f"ε {signals.epsilon:.2f}"
             note = f"{modules} saved, {left}"
             self._shown.update(learner.iteration, self._max_iterations, note)
+
+    def hashing(self, done: int, size: int) -> None:
+        """Show how far the source's files are hashed, once that is waited for."""
+        if not self._hashing:
+            self._hashing = True
+            self._shown.turn_to("hashing", "MB")
+            read = f"{done / GIGABYTE:.1f} of {size / GIGABYTE:.1f} GB are read"
+            self._shown.say(f"waiting for the SHA-256 of what is learned from: {read}")
+        self._shown.update(done / MEGABYTE, size / MEGABYTE)
 
 
 def outcome_line(outcome: Mapping[str, Any]) -> str:

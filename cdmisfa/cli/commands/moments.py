@@ -213,6 +213,7 @@ def fork_command(
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     try:
         with bar("learning", "blocks") as shown, compiling_said(shown), stoppable() as stop:
+            reporter = Reporter(shown, max_iterations)
             result = fork_run(
                 run,
                 at,
@@ -223,10 +224,11 @@ def fork_command(
                 limits={name: value for name, value in given.items() if value is not None},
                 force=force,
                 rerun=not no_rerun,
-                sinks=(Reporter(shown, max_iterations),),
+                sinks=(reporter,),
                 stop=stop,
                 keyframes=keyframes,
                 fsync_every=fsync_every,
+                hashing=reporter.hashing,
             )
     except RunExhaustedError as error:
         show(error.result, as_json=as_json)

@@ -98,9 +98,6 @@ class McapImages(ImageStream):
         with explained(self.path, "its decoder", held=table.data.nbytes):
             return take(table.view(place))
 
-    def confirm(self) -> None:
-        self.reader.confirm()
-
     def close(self) -> None:
         self._own = None, self._own[1]
         self.reader.close()
