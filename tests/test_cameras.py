@@ -102,15 +102,15 @@ def test_a_resumed_run_equals_one_that_was_not_stopped(cdmisfa: Cdmisfa, logs: P
     assert resumed.code == 0, resumed.err
     assert resumed.json["signals_sha256"] == whole.json["signals_sha256"]
     other = cdmisfa(*words, "--rate", "25", "--max-iterations", "9", "-o", logs / "run", "--resume")
-    assert (other.code, "source." in other.err) == (2, True)
+    assert (other.code, "record.fps = 50.0, not 25.0" in other.err) == (2, True)
 
 
 def test_a_scene_takes_no_camera_options(cdmisfa: Cdmisfa) -> None:
     done = cdmisfa("learn", "oscillatory", "--topic", "/left")
-    assert (done.code, "is a scene: --topic is for camera logs" in done.err) == (2, True)
+    assert (done.code, "is a scene: --topic is for cameras" in done.err) == (2, True)
     newer = ("--range", "0.3:5", "--from", "1", "--stamp", "header", "--color")
     done = cdmisfa("learn", "oscillatory", *newer)
-    assert "a scene: --from, --range, --stamp and --color are for camera logs" in done.err
+    assert "a scene: --from, --range, --stamp and --color are for cameras" in done.err
     done = cdmisfa("learn", "oscillatory", "--size", "12")
     assert (done.code, "128x48" in done.err) == (2, True)
 
