@@ -36,7 +36,8 @@ class JoinedImages(ImageStream):
         joined = f"{path}: {self.topic} is joined from {len(parts)} logs, by time"
         self.warnings = [joined, *warnings] if len(parts) > 1 else [*warnings]
         self.warnings += [warning for part in parts for warning in part.warnings]
-        self.parts = list(parts)
+        self.parts = [log for part in parts for log in getattr(part, "parts", [part])]
+        self._streams = list(parts)
         self.decode = getattr(parts[0], "decode", None)
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")
@@ -45,28 +46,28 @@ class JoinedImages(ImageStream):
         self._row_in = np.concatenate([np.arange(part.count) for part in parts])[order]
 
     def image(self, row: int) -> Shown:
-        return self.parts[int(self._part_of[row])].image(int(self._row_in[row]))
+        return self._streams[int(self._part_of[row])].image(int(self._row_in[row]))
 
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
         """What is taken of a message, where the logs are of messages."""
-        part: Any = self.parts[int(self._part_of[row])]
+        part: Any = self._streams[int(self._part_of[row])]
         found: Found = part.taken(int(self._row_in[row]), take)
         return found
 
     def stamp(self, row: int) -> int:
-        return self.parts[int(self._part_of[row])].stamp(int(self._row_in[row]))
+        return self._streams[int(self._part_of[row])].stamp(int(self._row_in[row]))
 
     def distances(self) -> bool:
-        return any(part.distances() for part in self.parts)
+        return any(part.distances() for part in self._streams)
 
     def stated_size(self, row: int) -> Size | None:
-        return self.parts[int(self._part_of[row])].stated_size(int(self._row_in[row]))
+        return self._streams[int(self._part_of[row])].stated_size(int(self._row_in[row]))
 
     def where(self, row: int) -> str:
-        return self.parts[int(self._part_of[row])].where(int(self._row_in[row]))
+        return self._streams[int(self._part_of[row])].where(int(self._row_in[row]))
 
     def close(self) -> None:
-        for part in self.parts:
+        for part in self._streams:
             part.close()
 
 
