@@ -18,6 +18,7 @@ from cdmisfa.cli.commands.doctor import EXTRAS
 from cdmisfa.core.errors import LogDamagedError
 from replay.runs.folders import runs_in
 
+LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
 SHORT = ("--set", "learner.tau=10", "--no-rerun")
 
 
@@ -214,6 +215,28 @@ def test_options_of_cameras_are_refused_for_a_scene_by_their_names(
         assert (done.code, list(tmp_path.iterdir())) == (2, [])
         told = "oscillatory is a scene: --size and --rate are for cameras; its rate is --set rec"
         assert told in done.err
+
+
+@pytest.mark.parametrize("command", ["convert", "learn"])
+def test_a_plan_needs_no_folder_and_none_is_written(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = (command, LOGS / "left.mcap", "--size", "16x12", "--dry-run")
+    planned = cdmisfa(*words)
+    assert planned.code == 0, planned.err
+    for out in ("rec", "s3://nowhere/rec"):
+        done = cdmisfa(*words, "-o", out)
+        assert (done.code, done.out, done.err) == (0, planned.out, planned.err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_conversion_needs_a_folder(cdmisfa: Cdmisfa) -> None:
+    done = cdmisfa("convert", LOGS / "left.mcap")
+    assert (done.code, done.err.count("\n")) == (2, 1)
+    assert "say -o FOLDER, where the recording goes" in done.err
+    apart = cdmisfa("convert", LOGS / "left.mcap", LOGS / "right.mcap", "--rate", 9, "--dry-run")
+    assert (apart.code, apart.err.rstrip().endswith("-o REC")) == (2, True), apart.err
 
 
 def test_advice_can_be_pasted_into_a_shell(cdmisfa: Cdmisfa, tmp_path: Path) -> None:

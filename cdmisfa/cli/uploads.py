@@ -52,8 +52,9 @@ def out(
                 if local is not None:
                     raise UsageError("--local goes with -o s3://...: it says where that is written")
                 return command(*args, **values)
+            force, dry = bool(values.get("force")), bool(values.get("dry_run"))
             resume = goes_on or bool(values.get("resume"))
-            with uploaded(address, local, force=bool(values.get("force")), resume=resume) as place:
+            with uploaded(address, local, force=force, resume=resume, dry_run=dry) as place:
                 values["out"] = place
                 click.get_current_context().params |= {"out": place, "local": None}
                 return command(*args, **values)
@@ -74,7 +75,9 @@ def out(
 
 
 @contextlib.contextmanager
-def uploaded(address: str, local: Path | None, *, force: bool, resume: bool) -> Iterator[Path]:
+def uploaded(
+    address: str, local: Path | None, *, force: bool, resume: bool, dry_run: bool
+) -> Iterator[Path]:
     """Where to write what is uploaded to an s3:// address once the body has finished.
 
     The address is looked at before any work is done. Where work is resumed that is not on this
@@ -85,6 +88,7 @@ def uploaded(address: str, local: Path | None, *, force: bool, resume: bool) -> 
         local: where it is written; by default its last name, in the current folder.
         force: overwrite what is behind the address.
         resume: go on with it.
+        dry_run: nothing will be written, so nothing is looked at, fetched or uploaded.
 
     Yields:
         The path; it is kept, whatever comes.
@@ -100,6 +104,9 @@ def uploaded(address: str, local: Path | None, *, force: bool, resume: bool) -> 
     url = location(address)
     assert isinstance(url, Url)
     place = local or Path(url.name)
+    if dry_run:
+        yield place
+        return
     there = objects_below(url)
     if there and not (force or resume):
         go_on = "go on with --resume or " if "resume" in click.get_current_context().params else ""

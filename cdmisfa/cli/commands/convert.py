@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @click.command("convert")
 @click.argument("source", nargs=-1, required=True)
-@uploads.out("Folder of the recording, or s3://...", required=True)
+@uploads.out("Folder of the recording, or s3://...; --dry-run needs none.")
 @camera_options
 @live_options
 @click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")
@@ -46,7 +46,7 @@ def convert_command(
     ctx: click.Context,
     /,
     source: tuple[str, ...],
-    out: Path,
+    out: Path | None,
     salvage: bool,
     resume: bool,
     fsync_every: float | None,
@@ -72,6 +72,10 @@ def convert_command(
     from replay.inputs.opening import open_cameras, refuse_what_is_no_log
     from replay.inputs.words import places
 
+    if out is None:
+        if not dry_run:
+            raise click.UsageError("say -o FOLDER, where the recording goes")
+        out = Path("REC")  # in a command that a refusal advises
     if any(map(is_live, source)):
         if resume or salvage or dry_run:
             raise UsageError(
