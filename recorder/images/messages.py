@@ -241,7 +241,7 @@ def _ros_video(data: bytes | memoryview) -> Packet:
 
 def _ffmpeg_packet(data: bytes | memoryview) -> Packet:
     fields = _RosFields(data, ros1=False)
-    fields.take(-fields.at % 4 + 8)  # width and height
+    fields.u32(), fields.u32()  # width and height
     codec = fields.text()
     fields.take(-(fields.at - 4) % 8 + 10)  # a number of 64 bits, and two of 8
     return Packet(bytes(fields.data()), codec)
