@@ -95,7 +95,7 @@ def named_streams(
     known = [(file, image_topics(file, reading)) for file in files]
     found: list[tuple[Location, str | None]] = []
     for topic in topics:
-        fits = [(file, name) for file, names in known for name in names if _fits(name, topic)]
+        fits = [(file, name) for file, names in known for name in names if fits_topic(name, topic)]
         if not fits:
             there = ", ".join(sorted({name for _, names in known for name in names}))
             if not there:
@@ -110,5 +110,6 @@ def _is_pattern(topic: str) -> bool:
     return any(letter in topic for letter in "*?[")
 
 
-def _fits(name: str, topic: str) -> bool:
+def fits_topic(name: str, topic: str) -> bool:
+    """Whether a topic is the one that is asked for, or of the pattern."""
     return name == topic or fnmatch.fnmatchcase(name, topic)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fnmatch
 import heapq
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
+from replay.camera_logs.catalogue import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
 from replay.mcap.identity import starts_as_log
@@ -154,11 +154,15 @@ class LoggedFeed:
         self._known = [_topics(reader) for reader in readers]
         there = sorted({topic.name for known in self._known for topic in known.values()})
         for asked in topics:
-            if not any(_fits(name, asked) for name in there):
+            if not any(fits_topic(name, asked) for name in there):
                 raise UsageError(f"{readers[0].path}: no topic {asked}; it has: {', '.join(there)}")
         if topics:
             self._known = [
-                {n: t for n, t in known.items() if any(_fits(t.name, asked) for asked in topics)}
+                {
+                    n: t
+                    for n, t in known.items()
+                    if any(fits_topic(t.name, asked) for asked in topics)
+                }
                 for known in self._known
             ]
         self.topics = tuple(dict.fromkeys(t for known in self._known for t in known.values()))
@@ -194,10 +198,6 @@ def _told(reader: LogReader, known: dict[int, Topic]) -> Iterator[Told]:
     for message in reader.messages():
         if message.channel.id in known:
             yield Told(message.log_time, known[message.channel.id], message.data)
-
-
-def _fits(name: str, asked: str) -> bool:
-    return name == asked or fnmatch.fnmatchcase(name, asked)
 
 
 class FrameFeed:
