@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.errors import CdmisfaError
+from recorder.images.videos import pyav
 from replay.export.episodes import Stitched
 from replay.export.images import count, file_names, pieces
 from replay.inputs.opening import Logged
@@ -61,7 +62,7 @@ def write_film(
         UsageError: PyAV is not installed.
         CdmisfaError: the file cannot be written.
     """
-    av, spec = _library(), source.spec
+    av, spec = pyav("writing videos"), source.spec
     about = {
         "view": spec.streams[stream],
         "first_frame": source.first_frame,
@@ -104,13 +105,3 @@ def _pictures(av: Any, source: StoredSource, stream: int) -> Iterator[Any]:
 def pixel_format(shape: tuple[int, ...]) -> str:
     """A video's pixels: half the chroma, which every player knows, needs even sides."""
     return "yuv444p" if shape[0] % 2 or shape[1] % 2 else "yuv420p"
-
-
-def _library() -> Any:
-    try:
-        import av
-        import av.error
-    except ImportError as error:
-        missing = "writing videos needs PyAV, which is not installed: pip install 'cdmisfa[video]'"
-        raise UsageError(missing) from error
-    return av

@@ -35,9 +35,8 @@ class LeRobotImages(ImageStream):
     """The images of one camera of a dataset, the episodes in their order.
 
     Raises:
-        UsageError: no such camera, or another version of the layout.
+        UsageError: no such camera, another version of the layout, or PyAV is missing.
         LogDamagedError: its tables cannot be read, or contradict each other.
-        CdmisfaError: the package av is missing.
     """
 
     def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:

@@ -15,10 +15,11 @@ from typing import Any, Final
 import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import data_bytes
 from recorder.images.frames import VIDEO_RECIPE, frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS
+from recorder.images.videos import pyav
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 from replay.mcap.records import Bytes, MalformedRecord
 
@@ -32,8 +33,7 @@ class VideoImages(ImageStream):
     """The frames of a video's first stream, at its presentation times.
 
     Raises:
-        CdmisfaError: the package av is missing.
-        UsageError: it is no topic of the file.
+        UsageError: PyAV is missing, or it is no topic of the file.
         LogDamagedError: it is no video, or a broken one.
     """
 
@@ -43,7 +43,7 @@ class VideoImages(ImageStream):
         self.path = path
         self._shown = frame_colors if color else frame_gray
         self.topic = path.stem
-        self._av = _pyav(path)
+        self._av = pyav(f"{path} is a video, which")
         self._next = _NOWHERE
         self._frames: Iterator[Any] = iter(())
         self._container: Any = None
@@ -125,14 +125,3 @@ class VideoImages(ImageStream):
         nanoseconds = np.fromiter(exact, np.int64, len(self._stamps))
         self.times = sorted_times(f"{self.path}: it", nanoseconds)
         self._container.seek(0, stream=stream, backward=True)
-
-
-def _pyav(path: Path) -> Any:
-    try:
-        import av
-    except ImportError:
-        raise CdmisfaError(
-            f"{path} is a video, which needs PyAV: pip install 'cdmisfa[video]'"
-        ) from None
-    av.logging.set_level(None)
-    return av
