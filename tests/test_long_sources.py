@@ -95,6 +95,13 @@ def learn(path: Path, out: Path, *sinks: Sink, **how: Any) -> RunResult:
         source.close()
 
 
+def damage(path: Path) -> None:
+    """Change what only the checksum over all of the data protects: the name of what wrote it."""
+    raw = bytearray(path.read_bytes())
+    raw[raw.index(b"cdmisfa ")] ^= 1
+    path.write_bytes(raw)
+
+
 def hashing_threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name == "hashing"]
 
@@ -299,15 +306,32 @@ def test_a_file_that_was_hashed_before_it_changed_is_hashed_again(
 def test_a_checksum_of_the_data_that_does_not_match_is_told_at_the_end(
     cdmisfa: Cdmisfa, recording: Path, tmp_path: Path
 ) -> None:
-    path = recording / "x1.mcap"
-    raw = bytearray(path.read_bytes())
-    raw[raw.index(b"cdmisfa ")] ^= 1  # what wrote it
-    path.write_bytes(raw)
+    damage(recording / "x1.mcap")
     words = ("learn", recording, "-o", tmp_path / "run", "--no-rerun", "--max-iterations", "3")
     done = cdmisfa(*words)
     assert (done.code, "x1.mcap: data section: its CRC does not match" in done.err) == (3, True)
     assert not (tmp_path / "run" / "run.json").exists()
     assert cdmisfa("info", tmp_path / "run").code == 0
+
+
+def test_damage_that_the_hash_finds_ends_learning(
+    recording: Path, tmp_path: Path, held: threading.Event
+) -> None:
+    damage(recording / "x1.mcap")
+    learned: list[int] = []
+
+    def hashed_by_now() -> None:
+        learned.append(1)
+        held.set()
+        for thread in threading.enumerate():
+            if thread.name == "hashing":
+                thread.join(60)
+
+    sinks = [Then(hashed_by_now, iteration) for iteration in range(ITERATIONS)]
+    with pytest.raises(LogDamagedError, match=r"x1\.mcap: data section: its CRC does not match"):
+        learn(recording, tmp_path / "run", *sinks)
+    assert len(learned) == 1
+    assert [file.name for file in (tmp_path / "run").iterdir()] == ["run.mcap.partial"]
 
 
 def test_an_end_waits_for_the_hash_and_says_so(

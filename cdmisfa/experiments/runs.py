@@ -28,7 +28,7 @@ from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmeti
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import machine, write_json
-from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.experiments.loop import Digest, HashedMeanwhile, learn
 from cdmisfa.experiments.resume import (
     COMMAND,
     FORK,
@@ -231,7 +231,7 @@ def run(
         if log is not None and shown is not None and (resume or fork):
             shown.earlier(log.path.parent)
         if isinstance(source, LongSource):
-            source.hash_meanwhile()
+            told.append(HashedMeanwhile(source))
         try:
             ended = learn(
                 source,
