@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
@@ -105,8 +104,8 @@ def hashed_log(path: Location, streams: Sequence[ImageStream]) -> Hashed:
         raise ValueError(f"{path} is not open")
     if not path.is_dir():
         return HashedFiles(path)
-    find = partial(path.rglob, "*") if is_dataset(path) else path.iterdir
-    return HashedFiles(path, lambda: (file for file in find() if file.is_file()))
+    found = path.rglob("*") if is_dataset(path) else path.iterdir()
+    return HashedFiles(path, (file for file in found if file.is_file()))
 
 
 def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:

@@ -100,36 +100,42 @@ class HashedBytes(Hashed):
             before = self.sha256()
             self.read(memoryview(bytearray(_MEMORY)), lambda count: None)
             if self.sha256() != before:
-                raise LogDamagedError(f"{self.path}: it was changed while it was read; begin again")
+                raise self.was_changed()
+
+    def was_changed(self) -> LogDamagedError:
+        """What is said of a log that is not what was opened."""
+        return LogDamagedError(f"{self.path}: it was changed while it was read; begin again")
 
 
 class HashedFiles(HashedBytes):
-    """A file, or the files of a folder with their names.
+    """A file, or files of a folder with their names.
 
     Args:
         path: of the file or folder.
-        files: finds those of the folder; None for a file.
+        files: those of the folder; None for a file.
 
     Raises:
         CdmisfaError: they cannot be read.
     """
 
-    def __init__(self, path: Path, files: Callable[[], Iterable[Path]] | None = None) -> None:
+    def __init__(self, path: Path, files: Iterable[Path] | None = None) -> None:
         self.path: Path = path
-        self._files = files
+        self._is_folder = files is not None
+        found = [path] if files is None else sorted(files)
+        self._names = [str(file.relative_to(path)) for file in found]
         self._then = self._now()
-        self.size = sum(size for _, size, _ in self._then)
-        self._sha256 = ""
+        self.size = sum(size for size, _ in self._then)
+        self._sha256, self._as_opened = "", False
 
     def sample(self) -> str:
         found = hashlib.sha256()
-        if self._files is not None:
-            for name, size, _ in self._then:
+        if self._is_folder:
+            for name, (size, _) in zip(self._names, self._then, strict=True):
                 found.update(_name(f"{name}\0{size}\n"))
-        starts = list(itertools.accumulate((s for _, s, _ in self._then), initial=0))
+        starts = list(itertools.accumulate((size for size, _ in self._then), initial=0))
         for place in sampled(self.size):
             number = bisect.bisect_right(starts, place) - 1
-            path = self.path / self._then[number][0] if self._files else self.path
+            path = self.path / self._names[number]
             try:
                 with path.open("rb", buffering=0) as file:
                     file.seek(place - starts[number])
@@ -139,30 +145,34 @@ class HashedFiles(HashedBytes):
         return found.hexdigest()
 
     def read(self, memory: memoryview, told: Told) -> None:
-        if self._files is None:
+        if self._is_folder:
+            whole = hashlib.sha256()
+            for name in self._names:
+                whole.update(_name(f"{name}\0{_sha256(self.path / name, memory, told)}\n"))
+            self._sha256 = whole.hexdigest()
+        else:
             self._sha256 = _sha256(self.path, memory, told)
-            return
-        whole = hashlib.sha256()
-        for name, _, _ in self._now():
-            whole.update(_name(f"{name}\0{_sha256(self.path / name, memory, told)}\n"))
-        self._sha256 = whole.hexdigest()
+        # What was changed before the first time may have been learned from as it was.
+        self._as_opened = self._as_opened or not self.changed()
 
     def sha256(self) -> str:
+        if not self._as_opened:
+            raise self.was_changed()
         return self._sha256
 
     def changed(self) -> bool:
         return self._now() != self._then
 
-    def _now(self) -> list[tuple[str, int, int]]:
-        """Each file's name, size and time of change."""
-        files = [self.path] if self._files is None else sorted(self._files())
+    def _now(self) -> list[tuple[int, int]]:
+        """Each file's size and time of change."""
         found = []
-        for path in files:
+        for name in self._names:
+            path = self.path / name
             try:
                 state = path.stat()
             except OSError as error:
                 raise CdmisfaError(f"{path}: {error.strerror}") from None
-            found.append((str(path.relative_to(self.path)), state.st_size, state.st_mtime_ns))
+            found.append((state.st_size, state.st_mtime_ns))
         return found
 
 
