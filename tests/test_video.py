@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
 import shlex
 import struct
 import sys
@@ -126,12 +125,25 @@ def test_limited_luma_becomes_the_full_range(tmp_path: Path) -> None:
     assert abs(frames[:, 0, 0].astype(int) - [0, 64, 128, 200, 255]).max() <= 1
 
 
-@pytest.mark.parametrize(("angle", "turns"), [(90, -1), (180, 2), (270, 1), (0, 0)])
-def test_a_video_of_a_telephone_stands_upright(tmp_path: Path, angle: int, turns: int) -> None:
+MATRICES = {
+    "as it is": ((1, 0, 0, 1), lambda image: image),
+    "clockwise": ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
+    "half": ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
+    "counterclockwise": ((0, -1, 1, 0), lambda image: np.rot90(image)),
+    "mirrored": ((-1, 0, 0, 1), np.fliplr),
+    "upside down": ((1, 0, 0, -1), np.flipud),
+    "mirrored, clockwise": ((0, 1, 1, 0), np.transpose),
+}
+"""What a telephone writes, and what a player makes of it."""
+
+
+@pytest.mark.parametrize("how", MATRICES)
+def test_a_video_of_a_telephone_stands_upright(tmp_path: Path, how: str) -> None:
+    matrix, turned = MATRICES[how]
     path = tmp_path / "a.mp4"
     images = write_video(path, pictures(3), codec="libx264", pixels="yuv420p")
-    turn_clockwise(path, angle)
-    upright = np.rot90(images[0], turns)
+    state_display_matrix(path, *matrix)
+    upright = turned(images[0])
     with contextlib.closing(VideoImages(path, None)) as video:
         small = shrink(video.image(0), *upright.shape)
         assert abs(small.astype(float) - upright).mean() < 8
@@ -139,13 +151,12 @@ def test_a_video_of_a_telephone_stands_upright(tmp_path: Path, angle: int, turns
         assert video.image(0).shape == (4 * upright.shape[0], 4 * upright.shape[1], 3)
 
 
-def turn_clockwise(path: Path, angle: int) -> None:
-    """Let the header of a track of an MP4 file say by how much a player turns it."""
+def state_display_matrix(path: Path, a: int, b: int, c: int, d: int) -> None:
+    """Let the header of a track of an MP4 file say how a player turns it."""
     data = bytearray(path.read_bytes())
-    cos, sin = (round(f(math.radians(angle))) << 16 for f in (math.cos, math.sin))
-    struct.pack_into(
-        ">9i", data, data.index(b"tkhd") + 44, cos, sin, 0, -sin, cos, 0, 0, 0, 1 << 30
-    )
+    one = 1 << 16
+    matrix = (a * one, b * one, 0, c * one, d * one, 0, 0, 0, 1 << 30)
+    struct.pack_into(">9i", data, data.index(b"tkhd") + 44, *matrix)
     path.write_bytes(data)
 
 

@@ -51,14 +51,26 @@ def frame_colors(frame: Any) -> Bytes:
 def frame_gray(frame: Any) -> Bytes:
     """The luma of a frame of PyAV, or the grey of its colours, (height, width) uint8.
 
-    It is turned by quarters, as a telephone says how it was held.
+    It is turned by quarters and mirrored, as a telephone says how it was held.
     """
     return _upright(_luma(frame), frame)
 
 
 def _upright(pixels: Bytes, frame: Any) -> Bytes:
-    turns = round(frame.rotation / 90) % 4
-    return np.ascontiguousarray(np.rot90(pixels, turns)) if turns else pixels
+    """Pixels turned by quarters, and mirrored, as the display matrix of their frame says.
+
+    Source: FFmpeg's libavutil/display.h. A point (x, y) is shown at (a x + c y, b x + d y).
+    """
+    stated = frame.side_data.get("DISPLAYMATRIX")
+    if stated is None:
+        return pixels
+    a, b, _, c, d = np.frombuffer(stated, np.int32)[:5].tolist()
+    if abs(b) > abs(a):
+        pixels = pixels.swapaxes(0, 1)
+        right, down = c, b
+    else:
+        right, down = a, d
+    return np.ascontiguousarray(pixels[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1])
 
 
 def _colors(frame: Any) -> Bytes:
