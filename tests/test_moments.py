@@ -12,6 +12,7 @@ import pytest
 from conftest import Cdmisfa
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from cdmisfa import Run
 from cdmisfa.agents.learners import open_learner
@@ -142,6 +143,26 @@ def test_another_source_is_found_out(place: Path, tmp_path: Path, cdmisfa: Cdmis
     assert short.code == 4
     assert short.json["first_difference"]["iteration"] == 1500 // 40
     assert "learned again" in cdmisfa("check", run, "--source", place / "log").out
+
+
+def test_files_that_were_changed_since_are_named(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
+    folder, run = tmp_path / "cam", tmp_path / "run"
+    folder.mkdir()
+    rng = np.random.default_rng(4)
+    for i in range(90):
+        Image.fromarray(rng.integers(0, 256, (12, 16), np.uint8)).save(folder / f"{i}.png")
+    learned = ("--rate", 20, "--max-iterations", 2, "--no-rerun")
+    assert cdmisfa("learn", folder, *learned, "-o", run).code == 0
+    whole = cdmisfa("check", run, "--json")
+    assert (whole.code, whole.json["other_files"]) == (0, [])
+    (folder / "89.png").write_bytes((folder / "88.png").read_bytes())  # it learned from 80
+    changed = cdmisfa("check", run)
+    assert changed.code == 4
+    assert "bit for bit; but cam: no longer what the run learned from" in changed.out
+    (folder / "3.png").write_bytes((folder / "4.png").read_bytes())
+    changed = cdmisfa("check", run, "--json")
+    assert (changed.code, changed.json["other_files"]) == (4, ["cam"])
+    assert changed.json["first_difference"]["iteration"] == 0
 
 
 def test_a_run_that_lies_is_found_out(tmp_path: Path, cdmisfa: Cdmisfa) -> None:

@@ -83,6 +83,20 @@ def known_to_both(one: Any, other: Any) -> tuple[Any, Any]:
     return _of_each(one, other, known), _of_each(other, one, known)
 
 
+def other_files(one: Any, another: Any) -> list[str]:
+    """Names of the files of a source that are not those of another, by what both know of them."""
+    found = []
+    for key in _FILES:
+        own, others = _tables(one, key), _tables(another, key)
+        if len(own) == len(others):
+            found += [
+                str(file.get("file"))
+                for file, like in zip(own, others, strict=True)
+                if any(file[known] != like[known] for known in _HASHES & file.keys() & like.keys())
+            ]
+    return found
+
+
 def _of_each(
     one: Any,
     other: Any,

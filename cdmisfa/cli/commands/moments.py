@@ -131,18 +131,18 @@ def check_command(
 ) -> None:
     """Learn a run again from its source, and compare every signal bit for bit.
 
-    So are the keyframes in its log. It says the first signal or memory that differs, and exits
-    with 4 if one does. A part begins at the newest keyframe before it.
+    So are the keyframes in its log. It says the first signal or memory that differs, and which
+    files are no longer those it learned from, and exits with 4 if there are any. A part begins at
+    the newest keyframe before it.
     """
     from cdmisfa.experiments.recompute.check import check_run
 
     checked = check_run(run, source, start, stop)
-    found = checked.difference
     if as_json:
         options.print_json({"schema": options.SCHEMA, "run": str(run), **checked.as_json()})
     else:
         click.echo(str(checked))
-    if found is not None:
+    if not checked.holds:
         ctx.exit(NotReproducedError.exit_code)
 
 

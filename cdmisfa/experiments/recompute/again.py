@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from cdmisfa.agents.learners import LEARNERS, open_learner
-from cdmisfa.core.blocks import SeekableSource, SourceSpec
+from cdmisfa.core.blocks import SeekableSource, SourceSpec, description
 from cdmisfa.core.config import build
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, LearnerState
@@ -18,6 +18,7 @@ from cdmisfa.experiments.sources import open_logs, open_source
 from recorder.cameras.words import is_live
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
+from replay.runs.final import other_files, stated_source
 from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_keyframe
 
@@ -118,6 +119,19 @@ class Again:
             if self._era + 1 < len(self._eras):
                 self._enter(self._eras[self._era + 1])
             yield signals
+
+    def other_files(self) -> list[str]:
+        """Names of the source's files that are not those it learned from.
+
+        None are named of a source of other words, of one that was not needed, and of a recording
+        that was still written.
+        """
+        if self._source is None or self._words or self._followed():
+            return []
+        return other_files(stated_source(self.log), description(self._source, at_once=True))
+
+    def _followed(self) -> bool:
+        return bool(read_command(self.log.parent)[1].get("follow"))
 
     def close(self) -> None:
         """Let go of the source."""

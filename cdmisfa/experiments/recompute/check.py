@@ -30,12 +30,19 @@ class Checked:
         difference: the first one, of the log from what was learned again.
         arithmetic: version of the log's, and of what was learned again; other versions give other
             last bits.
+        other_files: names of files that are not those the run learned from.
     """
 
     start: int
     stop: int
     difference: Difference | None
     arithmetic: tuple[int, int] = (1, 1)
+    other_files: tuple[str, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether the run is what it says: the same signals, of the same files."""
+        return self.difference is None and not self.other_files
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values."""
@@ -46,16 +53,20 @@ class Checked:
             "identical": found is None,
             "first_difference": None if found is None else found.as_json(),
             "arithmetic": list(self.arithmetic),
+            "other_files": list(self.other_files),
         }
 
     def __str__(self) -> str:
         """What came of it, in words."""
+        files = ", ".join(self.other_files)
+        other = f"{files}: no longer what the run learned from" if files else ""
         if self.difference is None:
             what = f"iterations {self.start} to {self.stop - 1}"
-            return f"{what}: learned again, they are identical, bit for bit"
+            same = f"{what}: learned again, they are identical, bit for bit"
+            return f"{same}; but {other}" if other else same
         then, now = self.arithmetic
-        why = f": {_otherwise(then, now)}" if then != now else ""
-        return f"{self.difference} when learned again{why}"
+        why = other or (_otherwise(then, now) if then != now else "")
+        return f"{self.difference} when learned again{why and f': {why}'}"
 
 
 def _otherwise(then: int, now: int) -> str:
@@ -85,13 +96,14 @@ def check_run(
         first = again.learner.iteration
         versions = again.header.arithmetic, arithmetic_of(again.learner)
         at, found = _learned_again(again, stop, read_keyframes(again.log, first))
+        others = tuple(again.other_files())
     if found is not None:
-        return Checked(first, at, found, versions)
+        return Checked(first, at, found, versions, others)
     if at <= start and (at or stop):
         raise UsageError(f"{again.log} holds {at} iterations: choose a part of these")
     if stop is not None and at < stop:
         raise UsageError(f"{again.log} holds {at} iterations: end at one of these")
-    return Checked(first, at, None, versions)
+    return Checked(first, at, None, versions, others)
 
 
 def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tuple[Learner, int]:
