@@ -186,7 +186,7 @@ def test_a_video_plays_at_its_own_pace(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_video_is_recorded_until_it_ends(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip.mkv")
     done = cdmisfa("record", f"av:{clip}", "-o", str(tmp_path / "rec"), "--size", "64x48")
-    assert re.search(r"ended at frame \d+: clip ended", done.err)
+    assert re.search(r"ended at frame \d+: clip ended$", done.err, re.MULTILINE)
     with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
         assert source.spec.fps == 25
         (held,) = source.coverage().values()
@@ -261,6 +261,16 @@ def test_a_web_camera_that_is_not_there_is_one_line(web_camera: str) -> None:
     with pytest.raises(UsageError) as refused:
         open_live([word], LiveOptions())
     assert str(refused.value) == f"{word} cannot be opened: Server returned 404 Not Found"
+
+
+def test_a_web_camera_that_does_not_answer_is_not_waited_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("recorder.cameras.words._TIMEOUT", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # it accepts, and says nothing
+        word = f"http://127.0.0.1:{server.getsockname()[1]}/stream.mjpg"
+        with pytest.raises(UsageError, match="cannot be opened: it did not answer in time"):
+            open_live([word], LiveOptions())
 
 
 def test_pictures_of_a_web_camera_were_taken_when_they_come(web_camera: str) -> None:

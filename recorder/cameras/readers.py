@@ -144,13 +144,15 @@ class Readers:
         delay, name = shortest, reading.camera.name
         while self._is_on(reading, epoch):
             came = False
-            why = f"{name} ended" if reading.came else f"{name} ended before a picture of it came"
             try:
                 for age, image in reading.camera.pictures():
                     picture = Picture(self.now() - age, image)
                     if not self._put(reading, epoch, picture):
                         return
                     came, delay = True, shortest
+                why = (
+                    f"{name} ended" if reading.came else f"{name} ended before a picture of it came"
+                )
             except Exception as error:
                 if not isinstance(error, CdmisfaError):
                     why = f"{name} is gone: {one_line(error)}"

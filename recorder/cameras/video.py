@@ -205,4 +205,6 @@ def video_camera(word: str, name: str, *, timeout: float, color: bool = False) -
 
 def _reason(error: Exception) -> str:
     """What an error of FFmpeg says, without the address, in which a password may be."""
+    if type(error).__name__ == "ExitError":  # what waiting for too long ends with
+        return "it did not answer in time"
     return str(getattr(error, "strerror", None) or _SECRET.sub("", one_line(error)))
