@@ -6,8 +6,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numba
+import numpy as np
 import pytest
 
 from cdmisfa.cli.progress import Bar, compiling_said
@@ -171,6 +173,88 @@ def test_arguments_of_each_type_have_code_of_their_own_also_when_it_is_kept(tmp_
     damaged.write_bytes(damaged.read_bytes()[:-1000])
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.stderr == "True"
+
+
+def test_code_is_not_run_on_what_looks_alike() -> None:
+    @compiled
+    def last(x: Any) -> Any:
+        return x[-1]
+
+    @compiled
+    def below(n: int) -> int:
+        return n - 1
+
+    assert last(np.arange(3.0)) == 2.0
+    with pytest.raises(numba.TypingError):
+        last(np.arange(3.0).astype(">f8"))
+    assert below(2**63) == 2**63 - 1
+    assert below(-1) == -2
+
+
+THREADS = """
+import sys
+from threading import Barrier, Thread
+import numpy as np
+from cdmisfa.core.arithmetic.compiled import compiled
+@compiled
+def first(x):
+    return x[0]
+@compiled
+def last(x):
+    return x[-1]
+x = np.arange(3.0)
+if sys.argv[1:]:
+    first(x)
+    sys.exit()
+made = []
+def work(function):
+    together.wait()
+    made.append(function(x))
+functions = [first, last] * 3
+together = Barrier(len(functions))
+threads = [Thread(target=work, args=(function,)) for function in functions]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+print(sorted(made))
+"""
+
+
+def test_threads_run_what_is_kept_while_others_compile(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(THREADS)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    words = [sys.executable, str(tmp_path / "program.py")]
+    subprocess.run([*words, "keep"], env=environment, check=True)
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("[0.0, 0.0, 0.0, 2.0, 2.0, 2.0]\n", "")
+
+
+def test_what_numba_is_told_it_does_itself(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from cdmisfa.core.arithmetic.compiled import compiled\n"
+        "@compiled\n"
+        "def same(x):\n"
+        "    return x\n"
+        "print(same(1.0))\n"
+    )
+    for told, kept in (
+        ({"NUMBA_DISABLE_JIT": "1"}, set()),
+        ({"NUMBA_OPT": "1"}, {".nbi", ".nbc"}),
+        ({}, {".nbi", ".nbc", ".kept"}),
+    ):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept"), **told}
+        done = subprocess.run(
+            [sys.executable, str(program)],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.stdout, done.stderr) == ("1.0\n", "")
+        files = [path for path in (tmp_path / "kept").rglob("*") if path.is_file()]
+        assert {path.suffix for path in files} == kept
 
 
 def test_the_processor_is_named_as_the_compiler_names_it(tmp_path: Path) -> None:

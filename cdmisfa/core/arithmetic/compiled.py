@@ -11,9 +11,17 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 from cdmisfa.core.arithmetic.choice import Either, portable
-from cdmisfa.core.arithmetic.kept import described, keep, kept_while_sources_last, recalled
-from cdmisfa.core.arithmetic.machine_code import fingerprint, loaded, machine_code
+from cdmisfa.core.arithmetic.kept import (
+    described,
+    keep,
+    kept_while_sources_last,
+    recalled,
+    runs_alone,
+)
+from cdmisfa.core.arithmetic.machine_code import LOADING, fingerprint, loaded, machine_code
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -105,12 +113,17 @@ class _ForPython:
 
     @cached_property
     def _dispatcher(self) -> Any:
-        return compiler().njit(**self._options)(self._function)
+        if runs_alone():
+            return compiler().njit(**self._options)(self._function)
+        return _jit(self._function, self._options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Run the machine code for arguments of these types."""
         if kwargs:
             return self._dispatcher(*args, **kwargs)
+        for value in args:  # the fingerprint of an array is that of one in another byte order
+            if isinstance(value, np.ndarray) and not value.dtype.isnative:
+                return self._dispatcher(*args)
         try:
             code = self._codes[self._types(args)]
         except (LookupError, NotImplementedError):
@@ -127,7 +140,11 @@ class _ForPython:
 
     def _first(self, args: tuple[Any, ...]) -> Callable[..., Any]:
         """What runs arguments of these types from now on."""
-        code = self._from_disk(args) or self._compiled(args)
+        code = None
+        with contextlib.suppress(LookupError):
+            name = self._name(args)
+            if runs_alone():
+                code = self._from_disk(name) or self._compiled(name, args)
         if code is None:
             return cast(Callable[..., Any], self._dispatcher)
         with contextlib.suppress(Exception):
@@ -135,27 +152,28 @@ class _ForPython:
             self._codes[self._types(args)] = code
         return code
 
-    def _from_disk(self, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+    def _from_disk(self, name: str) -> Callable[..., Any] | None:
         with contextlib.suppress(Exception):
-            kept = recalled(self._name(args), self._source)
+            kept = recalled(name, self._source)
             return loaded(kept, self._function.__module__)
         return None
 
-    def _compiled(self, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+    def _compiled(self, name: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
         """What the compiler makes of it, which is kept; None where it says what is wrong."""
+        dispatcher = self._dispatcher
         from numba.core.errors import NumbaError
 
         if len(args) != self._function.__code__.co_argcount:
             return None
         try:
-            types = tuple(map(self._dispatcher.typeof_pyval, args))
-            code = cast(Callable[..., Any], self._dispatcher.compile(types))
+            types = tuple(map(dispatcher.typeof_pyval, args))
+            code = cast(Callable[..., Any], dispatcher.compile(types))
         except (NumbaError, ValueError):
             return None
         with contextlib.suppress(Exception):
-            made = machine_code(self._dispatcher.overloads[types])
+            made = machine_code(dispatcher.overloads[types])
             if made is not None and self._function.__closure__ is None:
-                keep(self._name(args), self._source, made)
+                keep(name, self._source, made)
         return code
 
     def _name(self, args: tuple[Any, ...]) -> str:
@@ -195,8 +213,9 @@ _WAITING: list[Callable[[], None]] = []
 @cache
 def compiler() -> Any:
     """Numba, once all is prepared."""
-    import numba
-    from numba.core import event
+    with LOADING:
+        import numba
+        from numba.core import event
 
     class Tell(event.Listener):
         def on_start(self, event: Any) -> None:
@@ -218,6 +237,7 @@ def compiled_for() -> tuple[str, str]:
     name, source = "compiled for", Path(__file__)
     with contextlib.suppress(Exception):
         return cast(tuple[str, str], recalled(name, source))
+    compiler()
     from numba.core.registry import cpu_target
 
     _, processor, features = cpu_target.target_context.codegen().magic_tuple()

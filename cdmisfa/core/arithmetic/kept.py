@@ -7,7 +7,7 @@ import os
 import pickle
 import platform
 import sys
-import tempfile
+import uuid
 from collections.abc import Callable
 from functools import cache, partial
 from importlib import metadata
@@ -24,8 +24,9 @@ MARKS = (
     b"@in_compiled_code",
     b"@_intrinsic",
     b"Either",
+    b"class MachineCode",
 )
-"""What files that hold compiled functions contain."""
+"""What files contain that hold compiled functions, or say how they are kept."""
 
 
 def kept_while_sources_last(dispatcher: Any) -> Any:
@@ -53,8 +54,21 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
         return {}
 
 
+@cache
+def runs_alone() -> bool:
+    """Whether machine code is kept here, and run without the compiler: where this was tested.
+
+    Not where numba was told of more than folders and threads: it may be to profile what runs, or
+    to compile nothing. Then it keeps what it compiles itself.
+    """
+    return sys.platform == "linux" and platform.machine() == "x86_64" and not any(_told())
+
+
 def folder_of(source: Path) -> Path | None:
-    """Where numba and we keep what is compiled of a source file; None where nothing can be."""
+    """Where what is compiled of a source file is kept; None where nothing can be.
+
+    It is run as it is there, as numba runs what it keeps: a folder is trusted as the source is.
+    """
     wanted = os.environ.get("NUMBA_CACHE_DIR")
     beside = source.resolve().parent / "__pycache__"
     folders = [Path(wanted)] if wanted else [beside, Path.home() / ".cache" / "cdmisfa"]
@@ -77,9 +91,13 @@ def keep(name: str, source: Path, value: Any) -> None:
     whole = pickle.dumps((_made_by(source), value))
     folder = folder_of(source)
     if folder is not None:
-        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-            file.write(whole)
-        Path(file.name).replace(folder / _file(name, source))
+        file = folder / _file(name, source)
+        partial = file.with_name(f"{file.name}.{uuid.uuid4().hex[:16]}")
+        try:
+            partial.write_bytes(whole)
+            partial.replace(file)
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def recalled(name: str, source: Path) -> Any:
@@ -109,14 +127,20 @@ def _settings() -> tuple[str, ...]:
     """The processor, and what numba was told from outside."""
     import llvmlite.binding as llvm
 
+    return (
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+        *_told(),
+    )
+
+
+def _told() -> tuple[str, ...]:
     told = {name: value for name, value in os.environ.items() if name.startswith("NUMBA_")}
     for needless in ("NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS"):
         told.pop(needless, None)
     file = Path(".numba_config.yaml")
     return (
-        llvm.get_process_triple(),
-        llvm.get_host_cpu_name(),
-        llvm.get_host_cpu_features().flatten(),
         *(f"{name}={told[name]}" for name in sorted(told)),
         file.read_text("utf-8", "replace") if file.is_file() else "",
     )

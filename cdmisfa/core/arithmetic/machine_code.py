@@ -25,7 +25,8 @@ from typing import Any, NamedTuple, cast
 _NUMBERS = [f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)]
 _NUMBERS += ["complex64", "complex128", "boolean"]
 
-_LOADING = Lock()
+LOADING = Lock()
+"""Held while a package stands in for numba's, which nobody may import meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def loaded(machine: MachineCode, module: str) -> Callable[..., Any]:
     """
     import llvmlite.binding as llvm
 
-    with _LOADING:
+    with LOADING:
         runtime = _runtime()
         missing = [name for name in machine.needs if not llvm.address_of_symbol(name)]
         if missing:
@@ -106,7 +107,7 @@ def loaded(machine: MachineCode, module: str) -> Callable[..., Any]:
 
 def fingerprint() -> Callable[[tuple[Any, ...]], bytes]:
     """What tells arguments of different types apart, as the compiler does at every call."""
-    with _LOADING:
+    with LOADING:
         found: Callable[[tuple[Any, ...]], bytes] = _runtime().types.compute_fingerprint
     return found
 
@@ -177,7 +178,11 @@ def _have_read_by(read: Callable[..., Any], unpickle: int) -> None:
 @contextmanager
 def _package(name: str) -> Iterator[Path]:
     """A package whose modules can be imported, without what its `__init__` imports."""
-    found = importlib.util.find_spec(name) if name not in sys.modules else None
+    if name in sys.modules:
+        importlib.import_module(name)  # which waits where another thread has only begun to
+        found = None
+    else:
+        found = importlib.util.find_spec(name)
     if found is not None:
         sys.modules[name] = importlib.util.module_from_spec(found)
     try:
