@@ -131,7 +131,7 @@ def _kernel_cache() -> Iterator[Check]:
     except ImportError:  # `_packages` says which package is missing
         return
     root = Path(__file__).parents[3]
-    rooms = ("cdmisfa/agents", "cdmisfa/features/incsfa", "replay/recordings")
+    rooms = "cdmisfa/agents", "cdmisfa/features/incsfa", "recorder/images", "replay/recordings"
     folders = [folder_of(root / room / "__init__.py") for room in rooms]
     kept = None not in folders
     detail = ", ".join(dict.fromkeys(map(str, folders)))
