@@ -25,12 +25,16 @@ ENCODERS = {
 }
 
 
+OTHERS = {"h264 with B-frames": ("libx264", {"bf": "2", "preset": "veryfast"})}
+"""Videos of which messages hold no picture each."""
+
+
 @cache
 def video(codec: str, seed: int = 0) -> tuple[bytes, ...]:
     """The packets of a video, one for each picture, of which every twelfth begins anew."""
     import av
 
-    name, options = ENCODERS[codec]
+    name, options = ENCODERS.get(codec) or OTHERS[codec]
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     encoder: Any = av.CodecContext.create(name, "w")
     encoder.width, encoder.height, encoder.pix_fmt = 4 * WIDTH, 4 * HEIGHT, "yuv420p"

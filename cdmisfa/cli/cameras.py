@@ -244,9 +244,12 @@ def say_about(source: FrameSource) -> None:
 
 
 def say_changes(source: FrameSource) -> None:
-    """Say on stderr which streams changed the size of their images while they were read."""
-    for line in getattr(source, "changes", {}).values():
-        warn(line)
+    """Say on stderr what showed while a source was read: changes of size, broken images."""
+    from replay.camera_logs.source import ForeignSource
+
+    if isinstance(source, ForeignSource):
+        for line in (*source.changes.values(), *source.salvaged()):
+            warn(line)
 
 
 def print_plan(source: FrameSource, *, as_json: bool) -> None:

@@ -83,6 +83,10 @@ class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with a
     """What is no image that is read; who knows where it came from adds that."""
 
 
+class UnknownPixels(MalformedImage):
+    """Pixels in a format that is not read."""
+
+
 def gray(
     data: bytes | memoryview,
     height: int,
@@ -111,7 +115,8 @@ def gray(
 
     Raises:
         UsageError: 32FC1, and no `depth`.
-        MalformedImage: an unsupported format, or sizes that contradict the data.
+        UnknownPixels: an unsupported format.
+        MalformedImage: sizes that contradict the data.
     """
     if encoding == "32FC1" and depth is None:
         raise UsageError("its images are distances (32FC1): say which to show, as --range 0.3:5")
@@ -122,7 +127,7 @@ def gray(
     else:
         layout = _LAYOUTS.get(encoding)
     if layout is None:
-        raise MalformedImage(
+        raise UnknownPixels(
             f"its pixel format {encoding[:40]!r} is not read: use one of "
             f"{', '.join([*ENCODINGS, '32FC1', *_BAYER])}"
         )

@@ -71,15 +71,22 @@ class VideoPackets:
 
         Raises:
             MalformedImage: it cannot be decoded, or by itself shows no picture.
-            UsageError: PyAV is missing.
+            UsageError: PyAV is missing, or its pictures wait for later ones.
         """
         packet = self._opened(message)
+        if not packet.data:
+            raise MalformedImage("its message is empty, without a picture of its video")
         av = pyav("a video in messages")
         context = self._of(_codec(packet.codec), av)
         try:
             frames = context.decode(av.Packet(packet.data))
         except (OSError, ValueError, av.FFmpegError) as error:
             raise MalformedImage(f"its video is broken there ({type(error).__name__})") from None
+        if not frames and context.has_b_frames:
+            raise UsageError(
+                "a picture of its video waits for later ones (B-frames), which messages of one "
+                "picture each rule out: encode it without them, or take it as an .mp4 file"
+            )
         if len(frames) != 1 or frames[0].is_corrupt:
             raise MalformedImage(f"{len(frames)} pictures of its video can be shown there, not 1")
         return self._shown(frames[0])

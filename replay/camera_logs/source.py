@@ -14,7 +14,7 @@ from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
-from recorder.images.pixels import Depth, MalformedImage, Shown
+from recorder.images.pixels import Depth, Shown, UnknownPixels
 from recorder.images.reading import Clock, Reading
 from replay.camera_logs.alignment import (
     Rows,
@@ -36,8 +36,8 @@ from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import hashed_log, image_logs, open_images
 from replay.camera_logs.options import Align, Gaps
+from replay.camera_logs.salvaged import BROKEN, SALVAGE, WholeImages
 from replay.camera_logs.stream import ImageStream
-from replay.mcap.records import MalformedRecord
 from replay.storage.hashing import Hashed, LoggedSource
 from replay.storage.location import Location, Url
 from replay.stored import Span, outside
@@ -73,7 +73,7 @@ class ForeignSource(LoggedSource):
         stamp: the times of messages: those of the log, or those in their headers.
         rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
-        salvage: leave out what is damaged.
+        salvage: leave out what is damaged, and broken images; see `WholeImages`.
         goal: the command and the folder of its result that a refusal names in what would work.
 
     Attributes:
@@ -130,7 +130,7 @@ class ForeignSource(LoggedSource):
         self._loop = loop
         self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp, color)
         self._asked_size, self._asked_gaps, self._part = size, gaps, (start, stop)
-        self._goal = goal
+        self._goal, self._salvage = goal, salvage
         self._streams: list[ImageStream] = []
         self.changes: dict[int, str] = {}
         self._shown: dict[int, tuple[int, Shown]] = {}
@@ -148,6 +148,8 @@ class ForeignSource(LoggedSource):
             if start or stop is not None:
                 self._streams = excerpts(self._streams, self._times, start, stop)
                 self._times = known_times(self._streams, self._fps)
+            if salvage:
+                self._streams = [WholeImages(stream) for stream in self._streams]
             start_ns, self._rows, self._gaps = self._put_on_clock(align)
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
             if (
@@ -219,6 +221,11 @@ class ForeignSource(LoggedSource):
             row |= {"gaps": [list(gap) for gap in self.pauses[name]], **self.alignment[name]}
             rows.append(row)
         return rows
+
+    def salvaged(self) -> list[str]:
+        """For each stream of which broken images were met a line that says so."""
+        whole = [s.said() for s in self._streams if isinstance(s, WholeImages)]
+        return [line for line in whole if line is not None]
 
     def _changes_size(self, stream: int) -> bool | None:
         """Whether a stream's images change their size, as far as that is known unread."""
@@ -292,8 +299,11 @@ class ForeignSource(LoggedSource):
         images = self._streams[stream]
         try:
             return images.image(row)
-        except (MalformedImage, MalformedRecord) as error:
-            raise LogDamagedError(f"{images.where(row)}: {error}") from None
+        except UnknownPixels as error:
+            raise UsageError(f"{images.where(row)}: {error}") from None
+        except BROKEN as error:
+            remedy = "" if self._salvage else f": {SALVAGE}"
+            raise LogDamagedError(f"{images.where(row)}: {error}{remedy}") from None
         except UsageError as error:
             raise UsageError(f"{images.where(row)}: {error}") from None
 

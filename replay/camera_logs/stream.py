@@ -21,6 +21,11 @@ from recorder.images.reading import MessageKind, Reading
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
 
+
+class UnreadableError(LogDamagedError):
+    """What a library cannot read."""
+
+
 LAST_NS: Final = 2**62
 """Log times from here on are beyond any clock, in nanoseconds."""
 
@@ -121,8 +126,10 @@ def choose_images(
     topic: str | None,
     channels: Iterable[tuple[str, MessageKind, Found]],
     reading: Reading,
-) -> tuple[Found, Taken]:
-    """Find the one channel that is meant, of images or of fields, and its messages' decoder.
+) -> tuple[list[Found], Taken]:
+    """Find the channels that are meant, of images or of fields, and their messages' decoder.
+
+    They are of one topic and of one kind, as where its publisher began again.
 
     Args:
         path: the log, for the error.
@@ -131,20 +138,32 @@ def choose_images(
         reading: what is taken of them.
 
     Raises:
-        UsageError: there is none, or not one.
+        UsageError: there is none, or not one topic, or its messages are of several kinds.
     """
-    readable: list[tuple[str, Found, Taken]] = []
+    readable: dict[str, dict[MessageKind, list[Found]]] = {}
+    decoders: dict[MessageKind, Taken] = {}
     others: dict[str, str] = {}
     for name, kind, channel in channels:
         decoder = decoder_of(kind, reading)
         if decoder is None:
             others[name] = f"{kind.schema} in {kind.encoding or 'no encoding'}"
         else:
-            readable.append((name, channel, decoder))
-    found = [(channel, decoder) for name, channel, decoder in readable if topic in (None, name)]
+            alike = kind if reading.fields else MessageKind(kind.schema, kind.encoding)
+            kinds = readable.setdefault(name, {})
+            kinds.setdefault(alike, []).append(channel)
+            decoders.setdefault(alike, decoder)
+    found = [name for name in readable if topic in (None, name)]
     if len(found) == 1:
-        return found[0]
-    known = ", ".join(sorted({name for name, _, _ in readable})) or "none"
+        kinds = readable[found[0]]
+        if len(kinds) > 1:
+            said = ", ".join(f"{kind.schema} in {kind.encoding}" for kind in kinds)
+            raise UsageError(
+                f"{path}: {found[0]} holds messages of {len(kinds)} kinds, which are no one "
+                f"stream: {said}"
+            )
+        kind = next(iter(kinds))
+        return kinds[kind], decoders[kind]
+    known = ", ".join(sorted(readable)) or "none"
     what = "messages with fields" if reading.fields else "images"
     if not readable and any(said.startswith(VECTOR_SCHEMA) for said in others.values()):
         raise UsageError(
@@ -155,8 +174,6 @@ def choose_images(
         raise UsageError(holds_none(path, reading))
     if topic is None:
         raise UsageError(f"{path}: name one --topic or more; it has {what} on: {known}")
-    if len(found) > 1:
-        raise UsageError(f"{path}: {len(found)} channels share the topic {topic}")
     if topic in others and reading.fields:
         raise UsageError(f"{path}: {topic} holds {others[topic]}, whose fields are not known")
     if topic in others:
@@ -227,7 +244,7 @@ def in_one_line(path: Location, program: str, remedy: str = "") -> Iterator[None
     except MemoryError:
         most = f"{BUDGET >> 20} MiB of memory for it, the limit"
         said = f"{path}: {program} takes more than {most}"
-        raise LogDamagedError(f"{said}: {remedy}" if remedy else said) from None
+        raise UnreadableError(f"{said}: {remedy}" if remedy else said) from None
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise LogDamagedError(f"{path}: {program} cannot read it ({reason})") from None
+        raise UnreadableError(f"{path}: {program} cannot read it ({reason})") from None

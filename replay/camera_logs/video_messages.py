@@ -31,6 +31,7 @@ class VideoMessages(ImageStream):
         self.parts = getattr(messages, "parts", [messages])
         self._messages, self._packets = messages, packets
         self._next = -1
+        self._broken: dict[int, MalformedImage | MalformedRecord] = {}
         rows = range(len(messages.times))
         self._first = next((row for row in rows if self._begins(row)), len(rows))
         if self._first == len(rows):
@@ -45,14 +46,25 @@ class VideoMessages(ImageStream):
             start = row
             while start not in (self._first, self._next) and not self._begins(start):
                 start -= 1
+                if start in self._broken:  # of which all behind it are made
+                    raise self._broken[start]
             if start != self._next:
                 self._packets.forget()
             self._next = -1
             for before in range(start, row):
-                self._messages.taken(before, self._packets)
+                self._taken(before)
         self._next = -1
-        shown: Shown = self._messages.taken(row, self._packets)
+        shown = self._taken(row)
         self._next = row + 1
+        return shown
+
+    def _taken(self, row: int) -> Shown:
+        """The picture of a message; raises for one that is broken, which is remembered."""
+        try:
+            shown: Shown = self._messages.taken(row, self._packets)
+        except (MalformedImage, MalformedRecord) as error:
+            self._broken[row] = error
+            raise
         return shown
 
     def stamp(self, row: int) -> int:

@@ -130,9 +130,9 @@ class BagImages(ImageStream):
         kinds = _kinds(self._reader, ros1=self._ros1)
         channels = [(name, kind, name) for name, kind in kinds.items()]
         chosen, decode = choose_images(self.path, topic, channels, reading)
-        self._kind = kinds[chosen]
+        self._kind = kinds[chosen[0]]
         self._stamp = stamp_of(self._kind)
-        return [c for c in self._reader.connections if c.topic == chosen], decode
+        return [c for c in self._reader.connections if c.topic == chosen[0]], decode
 
 
 def bag_channels(path: Path, *, whole: bool = False) -> list[ChannelFacts]:

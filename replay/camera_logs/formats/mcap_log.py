@@ -59,9 +59,10 @@ class McapImages(ImageStream):
         try:
             _refuse_nothing(self.reader)
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
-            self._channel, self.decode = choose_images(path, topic, channels, reading)
-            self.topic = self._channel.topic
-            self._stamp = stamp_of(_kind(self.reader, self._channel))
+            own, self.decode = choose_images(path, topic, channels, reading)
+            self._channels = {channel.id for channel in own}
+            self.topic, self._kind = own[0].topic, _kind(self.reader, own[0])
+            self._stamp = stamp_of(self._kind)
             self._index()
         except BaseException:
             self.reader.close()
@@ -72,8 +73,7 @@ class McapImages(ImageStream):
         return self.taken(row, self.decode)
 
     def distances(self) -> bool:
-        kind = _kind(self.reader, self._channel)
-        return self.taken(0, partial(holds_distances, kind.schema, kind.encoding))
+        return self.taken(0, partial(holds_distances, self._kind.schema, self._kind.encoding))
 
     def stamp(self, row: int) -> int:
         if self._stamp is None:
@@ -90,7 +90,7 @@ class McapImages(ImageStream):
         place = int(self._row_in[row])
         if self.reader.by_index:
             if self._own[0] is not table:
-                self._own = table, np.flatnonzero(table.channel == self._channel.id)
+                self._own = table, self._rows_of(table)
             own = self._own[1]
             if place >= len(own) or table.log_time[own[place]] != self.times[row]:
                 raise MalformedRecord("its chunk holds other messages than the summary names")
@@ -122,7 +122,7 @@ class McapImages(ImageStream):
         """The topic's messages by their rows in the table of each chunk."""
         segments, times, places = [], [np.empty(0, np.uint64)], [np.empty(0, np.int64)]
         for segment, table in self.reader.tables(ordered=False):
-            own = np.flatnonzero(table.channel == self._channel.id)
+            own = self._rows_of(table)
             if len(own):
                 segments.append(segment)
                 times.append(table.log_time[own])
@@ -130,14 +130,22 @@ class McapImages(ImageStream):
         counts = [len(own) for own in times[1:]]
         return segments, counts, np.concatenate(times), np.concatenate(places)
 
+    def _rows_of(self, table: MessageTable) -> NDArray[np.intp]:
+        """The rows of a chunk's table that are of the topic."""
+        return np.flatnonzero(np.isin(table.channel, list(self._channels)))
+
     def _by_index(self) -> _Messages:
         """The topic's messages by their rows among its own in each chunk."""
-        number = self._channel.id
-        segments = [s for s in self.reader.segments if (s.channel_counts() or {}).get(number)]
+        own_ids = self._channels
+        segments = [
+            segment
+            for segment in self.reader.segments
+            if any(n for c, n in (segment.channel_counts() or {}).items() if c in own_ids)
+        ]
         self.reader.expect(segments, indexes=True)
         found, counts = [np.empty((0, 2), np.uint64)], []
         for segment in segments:
-            own = [pairs for channel, pairs in self.reader.index(segment) if channel == number]
+            own = [pairs for channel, pairs in self.reader.index(segment) if channel in own_ids]
             found += own
             counts.append(sum(map(len, own)))
         pairs, first = np.concatenate(found), np.cumsum(counts) - counts

@@ -6,6 +6,7 @@ on the processor, comes between; only videos without luma are taken by their col
 
 from __future__ import annotations
 
+import contextlib
 from array import array
 from collections.abc import Iterator
 from fractions import Fraction
@@ -66,15 +67,24 @@ class VideoImages(ImageStream):
     def image(self, row: int) -> Bytes:
         stamp = int(self._stamps[row])
         with explained(self.path, "FFmpeg", held=self._held):
-            if not self._next <= row < self._next + _FORWARD:
+            found, at, self._next = None, self._next, _NOWHERE
+            if at <= row < at + _FORWARD:
+                with contextlib.suppress(self._av.FFmpegError):  # of a frame that this needs not
+                    found = self._forward(row)
+            if found is None:
                 self._container.seek(stamp, stream=self._stream, backward=True)
                 self._frames = self._container.decode(self._stream)
-            found = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
-            self._next = row + 1
-            if found is None or found.pts != stamp or found.is_corrupt:
-                self._next = _NOWHERE
+                found = self._forward(row)
+            if found is None:
                 raise MalformedRecord("the video is broken, no frame can be decoded")
+            self._next = row + 1
             return self._shown(found)
+
+    def _forward(self, row: int) -> Any:
+        """Decode on to a frame; None if it is broken or not there."""
+        stamp = int(self._stamps[row])
+        found = next((f for f in self._frames if f.pts is None or f.pts >= stamp), None)
+        return None if found is None or found.pts != stamp or found.is_corrupt else found
 
     def where(self, row: int) -> str:
         return f"{self.path}: at {float(int(self._stamps[row]) * self._tick):g} s"

@@ -1,0 +1,206 @@
+"""One broken image among many: refused with the remedy, or passed over with --salvage."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from camera_files import HEIGHT, WIDTH, pictures
+from conftest import Cdmisfa
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import Writer
+from message_files import START, STEP, every, write_mcap
+from PIL import Image
+from video_packets import COUNT, FOXGLOVE, GROUP, foxglove, video
+
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.reading import MessageKind
+from replay.camera_logs.source import ForeignSource
+
+SIZE = (HEIGHT, WIDTH)
+RAW = MessageKind("foxglove.RawImage", "protobuf")
+PNG = MessageKind("foxglove.CompressedImage", "protobuf")
+
+
+def raw(image: np.ndarray[Any, Any], encoding: str = "mono8") -> bytes:
+    fields = {"width": WIDTH, "height": HEIGHT, "step": WIDTH, "encoding": encoding}
+    return RawImage(**fields, data=image.tobytes()).SerializeToString()
+
+
+def png(image: np.ndarray[Any, Any]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "PNG")
+    return CompressedImage(format="png", data=file.getvalue()).SerializeToString()
+
+
+def write(path: Path, broken: Sequence[int], count: int = 40) -> Path:
+    messages = [png(image) for image in pictures(count)]
+    for row in broken:
+        image = CompressedImage.FromString(messages[row])
+        image.data = image.data[:60]
+        messages[row] = image.SerializeToString()
+    return write_mcap(path, PNG, {"/cam": every(STEP, messages)})
+
+
+def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
+    """The frames of a salvaged log, asked for in some order."""
+    with contextlib.closing(ForeignSource(path, size=SIZE, salvage=True, loop=True)) as source:
+        frames = []
+        for row in rows:
+            source.seek(row)
+            frames.append(source.take(0, 1).frames[0])
+        return frames
+
+
+def test_a_broken_image_is_refused_with_the_remedy_and_passed_over_with_it(tmp_path: Path) -> None:
+    path, images = write(tmp_path / "a.mcap", [0, 7, 8, 39]), list(pictures(40))
+    with pytest.raises(LogDamagedError, match=f"/cam at {START} ns.*broken.*with --salvage"):
+        ForeignSource(path)
+    stands_for = {0: 1, 7: 6, 8: 6, 39: 38}
+    order = [*range(45), 8, 7, 39, 0, 1, 7]
+    for row, frame in zip(order, shown(path, order), strict=True):
+        np.testing.assert_array_equal(frame, images[stands_for.get(row % 40, row % 40)])
+    with contextlib.closing(ForeignSource(path, salvage=True)) as source:
+        assert source.take(0, 8).frames.shape[0] == 8
+        assert "2 broken of 40 images" in source.salvaged()[0]
+    with pytest.raises(LogDamagedError, match=r"/cam.*broken \(\w+\)$"):
+        ForeignSource(write(tmp_path / "b.mcap", range(3), 3), salvage=True)
+
+
+def test_salvaged_images_are_learned_from_and_converted_alike(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "a.mcap", [5, 25])
+    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
+    assert cdmisfa("learn", path, *quick).code == 3
+    learned = cdmisfa("learn", path, "--salvage", *quick)
+    assert learned.code == 0, learned.err
+    assert "2 broken of 40 images: the last whole one is taken" in learned.err
+    converted = cdmisfa("convert", path, "--salvage", "-o", tmp_path / "rec")
+    assert converted.code == 0, converted.err
+    assert "2 broken of 40 images: the last whole one is taken" in converted.err
+    again = cdmisfa("learn", tmp_path / "rec", "--algorithm", "progress", *quick).json
+    assert again["signals_sha256"] == learned.json["signals_sha256"]
+
+
+def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    packets = list(video("h264"))
+    packets[15], packets[30] = packets[15][:-40] + bytes(40), b""
+    kept = [foxglove(packet, "h264") for packet in packets]
+    path = write_mcap(tmp_path / "a.mcap", FOXGLOVE, {"/cam": every(STEP, kept)})
+    whole = [foxglove(packet, "h264") for packet in video("h264")]
+    expected = shown(write_mcap(tmp_path / "b.mcap", FOXGLOVE, {"/cam": every(STEP, whole)}),
+                     range(COUNT))  # fmt: skip
+    last = dict.fromkeys(range(15, 2 * GROUP), 14) | dict.fromkeys(range(30, 3 * GROUP), 29)
+    order = [*range(COUNT), *random.Random(0).sample(range(COUNT), COUNT)]
+    for row, frame in zip(order, shown(path, order), strict=True):
+        np.testing.assert_array_equal(frame, expected[last.get(row, row)], err_msg=str(row))
+    with contextlib.closing(ForeignSource(path, size=SIZE)) as source:
+        source.seek(30)
+        with pytest.raises(LogDamagedError, match="its message is empty, without a picture"):
+            source.take(0, 1)
+
+
+def film(path: Path, packets: Sequence[bytes]) -> tuple[int, int]:
+    """Write a film of packets of H.264; gives place and size of the one of frame 17."""
+    av: Any = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=20)
+        stream.width, stream.height, stream.pix_fmt = 4 * WIDTH, 4 * HEIGHT, "yuv420p"
+        for i, data in enumerate(packets):
+            packet = av.Packet(data)
+            packet.stream, packet.pts, packet.dts = stream, i, i
+            packet.time_base, packet.is_keyframe = Fraction(1, 20), i % GROUP == 0
+            container.mux(packet)
+    with av.open(str(path)) as container:
+        made = [packet for packet in container.demux(video=0) if packet.size]
+    return made[17].pos, made[17].size
+
+
+def test_a_broken_film_shows_the_same_in_any_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    place, size = film(path, video("h264"))
+    expected = shown(path, range(COUNT))
+    data = bytearray(path.read_bytes())
+    data[place + 5 : place + size] = bytes(size - 5)
+    path.write_bytes(data)
+    last = dict.fromkeys(range(17, 2 * GROUP), 16)
+    order = [*range(COUNT), 3, 30, *random.Random(0).sample(range(COUNT), COUNT)]
+    for row, frame in zip(order, shown(path, order), strict=True):
+        np.testing.assert_array_equal(frame, expected[last.get(row, row)], err_msg=str(row))
+
+
+def test_pictures_that_wait_for_later_ones_are_refused_by_name(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    messages = [foxglove(packet, "h264") for packet in video("h264 with B-frames")]
+    path = write_mcap(tmp_path / "a.mcap", FOXGLOVE, {"/cam": every(STEP, messages)})
+    for salvage in (False, True):
+        with pytest.raises(UsageError, match=r"/cam at .* waits for later ones \(B-frames\)"):
+            ForeignSource(path, salvage=salvage)
+
+
+def test_a_pixel_format_that_is_not_read_is_no_damage(tmp_path: Path) -> None:
+    messages = [raw(image, "weird8") for image in pictures(3)]
+    path = write_mcap(tmp_path / "a.mcap", RAW, {"/cam": every(STEP, messages)})
+    for salvage in (False, True):
+        with pytest.raises(UsageError, match="its pixel format 'weird8' is not read"):
+            ForeignSource(path, salvage=salvage)
+
+
+def test_an_index_that_names_other_messages_is_damage_with_a_remedy(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", RAW, {"/cam": every(STEP, map(raw, pictures(40)))})
+    data = bytearray(path.read_bytes())
+    place = data.rfind((START + 3 * STEP).to_bytes(8, "little"))  # in the chunk's message index
+    data[place] ^= 1
+    path.write_bytes(data)
+    with (
+        contextlib.closing(ForeignSource(path)) as source,
+        pytest.raises(LogDamagedError, match=r"other messages than the summary names.*--salvage"),
+    ):
+        source.take(0, 8)
+    for row, frame in enumerate(shown(path, range(8))):
+        np.testing.assert_array_equal(frame, list(pictures(8))[row])
+
+
+def write_channels(path: Path, channels: Sequence[tuple[MessageKind, Sequence[bytes]]]) -> Path:
+    """A log whose channels of /cam take turns, message by message."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2048)
+        writer.start()
+        numbers = []
+        for kind, _ in channels:
+            schema = writer.register_schema(kind.schema, kind.language, kind.definition)
+            of = {"number": str(len(numbers))}  # without which it would be the same
+            numbers.append(writer.register_channel("/cam", kind.encoding, schema, of))
+        row = 0
+        for turn in zip(*(messages for _, messages in channels), strict=True):
+            for number, message in zip(numbers, turn, strict=True):
+                writer.add_message(number, START + row * STEP, message, START + row * STEP)
+                row += 1
+        writer.finish()
+    return path
+
+
+def test_channels_of_one_topic_and_kind_are_one_stream(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    images = list(pictures(40))
+    halves = [(RAW, [raw(image) for image in images[start::2]]) for start in (0, 1)]
+    path = write_channels(tmp_path / "a.mcap", halves)
+    for topics in ((), ("/cam",)):
+        with contextlib.closing(ForeignSource(path, topics, size=SIZE)) as source:
+            np.testing.assert_array_equal(source.take(0, 40).frames, images)
+    for row, frame in enumerate(shown(path, range(40))):  # by a pass over the log
+        np.testing.assert_array_equal(frame, images[row])
+    path = write_channels(tmp_path / "b.mcap", [halves[0], (PNG, list(map(png, images[1::2])))])
+    for words in ((), ("--topic", "/cam")):
+        done = cdmisfa("convert", path, *words, "-o", tmp_path / "rec")
+        assert done.code == 2
+        assert "foxglove.RawImage in protobuf, foxglove.CompressedImage in protobuf" in done.err
