@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from camera_files import write_cameras, write_pictures
 from conftest import Cdmisfa
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
+from message_files import write_mcap
 from PIL import Image
 
 from recorder.config import view_names
+from recorder.images.reading import MessageKind
 
 SMALL = ("--size", "16x12")
 QUICK = ("--max-iterations", "4", "--no-rerun", "--set", "learner.tau=10")
@@ -194,6 +197,65 @@ def test_what_lies_in_no_part_of_a_log_is_refused(cdmisfa: Cdmisfa, logs: Path) 
     turned = cdmisfa("learn", logs / "a.mcap", *BOTH, "--from", "12", "--to", "5", "--dry-run")
     assert turned.code == 2
     assert "--from 12 is no earlier than --to 5" in turned.err
+
+
+def test_what_is_exported_or_played_is_counted_as_what_is_learned_from(
+    cdmisfa: Cdmisfa, logs: Path
+) -> None:
+    for words in (("export", "--to", "images", "-o", logs / "out"), ("play", "--rate", 100)):
+        done = cdmisfa(words[0], logs / "uneven.mcap", *words[1:])
+        assert done.code == 0, done.err
+        assert "/cam_right: 45 images, 44 frames repeated, 0 images dropped" in done.err
+        assert "/cam_left: 90 images, 0 frames repeated, 1 images dropped" in done.err
+
+
+def test_commands_say_that_images_are_not_at_their_times(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    rows = "\n".join(f"{i / 50},{i}" for i in range(60) if i not in (20, 21))
+    (tmp_path / "t.csv").write_text(f"s,a\n{rows}\n")
+    for words in (
+        ("learn", "--dry-run"),
+        ("convert", "-o", tmp_path / "rec"),
+        ("export", "--to", "lerobot", "-o", tmp_path / "out"),
+        ("play", "--rate", 100),
+    ):
+        done = cdmisfa(words[0], tmp_path / "t.csv", "--time", "s", *words[1:])
+        assert done.code == 0, done.err
+        assert done.err.count("(2 missing): 1.2 s of it become 1.16 s of frames") == 1
+
+
+def test_streams_without_a_common_time_are_named(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+    def image(size: int) -> bytes:
+        data = bytes(size * size)
+        return RawImage(
+            height=size, width=size, step=size, encoding="mono8", data=data
+        ).SerializeToString()
+
+    log = write_mcap(
+        tmp_path / "log.mcap",
+        MessageKind("foxglove.RawImage", "protobuf"),
+        {
+            "/late": [((200 + i) * 10**8, image(16)) for i in range(20)],
+            "/early": [(i * 10**8, image(16)) for i in range(25)],
+        },
+    )
+    refused = cdmisfa("view", log, "--save", tmp_path / "v.rrd")
+    assert refused.code == 2
+    assert f"{log}: /early ends before /late begins, they have no time in common" in refused.err
+    assert refused.err.endswith("take each by itself, with --topic\n")
+
+
+def test_images_and_numbers_are_refused_before_they_are_put_by_number(
+    cdmisfa: Cdmisfa, logs: Path
+) -> None:
+    (logs / "t.csv").write_text("s,a\n0,1\n1,2\n2,3\n")
+    kind = MessageKind("foxglove.CompressedImage", "json")
+    write_mcap(logs / "b.mcap", kind, {"/cam": [(10**12 + i, b'{"data": ""}') for i in range(9)]})
+    refused = cdmisfa("learn", logs / "t.csv", logs / "b.mcap", "--time", "s", "--field", "a")
+    assert refused.code == 2
+    assert "as with" not in refused.err
+    assert "/cam" in refused.err
+    assert "there is no a, " in refused.err
+    assert refused.err.endswith("--field is of every stream, images are no numbers\n")
 
 
 def test_a_range_is_for_distances(cdmisfa: Cdmisfa, logs: Path) -> None:

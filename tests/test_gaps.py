@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from message_files import write_mcap
 
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import LogExhaustedError
+from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.experiments.convert import convert
 from cdmisfa.testing.sources import SourceContract
 from recorder.images.framing import FRAME_PIXELS, Fit, default_size, fitted
@@ -84,6 +84,51 @@ def test_no_block_reaches_across_a_gap(tmp_path: Path, align: Align | None) -> N
         source.take(0, 90)
     assert "a gap of 3 s after 1.98 s: no block reaches across" in source.warnings[0]
     assert source.alignment["/cam"] == {"messages": 300, "repeated": 0, "dropped": 0}
+
+
+UNEVEN = {
+    "lost": ([*range(0, 4000, 20), *range(4080, 8000, 20)], "(4 missing): 8 s of it become 7.92 s"),
+    "two rates": ([*range(0, 1000, 100), *range(1000, 1500, 25)], "(30 missing): 1.5 s of it"),
+    "slow": ([*range(0, 4000, 28), *range(4004, 9000, 20)], "(0 missing): 9.004 s of it become 7"),
+}
+EVEN = {
+    "even": range(0, 4000, 20),
+    "jitter": [20 * i + (0, 0, 0, 12, 0, 0, 0)[i % 7] for i in range(200)],
+    "a pause": PAUSED,
+    "one": [0, 20],
+}
+
+
+@pytest.mark.parametrize(("times", "said"), UNEVEN.values(), ids=UNEVEN)
+def test_images_at_other_times_than_their_frames_are_said(
+    times: list[int], said: str, tmp_path: Path
+) -> None:
+    path = write_log(tmp_path / "log.mcap", times)
+    (line,) = ForeignSource(path).warnings
+    assert line.startswith(f"{path}: /cam is taken by number, its rate uneven ")
+    assert said in line
+    remedy = line.split("--align time --rate ")[1].split()[0]
+    kept = ForeignSource(path, align="time", rate=float(remedy))
+    assert not kept.warnings
+    assert kept.frames / kept.spec.fps == pytest.approx((times[-1] - times[0]) / 1000, abs=0.05)
+    assert not ForeignSource(path, align="index").warnings
+
+
+@pytest.mark.parametrize("times", EVEN.values(), ids=EVEN)
+def test_images_near_the_times_of_their_frames_are_no_news(
+    times: Sequence[int], tmp_path: Path
+) -> None:
+    said = ForeignSource(write_log(tmp_path / "log.mcap", times)).warnings
+    assert not [line for line in said if "by number" in line]
+
+
+def test_a_gap_of_more_frames_than_there_can_be_names_where_it_is(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", [0, *(1_700_000_000_000 + i * 20 for i in range(30))])
+    with pytest.raises(UsageError) as refused:
+        ForeignSource(path)
+    assert str(refused.value).startswith(f"{path}: /cam: it has a gap of 1.7e+09 s after 0 s, ")
+    assert str(refused.value).endswith("choose a part without, with --from or --to")
+    assert ForeignSource(path, start=1).frames == 30
 
 
 def test_a_gap_comes_again_with_every_turn(tmp_path: Path) -> None:

@@ -299,6 +299,8 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
         ({"time": "word"}, "word holds string, as 'x', neither numbers nor dates"),
         ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),
         ({"time": "big"}, "beyond any clock, counted in s: say what they count, as --time big:ns"),
+        ({"time": "ms"}, "beyond any clock, counted in s: say what they count, as --time ms:ms"),
+        ({"time": "us"}, "as --time us:us"),
         ({"rate": 5, "size": (4, 4)}, "as they are: --size is for images"),
         ({"rate": 5, "size": (4, 4), "fit": "pad"}, "--size and --fit are for images"),
         ({"rate": 5, "topics": ["x"]}, "a table has no topics, leave x out; see --field"),
@@ -306,6 +308,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
 )
 def test_what_a_table_lacks_is_said(options: Any, why: str, tmp_path: Path) -> None:
     columns = {"s": [0.0, 1.0], "a": [1, 2], "word": ["x", "y"], "big": [10**18, 10**18 + 1]}
+    columns |= {"ms": [1_700_000_000_000] * 2, "us": [1_700_000_000_000_000] * 2}
     with pytest.raises(UsageError, match=why):
         ForeignSource(write_table(tmp_path / "t.csv", columns), **options)
 

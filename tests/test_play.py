@@ -29,6 +29,7 @@ from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from replay.camera_logs.options import CameraOptions
+from replay.inputs.opening import Logged
 from replay.playing.feed import Told, Topic, opened_feed
 from replay.playing.pace import Played, paced, rounds
 from replay.playing.robot import play_as_robot
@@ -207,7 +208,11 @@ def test_topics_are_played_as_they_are_and_fields_as_numbers(tmp_path: Path) -> 
     (tmp_path / "t.csv").write_text("stamp,a\n0,1\n1,2\n2,n/a\n3,4\n")
     said: list[str] = []
     cameras = CameraOptions(time="stamp", fields=("a",))
-    with opened_feed([tmp_path / "t.csv"], None, cameras, said.append) as feed:
+
+    def about(source: Logged) -> None:
+        said.extend(source.warnings)
+
+    with opened_feed([tmp_path / "t.csv"], None, cameras, about) as feed:
         told = list(feed.messages())
     assert [(each.topic.schema_name, each.time_ns // 10**9) for each in told] == [
         ("cdmisfa.Vector", second) for second in (0, 1, 2)

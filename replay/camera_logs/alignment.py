@@ -18,6 +18,8 @@ GAP_STEPS: Final = 10
 """A pause between two images of more than so many median steps is a gap."""
 _UNEVEN: Final = 0.01
 """By how much of itself a rate may differ from another that counts as the same."""
+_JITTER: Final = 0.75
+"""By how much of a frame the time of an image may differ from that of its frame."""
 
 Times = NDArray[np.uint64]
 """When each image of a stream was taken, (n,) in nanoseconds, in order."""
@@ -88,7 +90,10 @@ def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list
     """
     ticks = (stop - start) * fps / NANOSECONDS + 1
     if ticks > MAX_FRAMES:
-        raise UsageError(f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one")
+        raise UsageError(
+            f"--rate {fps:g} makes {ticks:.0f} frames: choose a lower one, or a part of the log "
+            "with --from and --to"
+        )
     clock = times_of(np.arange(int(ticks)), fps, start).astype(np.uint64)
     return [np.searchsorted(times, clock, side="right") - 1 for times in streams]
 
@@ -101,10 +106,39 @@ def pauses(times: Times) -> Rows:
 
 def missing(times: Times) -> int:
     """How many images a stream lacks between its first and last that its rate would have had."""
+    return int(_lacks(times).sum())
+
+
+def _lacks(times: Times) -> NDArray[np.float64]:
+    """How many images are missing before each one but the first, (n - 1,)."""
     step = step_of(times) * NANOSECONDS
     if not step > 0:
-        return 0
-    return int(np.maximum(np.round(np.diff(times) / step) - 1, 0).sum())
+        return np.zeros(max(len(times) - 1, 0))
+    return np.maximum(np.round(np.diff(times) / step) - 1, 0)
+
+
+def retimed(times: Times, rows: Rows, fps: float) -> str:
+    """How frames that show images by their number are of other times than these, in words.
+
+    Args:
+        times: of the images, nanoseconds.
+        rows: which of them each frame shows, each at least once; see `with_gaps`.
+        fps: frames a second.
+
+    Returns:
+        "" where each frame is of its image's time, but for jitter, and, where no image is
+        missing, for a rate that is known to a hundredth.
+    """
+    frame = np.flatnonzero(np.diff(rows, prepend=-1))
+    since = (times - times[0]) / NANOSECONDS
+    lacks = _lacks(times)
+    lacks[pauses(times) - 1] = 0
+    lost = int(lacks.sum())
+    allowed = _JITTER / fps + (0 if lost else _UNEVEN) * since
+    if (np.abs(since - frame / fps) <= allowed).all():
+        return ""
+    lasts, become = since[-1] + 1 / fps, len(rows) / fps
+    return f"its rate uneven ({lost} missing): {lasts:.6g} s of it become {become:.6g} s of frames"
 
 
 def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows], list[Span]]:
@@ -117,6 +151,9 @@ def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows
 
     Returns:
         As `rows`, so long as the streams last by their times; and the frames put in.
+
+    Raises:
+        UsageError: that makes more frames than anybody can want.
     """
     count = len(rows[0])
     begins = [int(i) for i in pauses(first) if i < count]
@@ -124,10 +161,11 @@ def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows
     for i in begins:
         ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
     frame = np.cumsum(ticks) - ticks[0]
-    if count and frame[-1] > MAX_FRAMES:
-        raise UsageError(f"its images are {frame[-1]} frames apart: choose a part of the log")
-    shows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
     gaps = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
+    if count and frame[-1] > MAX_FRAMES:
+        said = f"it has {in_words(gaps, fps)}, {frame[-1] + 1} frames in all"
+        raise UsageError(f"{said}: choose a part without, with --from or --to")
+    shows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
     return [stream[shows] for stream in rows], gaps
 
 

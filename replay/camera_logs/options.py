@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import Depth
-from recorder.images.reading import Clock
+from recorder.images.reading import Clock, Reading
 
 Align = Literal["index", "time"]
 Gaps = Literal["skip", "hold"]
@@ -68,3 +68,20 @@ class CameraOptions:
             for field in fields(self)
             if getattr(self, field.name) != field.default
         )
+
+
+def spelled(
+    reading: Reading, size: Size | None, fit: Fit, start: float, stop: float | None, gaps: Gaps
+) -> list[str]:
+    """The options of the command line that choose what is taken; of defaults, none."""
+    words = ["--size", f"{size[1]}x{size[0]}"] if size is not None else []
+    words += ["--fit", fit] if fit != "crop" else []
+    for field in reading.fields:
+        words += ["--field", field]
+    words += ["--time", reading.time] if reading.time is not None else []
+    words += ["--stamp", reading.stamp] if reading.stamp != "log" else []
+    words += ["--color"] if reading.color else []
+    words += ["--range", "{:g}:{:g}".format(*reading.depth)] if reading.depth is not None else []
+    words += ["--from", f"{start:g}"] if start else []
+    words += ["--to", f"{stop:g}"] if stop is not None else []
+    return words + (["--gaps", "hold"] if gaps == "hold" else [])

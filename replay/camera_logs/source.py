@@ -27,6 +27,7 @@ from replay.camera_logs.alignment import (
     of_other_rate,
     overlap,
     pauses,
+    retimed,
     step_of,
     unlike,
     with_gaps,
@@ -35,7 +36,7 @@ from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import hashed_log, image_logs, open_images
-from replay.camera_logs.options import Align, Gaps
+from replay.camera_logs.options import Align, Gaps, spelled
 from replay.camera_logs.salvaged import BROKEN, SALVAGE, WholeImages
 from replay.camera_logs.stream import ImageStream
 from replay.storage.hashing import Hashed, LoggedSource
@@ -84,7 +85,8 @@ class ForeignSource(LoggedSource):
         shapes: for each stream how an image becomes a frame, in words.
         changes: for each stream whose images change their size, a line that says so; as soon as
             one was shown.
-        warnings: what the user should know: logs that were cut, damage that was left out.
+        warnings: what the user should know: logs that were cut, damage that was left out, images
+            that are shown at other times than their own.
     """
 
     def __init__(
@@ -182,6 +184,10 @@ class ForeignSource(LoggedSource):
         self.shapes = dict(zip(names, map(str, self._framings), strict=True))
         warnings = [w for s in self._streams for w in s.warnings]
         warnings += [self._said_of_gaps(stream) for stream, own in enumerate(self._gaps) if own]
+        if align is None and (said := retimed(self._times[0], self._rows[0], self._fps)):
+            one, way = self._streams[0], f"--align time --rate {self._fps:g} to keep its times"
+            said = f"{one.path}: {one.topic} is taken by number, {said}"
+            warnings.append(f"{said}; convert or learn it with {way}")
         self.warnings = tuple(dict.fromkeys(warnings))
 
     def scene(self) -> Mapping[str, str]:
@@ -309,13 +315,15 @@ class ForeignSource(LoggedSource):
 
     def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Span]]]:
         """When frame 0 is, which image of each stream every frame shows, and each one's gaps."""
-        first = self._times[0]
+        first, of = self._times[0], range(len(self._times))
         if align == "time":
             start, stop = overlap(self._times)
             if stop < start:
+                ends = self._streams[min(of, key=lambda i: int(self._times[i][-1]))]
+                begins = self._streams[max(of, key=lambda i: int(self._times[i][0]))]
                 raise UsageError(
-                    f"{self._streams[0].topic} and others have no time in common: take each by "
-                    "itself"
+                    f"{ends.path}: {ends.topic} ends before {begins.topic} begins, they have no "
+                    "time in common: take each by itself, with --topic"
                 )
             rows = by_time(self._times, start, stop, self._fps)
             gaps = [gaps_by_time(t, start, len(rows[0]), self._fps) for t in self._times]
@@ -324,7 +332,11 @@ class ForeignSource(LoggedSource):
         if align == "index" and len(rows) > 1:
             return int(first[0]), rows, [[] for _ in rows]
         self._refuse_unequal()
-        rows, shared = with_gaps(rows, first, self._fps)
+        try:
+            rows, shared = with_gaps(rows, first, self._fps)
+        except UsageError as error:
+            one = self._streams[0]
+            raise UsageError(f"{one.path}: {one.topic}: {error}") from None
         return int(first[0]), rows, [shared for _ in rows]
 
     def _said_of_gaps(self, stream: int) -> str:
@@ -348,8 +360,8 @@ class ForeignSource(LoggedSource):
             if any(len(pauses(own)) for own in self._times):
                 raise UnequalError(
                     f"{two} have no time in common, and gaps, across which --align index takes "
-                    "images for neighbours: take each by itself, or a part without with --from "
-                    "and --to"
+                    "images for neighbours: take each by itself, with --topic, or a part "
+                    "without with --from and --to"
                 )
             raise UnequalError(
                 f"{two} have no time in common: take the i-th image of each together, as with: "
@@ -363,27 +375,17 @@ class ForeignSource(LoggedSource):
                 )
 
     def _command(self, align: Align = "time") -> str:
-        """A command that takes these streams."""
+        """A command that takes these streams; numbers that no clock puts together are refused."""
+        if self._reading.fields:
+            try:
+                firsts = [self._image(i, 0) for i in range(len(self._streams))]
+            except UsageError as error:
+                said = f"{error}; --field is of every stream, images are no numbers"
+                raise UsageError(said) from None
+            framings(firsts, None, self._fit)
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        if self._asked_size is not None:
-            words += ["--size", f"{self._asked_size[1]}x{self._asked_size[0]}"]
-        if self._fit != "crop":
-            words += ["--fit", self._fit]
-        for field in self._reading.fields:
-            words += ["--field", field]
-        if self._reading.time is not None:
-            words += ["--time", self._reading.time]
-        if self._reading.stamp != "log":
-            words += ["--stamp", self._reading.stamp]
-        if self._reading.color:
-            words += ["--color"]
-        if self._reading.depth is not None:
-            words += ["--range", "{:g}:{:g}".format(*self._reading.depth)]
-        start, stop = self._part
-        words += ["--from", f"{start:g}"] if start else []
-        words += ["--to", f"{stop:g}"] if stop is not None else []
-        words += ["--gaps", "hold"] if self._asked_gaps == "hold" else []
+        words += spelled(self._reading, self._asked_size, self._fit, *self._part, self._asked_gaps)
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])

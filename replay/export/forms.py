@@ -17,7 +17,7 @@ from replay.export.images import write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
 from replay.export.videos import write_film, write_films
-from replay.inputs.opening import holds_run, open_to_look
+from replay.inputs.opening import Logged, holds_run, open_to_look
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ def export(
     force: bool = False,
     lossless: bool = False,
     cameras: CameraOptions | None = None,
-    warn: Callable[[str], None] = lambda line: None,
+    about: Callable[[Logged], None] = lambda source: None,
 ) -> int:
     """Write a run's signals, or a recording's frames, in another form.
 
@@ -78,7 +78,7 @@ def export(
         force: replace an existing file, or an earlier export in a folder.
         lossless: keep every value of images that become a video.
         cameras: which streams of camera logs; by default all of images.
-        warn: told what the user should know of a recording or of camera logs.
+        about: given a recording or camera logs before they are written, to say what they are.
 
     Returns:
         The number of iterations, or of images or frames, written.
@@ -103,7 +103,7 @@ def export(
         if not named.exists():
             raise UsageError(f"{named}: no such file or folder")
     if described.of == "recording":
-        return _export_recording(paths, out, form, lossless, cameras, warn)
+        return _export_recording(paths, out, form, lossless, cameras, about)
     if out.is_dir():
         raise UsageError(f"{out} is a folder: name the file to write")
     if not all(map(holds_run, paths)):
@@ -125,14 +125,13 @@ def _export_recording(
     form: str,
     lossless: bool,
     cameras: CameraOptions | None,
-    warn: Callable[[str], None],
+    about: Callable[[Logged], None],
 ) -> int:
     path = paths[0]
     if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
     with contextlib.closing(open_to_look(paths, cameras)) as source:
-        for warning in source.warnings:
-            warn(warning)
+        about(source)
         if form in ("images", "mp4") and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():

@@ -82,7 +82,7 @@ def opened_source(
     paths: Sequence[Path],
     fps: float | None,
     cameras: CameraOptions | None = None,
-    warn: Callable[[str], None] = lambda line: None,
+    about: Callable[[Logged], None] = lambda source: None,
 ) -> Iterator[Logged]:
     """The frames of a recording, or of camera logs of others, from the first on.
 
@@ -90,7 +90,7 @@ def opened_source(
         paths: see `play_as_robot`.
         fps: frames a second of logs that tell none.
         cameras: what else is taken of camera logs of others, and how.
-        warn: told what the user should know of them.
+        about: given them once they are open, to say what they are.
 
     Raises:
         UsageError: there is no such log, or it is a run.
@@ -101,8 +101,7 @@ def opened_source(
     except UsageError as error:  # where --rate is how fast it is played
         raise UsageError(str(error).replace("with --rate", "with --fps")) from None
     with contextlib.closing(source):
-        for warning in source.warnings:
-            warn(warning)
+        about(source)
         yield source
 
 
@@ -111,7 +110,7 @@ def opened_feed(
     paths: Sequence[Path],
     fps: float | None = None,
     cameras: CameraOptions | None = None,
-    warn: Callable[[str], None] = lambda line: None,
+    about: Callable[[Logged], None] = lambda source: None,
 ) -> Iterator[Feed]:
     """The messages of a recording, or of camera logs of others; see `opened_source`.
 
@@ -129,7 +128,7 @@ def opened_feed(
             readers = [stack.enter_context(LogReader(file)) for file in files]
             yield LoggedFeed(readers, cameras.topics)
         else:
-            yield FrameFeed(stack.enter_context(opened_source(paths, fps, cameras, warn)))
+            yield FrameFeed(stack.enter_context(opened_source(paths, fps, cameras, about)))
 
 
 def _is_mcap(path: Path) -> bool:

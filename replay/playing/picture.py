@@ -14,6 +14,7 @@ import rerun as rr
 
 from cdmisfa.core.clock import NANOSECONDS
 from replay.camera_logs.options import CameraOptions
+from replay.inputs.opening import Logged
 from replay.playing.feed import frames_of, opened_source
 from replay.playing.pace import Played, paced, rounds
 from replay.view.columns import frames_column, line_column
@@ -35,7 +36,7 @@ def play_in_rerun(
     loop: bool = False,
     fps: float | None = None,
     cameras: CameraOptions | None = None,
-    warn: Callable[[str], None] = lambda line: None,
+    about: Callable[[Logged], None] = lambda source: None,
     port: int | None = None,
     announce: Callable[[str], None] = lambda address: None,
     stop: Callable[[], bool] = lambda: False,
@@ -48,7 +49,7 @@ def play_in_rerun(
         rate: how many seconds of the recording pass in one.
         fps: frames a second of logs that tell none, as folders of pictures.
         cameras: what is taken of camera logs of others; their rate is `fps`.
-        warn: told what the user should know of what is played frame by frame.
+        about: given what is played frame by frame before that, to say what it is.
         loop: begin again at the end, at a later time.
         port: to listen at; by default a free one.
         announce: called with the address.
@@ -62,7 +63,7 @@ def play_in_rerun(
     """
     played = Played()
     with contextlib.ExitStack() as stack:
-        source = stack.enter_context(opened_source(paths, fps, cameras, warn))
+        source = stack.enter_context(opened_source(paths, fps, cameras, about))
         spec, first, count = source.spec, source.t, source.frames
         recording = rr.RecordingStream(APPLICATION, recording_id=f"played-{os.getpid()}")
         recording.set_log_time_enabled(False)

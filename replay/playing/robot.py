@@ -10,6 +10,7 @@ from typing import Any, Final
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from replay.camera_logs.options import CameraOptions
+from replay.inputs.opening import Logged
 from replay.playing.feed import Feed, opened_feed
 from replay.playing.pace import SLICE, Played, paced, rounds
 
@@ -32,7 +33,7 @@ def play_as_robot(
     loop: bool = False,
     fps: float | None = None,
     cameras: CameraOptions | None = None,
-    warn: Callable[[str], None] = lambda line: None,
+    about: Callable[[Logged], None] = lambda source: None,
     port: int = PORT,
     wait: int = 1,
     say: Callable[[str], None] = lambda line: None,
@@ -49,7 +50,7 @@ def play_as_robot(
         rate: how many seconds of the recording pass in one.
         fps: frames a second of logs that tell none, as folders of pictures.
         cameras: what is taken of camera logs of others; their rate is `fps`.
-        warn: told what the user should know of what is played frame by frame.
+        about: given what is played frame by frame before that, to say what it is.
         loop: begin again at the end.
         port: to listen at; 0 for a free one.
         wait: begin once clients have subscribed to so many topics.
@@ -63,7 +64,7 @@ def play_as_robot(
         CdmisfaError: the port is taken.
     """
     played = Played()
-    with opened_feed(paths, fps, cameras, warn) as feed, _Robot(feed, port) as robot:
+    with opened_feed(paths, fps, cameras, about) as feed, _Robot(feed, port) as robot:
         say(f"playing at ws://{HOST}:{robot.port}{', once watched' if wait else ''}")
         while robot.watched < wait and not stop():
             time.sleep(SLICE / 10)

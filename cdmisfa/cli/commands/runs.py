@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import look_options, warn
+from cdmisfa.cli.cameras import look_options, say_about
 from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.experiments.documents import markdown
 
@@ -141,7 +141,7 @@ def export_command(
         raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
     chosen = CameraOptions(**cameras)
-    rows = export(path, out, form, force=force, lossless=lossless, cameras=chosen, warn=warn)
+    rows = export(path, out, form, force=force, lossless=lossless, cameras=chosen, about=say_about)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)

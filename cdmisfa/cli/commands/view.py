@@ -10,7 +10,14 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import look_options, number_options, range_option, tell, topic_option, warn
+from cdmisfa.cli.cameras import (
+    look_options,
+    number_options,
+    range_option,
+    say_about,
+    tell,
+    topic_option,
+)
 from cdmisfa.cli.commands.learn import announce
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import bar
@@ -229,7 +236,7 @@ def play_command(
                 rate=rate,
                 fps=fps,
                 cameras=cameras,
-                warn=warn,
+                about=say_about,
                 loop=loop,
                 port=PORT if port is None else port,
                 wait=1 if wait is None else wait,
@@ -245,7 +252,7 @@ def play_command(
                 rate=rate,
                 fps=fps,
                 cameras=cameras,
-                warn=warn,
+                about=say_about,
                 loop=loop,
                 port=port,
                 announce=announce,

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular
 from recorder.images.fields import NUMBERS_RECIPE, Field, bounded
@@ -34,6 +35,9 @@ MAX_ROWS: Final = 4 * 1024**2
 
 UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 """What a column of times may count, in nanoseconds."""
+
+_YEAR: Final = 365.25 * 24 * 3600
+"""In seconds."""
 
 
 class TableNumbers(ImageStream):
@@ -232,6 +236,15 @@ def _floats(column: Any) -> NDArray[np.float64]:
     return found
 
 
+def _unit_of(counted: NDArray[np.float64]) -> str:
+    """The unit in which times, (n,), are of 1971 to 2100; "ns" where none is."""
+    for unit, scale in UNITS.items():
+        seconds = counted * (scale / NANOSECONDS)
+        if seconds.min() >= _YEAR and seconds.max() < 130 * _YEAR:
+            return unit
+    return "ns"
+
+
 def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64] | None, str]:
     """When each row was, nanoseconds, -1 where nobody knows; and the name of the column."""
     if named is None:
@@ -266,7 +279,7 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64]
     if (np.abs(rough[known]) >= LAST_NS).any():
         raise UsageError(
             f"{path}: {name} holds times beyond any clock, counted in {unit}: say what they count, "
-            f"as --time {name}:ns"
+            f"as --time {name}:{_unit_of(rough[known] / scale)}"
         )
     if not known.any() or (rough[known] < 0).any():
         raise UsageError(f"{path}: {name} holds no times, or some before 1970: name another column")
