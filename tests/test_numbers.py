@@ -88,10 +88,37 @@ def test_what_is_no_number_is_refused_in_words(path: str, why: str) -> None:
 
 def test_what_is_not_finite_is_refused_or_kept_in_a_range() -> None:
     ranges = {"ranges": [0.5, float("inf"), float("nan"), 50.0, -1.0]}
-    with pytest.raises(LogDamagedError, match=r"holds inf at place 1.* as --range"):
+    with pytest.raises(UsageError, match=r"holds inf at place 1.* as --range"):
         numbers_of([Field("ranges")], ranges, None)
     kept = numbers_of([Field("ranges")], ranges, (0.1, 10.0))
     assert kept.tolist() == [0.5, 0.1, 0.1, 10.0, 0.1]
+
+
+def test_null_is_no_finite_number_and_a_missing_key_is_an_error() -> None:
+    message = {"a": None, "p": {"x": None}, "l": [1, None], "q": None}
+    for path in ("a", "p.x", "l", "q.x"):
+        with pytest.raises(UsageError, match=r"holds NaN or null at place .* as --range"):
+            numbers_of([Field(path)], message, None)
+    fields = [Field(path) for path in ("a", "p.x", "l", "q.x", "q[0]")]
+    assert numbers_of(fields, message, (-5, 9)).tolist() == [-5, -5, 1, -5, -5, -5]
+    with pytest.raises(UsageError, match="there is no a, it has no fields at all"):
+        numbers_of([Field("a")], {}, (0, 1))
+
+
+def test_whole_numbers_of_messages_that_are_rounded_are_said(tmp_path: Path) -> None:
+    def path(name: str, first: int) -> Path:
+        rows = (json.dumps({"a": i, "b": first + 9 * i}).encode() for i in range(9))
+        kind = MessageKind("n", "json")
+        return write_mcap(tmp_path / name, kind, {"/n": every(STEP, rows)})
+
+    for first, count in ((2**53 - 63, 1), (2**53 - 72, 0)):
+        with contextlib.closing(ForeignSource(path(f"{count}", first), fields=["a", "b"])) as log:
+            assert log.changes == {}
+            log.take(0, 9)
+            assert len(log.changes) == count
+            if count:
+                said = f"b holds {2**53 + 8}: whole numbers beyond 2^53 are rounded to float64"
+                assert log.changes[0].endswith(said)
 
 
 def angles(count: int = COUNT) -> np.ndarray:
@@ -273,7 +300,7 @@ def test_rows_without_a_number_are_left_out_and_a_pause_is_a_gap(tmp_path: Path)
         assert "22 of 90 rows lack a number or their time" in source.warnings[0]
         shown = source.take(0, 7).frames[:, 0]
         assert (shown == angles()[[0, 1, 2, 2, 4, 4, 6], 0]).all()
-    with pytest.raises(UsageError, match=r"row 7 lacks a number \(a holds no number\): name"):
+    with pytest.raises(UsageError, match=r"line 9 lacks a number \(a holds no number\): name"):
         ForeignSource(path, fields=["a"], rate=10)
 
 
@@ -294,7 +321,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     [
         ({}, "tells no rate: set one with --rate, or name the column of its times with --time"),
         ({"fields": ["z"], "rate": 5}, "there is no column z; it has s, a, word"),
-        ({"fields": ["word"], "rate": 5}, "row 0: --field word is no number but str"),
+        ({"fields": ["word"], "rate": 5}, "line 2: --field word is no number but str"),
         ({"time": "z"}, "there is no column z; it has s, a, word"),
         ({"time": "word"}, "word holds string, as 'x', neither numbers nor dates"),
         ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),
@@ -362,8 +389,8 @@ def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> No
 def test_a_table_that_is_none_is_damaged(tmp_path: Path) -> None:
     (tmp_path / "t.parquet").write_bytes(b"PAR1" + b"x" * 100)
     (tmp_path / "t.csv").write_bytes(b"a,b\n1,2\n1,2,3\n")
-    for name in ("t.parquet", "t.csv"):
-        with pytest.raises(LogDamagedError, match="PyArrow cannot read it"):
+    for name, why in (("t.parquet", "PyArrow cannot read it"), ("t.csv", "line 3 holds 3 cells")):
+        with pytest.raises(LogDamagedError, match=why):
             ForeignSource(tmp_path / name, rate=5)
 
 

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 from conftest import Cdmisfa
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from replay.camera_logs.formats.csv_table import line_of
 from replay.camera_logs.source import ForeignSource
 
 ROWS = 12
@@ -43,7 +45,7 @@ def test_words_for_what_is_missing_are_no_words(tmp_path: Path, cell: str) -> No
     frames, said = taken(written(tmp_path, {7: f"0.7,7,{cell}"}))
     assert frames == [[i, 2 * i + 0.5] for i in range(ROWS) if i != 7]
     assert len(said) == 1
-    assert said[0].endswith("t.csv: row 7 is left out: b holds no number")
+    assert said[0].endswith("t.csv: line 9 is left out: b holds no number")
 
 
 @pytest.mark.parametrize("cell", ["broken", "'1'", "1,2", "0x1F", "1.2.3", "12 V"])
@@ -51,14 +53,14 @@ def test_a_word_among_numbers_is_said_and_its_row_is_left_out(tmp_path: Path, ce
     path = written(tmp_path, {7: f'0.7,7," {cell}"', 9: "0.9,9,"})
     frames, said = taken(path)
     assert frames == [[i, 2 * i + 0.5] for i in range(ROWS) if i not in (7, 9)]
-    holds = f"b holds words, no numbers, in 1 of 12 rows, the first is {' ' + cell!r} in row 7"
+    holds = f"b holds words, no numbers, in 1 of 12 rows, the first is {' ' + cell!r} in line 9"
     assert [line.partition("t.csv: ")[2] for line in said] == [
         holds,
-        "2 of 12 rows lack a number or their time and are left out, the first is row 7: b holds "
+        "2 of 12 rows lack a number or their time and are left out, the first is line 9: b holds "
         f"{' ' + cell!r}",
     ]
     assert taken(path, fields=["a"])[1] == ()
-    with pytest.raises(UsageError, match=r"row 7 lacks a number \(b holds"):
+    with pytest.raises(UsageError, match=r"line 9 lacks a number \(b holds"):
         taken(path, time=None, rate=5)
 
 
@@ -67,8 +69,8 @@ def test_a_column_of_words_is_left_out_and_said_where_it_has_numbers(tmp_path: P
     frames, said = taken(path)
     assert frames == [[i] for i in range(ROWS)]
     (line,) = said
-    assert line.endswith("in 6 of 12 rows, the first is 'ok' in row 2, and is left out")
-    with pytest.raises(UsageError, match="row 0: --field b is no number but str"):
+    assert line.endswith("in 6 of 12 rows, the first is 'ok' in line 4, and is left out")
+    with pytest.raises(UsageError, match="line 2: --field b is no number but str"):
         taken(path, fields=["b"])
     assert taken(written(tmp_path, {i: f"{i / 10},{i},ok" for i in range(ROWS)}))[1] == ()
 
@@ -76,10 +78,10 @@ def test_a_column_of_words_is_left_out_and_said_where_it_has_numbers(tmp_path: P
 def test_a_row_of_units_and_a_time_that_is_none_are_left_out(tmp_path: Path) -> None:
     frames, said = taken(written(tmp_path, {0: "[s],[rad],[m]", 5: "late,5,1", 6: ",6,1"}))
     assert [a for a, _ in frames] == [1, 2, 3, 4, 7, 8, 9, 10, 11]
-    assert "t holds words, no numbers, in 2 of 12 rows, the first is '[s]' in row 0" in said[0]
+    assert "t holds words, no numbers, in 2 of 12 rows, the first is '[s]' in line 2" in said[0]
     assert said[-1].endswith(
         "3 of 12 rows lack a number or their time and are left out, the first "
-        "is row 0: a holds '[rad]'"
+        "is line 2: a holds '[rad]'"
     )
 
 
@@ -94,13 +96,14 @@ def test_what_is_not_finite_is_left_out_by_its_name_or_kept_in_a_range(
         path.write_text("t,a\n" + "".join(f"{i / 10},{a}\n" for i, a in enumerate(values)))
     else:
         pq.write_table(pa.table({"t": np.arange(ROWS) / 10, "a": values}), path)
+    place = "line 5" if path.suffix == ".csv" else "row 3"
     frames, said = taken(path)
     assert [a for (a,) in frames] == [*range(-4, -1), *range(8)]
-    assert said[0].endswith("row 3 is left out: a holds inf, which is not finite")
+    assert said[0].endswith(f"{place} is left out: a holds inf, which is not finite")
     kept, said = taken(path, depth=(-3.0, 5.0))
     assert [a for (a,) in kept] == [-3, -3, -2, -3, *range(6), 5, 5]
     assert said == ()
-    with pytest.raises(UsageError, match=r"row 3 lacks a number \(a holds inf"):
+    with pytest.raises(UsageError, match=rf"{place} lacks a number \(a holds inf"):
         taken(path, time=None, rate=5)
 
 
@@ -126,6 +129,20 @@ def test_semicolons_tabs_and_decimal_commas_are_read(
         ("t,a\xb5\n0,1\n", {}, UsageError, "its line of names is no UTF-8: save it as CSV UTF-8"),
         ("t,a\n1.2.24 10:00,1\n", {}, UsageError, r"t holds string, as '1.2.24 10:00', neither"),
         ("t,a\nx,y\n", {"time": None, "rate": 5}, UsageError, "but t of string, a of string"),
+        ("0.0,1\n0.1,2\n", {}, UsageError, "its first line, 0.0,1, holds numbers, no names: write"),
+        ("0,0;1\n0,1;2\n", {}, UsageError, "its first line, 0,0;1, holds numbers, no names: write"),
+        ("t,a,a\n0,1,2\n", {}, UsageError, "two columns are called 'a': rename one of them"),
+        (
+            "t,a\n0,1\n\n1\n2,3\n",
+            {},
+            LogDamagedError,
+            "line 4 holds a cell, '1', and .* 2 cells: m",
+        ),
+        ("t,a\n0,1\n1,2,3", {}, LogDamagedError, "line 3 holds 3 cells, '1,2,3', and .* 2 cells"),
+        ("t,a\n0,1\n1\n", {}, LogDamagedError, "line 3 holds a cell, '1', and .*: mend the line"),
+        ("t,a\n0,1\n\xff,2,3\n", {}, LogDamagedError, "line 3 holds 3 cells, '\ufffd,2,3', and"),
+        ("# a log\nt,a\n0,1\n", {}, UsageError, "line 2 holds 2 cells.*: leave out the comment"),
+        ("t,a\n0,\n1,\n", {"fields": ["a"]}, UsageError, "a is empty in every row: leave it out"),
         ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "1e.09 rows a second.*--time COL"),
         ("t,a\n0,1\n.1,2\n.2,3\n", {"time": "t:ns"}, UsageError, "say what its times count, as"),
     ],
@@ -137,6 +154,87 @@ def test_what_is_wrong_with_a_table_is_said(
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(error, match=why):
         taken(path, **options)
+
+
+def test_a_last_line_that_was_cut_is_left_out_and_said(tmp_path: Path) -> None:
+    path = written(tmp_path, {}, names="\ufefft,a,\xb5")
+    path.write_text(path.read_text() + "1.2,1")
+    frames, said = taken(path)
+    assert frames == [[i, 2 * i + 0.5] for i in range(ROWS)]
+    (line,) = said
+    assert line.endswith(
+        "t.csv: line 14 holds 2 cells, '1.2,1', and the line of names 3 cells: the file was cut "
+        "there, and the line is left out"
+    )
+
+
+def test_lines_are_counted_as_an_editor_does(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_bytes(b't,a,w\r\n0,0,x\r\n\r\n.1,1,"two\r\nlines"\r\n.2,,5" pipe\r\n.3,3,x\r\n')
+    assert [line_of(path, row) for row in range(4)] == [2, 4, 6, 7]
+    semicolons = tmp_path / "s.csv"
+    semicolons.write_bytes(path.read_bytes().replace(b",", b";"))
+    assert [line_of(semicolons, row) for row in range(4)] == [2, 4, 6, 7]
+    assert taken(path)[1][0].endswith("t.csv: line 6 is left out: a holds no number")
+
+
+def test_an_empty_column_and_rows_out_of_order_are_said(tmp_path: Path) -> None:
+    rows = {i: f"{i / 10},,{i}" for i in range(ROWS)}
+    rows |= {4: "0.7,,7", 7: "0.4,,4", 9: "0.9,,"}
+    frames, said = taken(written(tmp_path, rows))
+    assert [b for (b,) in frames] == [i for i in range(ROWS) if i != 9]
+    assert [line.partition("t.csv: ")[2] for line in said[:3]] == [
+        "a is empty in every row, and is left out",
+        "line 11 is left out: b holds no number",
+        "rows that stand after later ones: 3 of 11, the first is line 7; they are taken in the "
+        "order of t",
+    ]
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_what_is_missing_is_left_out_and_is_not_the_end_of_a_range(
+    tmp_path: Path, name: str
+) -> None:
+    values: list[Any] = [*range(ROWS)]
+    values[3], values[5] = None, float("inf")
+    path = tmp_path / name
+    if path.suffix == ".csv":
+        cells = ["" if v is None else v for v in values]
+        path.write_text("t,a\n" + "".join(f"{i / 10},{a}\n" for i, a in enumerate(cells)))
+    else:
+        pq.write_table(pa.table({"t": np.arange(ROWS) / 10, "a": values}), path)
+    kept, said = taken(path, depth=(1.0, 8.0), gaps="hold", align="index")
+    assert [a for (a,) in kept] == [1, 1, 2, 4, 1, 6, 7, 8, 8, 8, 8]
+    place = "line 5" if path.suffix == ".csv" else "row 3"
+    assert said[0].endswith(f"{place} is left out: a holds no number")
+    with pytest.raises(UsageError, match=f"{place} lacks a number.*so that it can be left out$"):
+        taken(path, time=None, rate=5, depth=(1.0, 8.0))
+
+
+def test_distances_in_a_list_that_were_not_measured_are_the_end_of_a_range(tmp_path: Path) -> None:
+    lists = [[1.0, None], [np.nan, 2.0], None, [3.0, np.inf]]
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"t": np.arange(4) / 10, "r": lists}), path)
+    kept, said = taken(path, fields=["r"], depth=(0.5, 9.0), align="index")
+    assert kept == [[1, 0.5], [0.5, 2], [3, 0.5]]
+    assert said[0].endswith("row 2 is left out: r holds no number")
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_whole_numbers_that_float64_rounds_are_said(tmp_path: Path, name: str) -> None:
+    big = [2**53 + i for i in range(ROWS)]
+    table = pa.table({"t": np.arange(ROWS) / 10, "a": big, "b": range(ROWS)})
+    (pa_csv.write_csv if name == "t.csv" else pq.write_table)(table, tmp_path / name)
+    said = taken(tmp_path / name)[1]
+    assert [line.partition(": ")[2] for line in said] == [
+        "a holds whole numbers beyond 2^53, which are rounded to float64"
+    ]
+    assert taken(tmp_path / name, fields=["b"])[1] == ()
+    assert taken(tmp_path / name, depth=(0, 9))[1] == ()
+    if name == "t.parquet":  # they were rounded before
+        floats = pa.table({"t": np.arange(ROWS) / 10, "a": [1e300] * ROWS})
+        pq.write_table(floats, tmp_path / name)
+        assert taken(tmp_path / name)[1] == ()
 
 
 @pytest.mark.parametrize(
@@ -163,7 +261,7 @@ def test_a_field_that_is_none_is_named_as_it_was_written(
 
 def test_commands_take_tables_and_say_what_was_left_out(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     path = written(tmp_path, {7: "0.7,7,broken"})
-    left_out = f"warning: {path}: row 7 is left out: b holds 'broken'"
+    left_out = f"warning: {path}: line 9 is left out: b holds 'broken'"
     outs = {name: tmp_path / name for name in ("set", "rec", "v.rrd")}
     every = [
         ["learn", path, "--time", "t", "--range", "-3:3", "--dry-run"],

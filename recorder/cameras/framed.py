@@ -8,6 +8,7 @@ from typing import Any
 
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.camera import Camera
+from recorder.images.fields import rounded
 from recorder.images.framing import Fit, Framing, Size, Vector, framings, size_of
 from recorder.images.pixels import Shown
 
@@ -80,7 +81,7 @@ class FramedCamera:
             framing = self._framing = self._framing or self._begun(image)
             if framing is None:
                 continue
-            if not self._changed and (change := framing.change(image.shape)):
+            if not self._changed and (change := framing.change(image.shape) or _rounded(image)):
                 self._changed = True
                 self._say(f"{self.name}: {change}")
             try:
@@ -107,3 +108,8 @@ class FramedCamera:
             frames.numbers = frames.numbers or framing
             frames.numbers.frame(first)
         return framing
+
+
+def _rounded(image: Shown) -> str:
+    """What the user should know of numbers that are held rounded; "" of images."""
+    return rounded((), image) if image.ndim == 1 else ""

@@ -20,6 +20,9 @@ NUMBERS_RECIPE: Final = "numbers as they are, float64"
 MOST: Final = 100_000
 """Most numbers that a message may give."""
 
+EXACT: Final = 2.0**53
+"""Up to here float64 holds every whole number."""
+
 _STEP: Final = re.compile(r"\.?([^.\[\]]+)|\[(\d{1,9})\]|\[(\d{0,9}):(\d{0,9})\]")
 
 _Step = str | int | slice
@@ -69,7 +72,7 @@ class Field:
         return str(self._steps[0])
 
     def numbers(self, message: Any) -> list[float]:
-        """What stands there in a message.
+        """What stands there in a message; NaN where that is null.
 
         Raises:
             UsageError: there is no such field, or what is there is no number.
@@ -80,6 +83,8 @@ class Field:
 
     def _value(self, value: Any, steps: Sequence[_Step]) -> Any:
         for place, step in enumerate(steps):
+            if value is None and not isinstance(step, slice):
+                return None
             if isinstance(step, str) and _is_list(value):
                 return [self._value(member, steps[place:]) for member in value]
             value = self._member(value, step)
@@ -89,7 +94,9 @@ class Field:
         if isinstance(step, str):
             names = members(value)
             if step not in names:
-                there = f"it has {', '.join(names)}" if names else "it is no message"
+                there = "it is no message"
+                if names or isinstance(value, Mapping):
+                    there = f"it has {', '.join(names) or 'no fields at all'}"
                 raise UsageError(f"--field {self.path}: there is no {step}, {there}")
             return field_value(value, step)
         if not _is_list(value):
@@ -110,8 +117,9 @@ def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> N
         bounds: what they are kept in; what is no finite number becomes the first of them.
 
     Raises:
-        UsageError: a field is not there, or is no number.
-        MalformedImage: one is not finite, and there are no bounds.
+        UsageError: a field is not there, or is no number, or one that is not finite, and there
+            are no bounds.
+        MalformedImage: a field is of no size that is read.
     """
     found: list[float] = []
     for field in fields:
@@ -121,8 +129,9 @@ def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> N
             raise MalformedImage(f"--field {field.path} is of no size that is read") from None
         if bounds is None and not np.isfinite(own).all():
             place = int(np.flatnonzero(~np.isfinite(own))[0])
-            raise MalformedImage(
-                f"--field {field.path} holds {own[place]} at place {place}, which is no finite "
+            held = "NaN or null" if np.isnan(own[place]) else own[place]
+            raise UsageError(
+                f"--field {field.path} holds {held} at place {place}, which is no finite "
                 "number: leave it out, or keep numbers in a range, as --range 0.1:10"
             )
         found += own
@@ -136,6 +145,20 @@ def bounded(numbers: Numbers, bounds: Depth | None) -> Numbers:
     if bounds is None:
         return numbers
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
+
+
+def rounded(fields: Sequence[str], numbers: Numbers) -> str:
+    """What the user should know of numbers, (I,), that float64 may hold rounded; "" of others.
+
+    Args:
+        fields: what their fields are called.
+        numbers: of a message, finite.
+    """
+    if not len(numbers) or np.abs(numbers).max() <= EXACT:
+        return ""
+    place = int(np.argmax(np.abs(numbers) > EXACT))
+    name = fields[place] if len(fields) == len(numbers) else ", ".join(fields) or "a message"
+    return f"{name} holds {numbers[place]:.17g}: whole numbers beyond 2^53 are rounded to float64"
 
 
 def members(value: Any) -> list[str]:
@@ -160,7 +183,9 @@ def _is_list(value: Any) -> bool:
 
 
 def _collect(value: Any, path: str, found: list[float]) -> None:
-    if isinstance(value, bool | int | float | np.generic):
+    if value is None:
+        found.append(np.nan)
+    elif isinstance(value, bool | int | float | np.generic):
         found.append(float(value))
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
         found += value.astype(np.float64).reshape(-1).tolist()

@@ -36,6 +36,7 @@ class JoinedImages(ImageStream):
         joined = f"{path}: {self.topic} is joined from {len(parts)} logs, by time"
         self.warnings = [joined, *warnings] if len(parts) > 1 else [*warnings]
         self.warnings += [warning for part in parts for warning in part.warnings]
+        self.told_rounded = all(part.told_rounded for part in parts)
         self.parts = [log for part in parts for log in getattr(part, "parts", [part])]
         self._streams = list(parts)
         self.decode = getattr(parts[0], "decode", None)

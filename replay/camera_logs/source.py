@@ -12,6 +12,7 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.fields import rounded
 from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
 from recorder.images.pixels import Depth, Shown, UnknownPixels
@@ -83,8 +84,8 @@ class ForeignSource(LoggedSource):
         gaps: whether streams lack frames: then `take` gives the next n that follow one another.
         pauses: for each stream the frames [start, stop) of its gaps.
         shapes: for each stream how an image becomes a frame, in words.
-        changes: for each stream whose images change their size, a line that says so; as soon as
-            one was shown.
+        changes: for each stream whose images change their size, or whose numbers are held
+            rounded, a line that says so; as soon as one was shown.
         warnings: what the user should know: logs that were cut, damage that was left out, images
             that are shown at other times than their own.
     """
@@ -291,8 +292,13 @@ class ForeignSource(LoggedSource):
             return shown[1]
         image = self._image(stream, row)
         framing = self._framings[stream]
-        if stream not in self.changes and (change := framing.change(image.shape)):
-            self.changes[stream] = f"{self._streams[stream].where(row)}: {change}"
+        if stream not in self.changes:
+            images = self._streams[stream]
+            change = framing.change(image.shape)
+            if image.ndim == 1 and not images.told_rounded:
+                change = rounded(images.fields, image)
+            if change:
+                self.changes[stream] = f"{images.where(row)}: {change}"
         try:
             frame = framing.frame(image)
         except UsageError as error:

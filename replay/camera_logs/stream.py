@@ -67,6 +67,7 @@ class ImageStream(ABC):
         recipe: how an image becomes a frame, for the record.
         fields: the numbers that are taken instead of images, in their order.
         warnings: what the user should know: what was cut or left out.
+        told_rounded: whether warnings say of every number that is held rounded.
     """
 
     path: Location
@@ -76,6 +77,7 @@ class ImageStream(ABC):
     recipe: str = RECIPE
     fields: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    told_rounded: bool = False
 
     @property
     def count(self) -> int:

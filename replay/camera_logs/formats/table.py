@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular
-from recorder.images.fields import NUMBERS_RECIPE, Field, bounded
+from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
 from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, Reading
-from replay.camera_logs.formats.csv_table import Words, read_csv
+from replay.camera_logs.formats.csv_table import Words, line_of, read_csv
 from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,
@@ -48,7 +48,8 @@ class TableNumbers(ImageStream):
     column `reading.time`: dates, or numbers of seconds, or of another unit as in `stamp:ns`.
     Without it the rows are at an even rate.
 
-    Rows without a finite number or a time are left out.
+    Rows without a number or a time are left out, and those with one that is not finite where
+    numbers are kept in no range.
 
     Raises:
         UsageError: no such column, or no numbers in it.
@@ -56,31 +57,38 @@ class TableNumbers(ImageStream):
     """
 
     recipe = NUMBERS_RECIPE
+    told_rounded = True
 
     def __init__(self, path: Path, topic: str | None, reading: Reading = IMAGES) -> None:
-        self.path, self.topic = path, path.stem
+        self.path = self._file = path
+        self.topic = path.stem
         self.encoding = path.suffix[1:]
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a table has no topics, leave {topic} out; see --field")
-        table, words = _table(path)
+        table, words, notes = _table(path)
         if not table.num_rows:
             raise UsageError(f"{path}: it has names of columns, and no rows")
         times, of_times = _times(path, table, reading.time)
-        numeric = [n for n in table.column_names if _is_numeric(table[n]) and n != of_times]
-        names = reading.fields or numeric
+        empty = [n for n in table.column_names if table[n].null_count == table.num_rows]
+        numeric = [n for n in table.column_names if _is_numeric(table[n])]
+        names = reading.fields or [n for n in numeric if n not in (of_times, *empty)]
         if not names:
             raise UsageError(f"{path}: it has no column of numbers{_said_instead(table)}")
         with arrow_explained(path, remedy="take fewer columns, with --field"):
             columns = [_column(path, table, name) for name in names]
-        numbers = bounded(np.concatenate(columns, axis=1), reading.depth)
-        whole = np.all(np.isfinite(numbers), axis=1)
+        numbers = np.concatenate(columns, axis=1)
+        # What is missing is beyond no bounds.
+        known = ~np.any([np.isnan(own).all(axis=1) for own in columns], axis=0)
+        whole = known & (np.isfinite(numbers).all(axis=1) | (reading.depth is not None))
+        numbers = bounded(numbers, reading.depth)
         lacks = partial(_lacking, table, words, names, columns)
         if times is None:
             if not whole.all():
                 row = int(np.argmin(whole))
                 raise UsageError(
-                    f"{path}: row {row} lacks a number ({lacks(row)}): name the column of its "
-                    "times with --time, so that it can be left out, or keep numbers in a range"
+                    f"{path}: {_called(path, row)} lacks a number ({lacks(row)}): name the column "
+                    "of its times with --time, so that it can be left out"
+                    f"{', or keep numbers in a range, with --range' if known[row] else ''}"
                 )
             times = np.empty(0, np.int64)
         else:
@@ -91,8 +99,10 @@ class TableNumbers(ImageStream):
         self.fields = tuple(names)
         if not len(self._numbers):
             raise UsageError(f"{path}: there is no row with all of {', '.join(names)}")
+        late = self._places[:0]
         if len(times):
-            if (np.diff(times) < 0).any():
+            late = self._places[times < np.maximum.accumulate(times)]
+            if len(late):
                 order = np.argsort(times, kind="stable")
                 times = times[order]
                 self._numbers, self._places = self._numbers[order], self._places[order]
@@ -100,15 +110,28 @@ class TableNumbers(ImageStream):
         else:
             self.times = np.empty(0, np.uint64)
         used = {of_times, *names} if reading.fields else set(table.column_names)
-        self.warnings = [f"{path}: {said}" for name, said in words.items() if name in used]
+        self.warnings = [*notes]
+        self.warnings += [f"{path}: {said}" for name, said in words.items() if name in used]
+        if not reading.fields:
+            self.warnings += [f"{path}: {n} is empty in every row, and is left out" for n in empty]
+        self.warnings += [
+            f"{path}: {name} holds whole numbers beyond 2^53, which are rounded to float64"
+            for name, own in zip(names, columns, strict=True)
+            if _has_digits(path, table, name) and _beyond(bounded(own[whole], reading.depth))
+        ]
         left = len(whole) - len(self._numbers)
         if left:
             row = int(np.argmin(whole))
-            rows = f"row {row} is left out"
+            rows = f"{_called(path, row)} is left out"
             if left > 1:
                 rows = f"{left} of {len(whole)} rows lack a number or their time and are left out"
-                rows += f", the first is row {row}"
+                rows += f", the first is {_called(path, row)}"
             self.warnings += [f"{path}: {rows}: {lacks(row)}"]
+        if len(late):
+            self.warnings += [
+                f"{path}: rows that stand after later ones: {len(late)} of {len(times)}, the first "
+                f"is {_called(path, late[0])}; they are taken in the order of {of_times}"
+            ]
 
     @property
     def count(self) -> int:
@@ -119,7 +142,7 @@ class TableNumbers(ImageStream):
         return shown
 
     def where(self, row: int) -> str:
-        return f"{self.path}: row {self._places[row]}"
+        return f"{self.path}: {_called(self._file, int(self._places[row]))}"
 
     def close(self) -> None:
         """Do nothing: no file stays open."""
@@ -132,7 +155,7 @@ def is_table(path: Path) -> bool:
 
 def table_channels(path: Path) -> list[ChannelFacts]:
     """What is in each column of a table; raises as `TableNumbers`."""
-    (table, _), kind = _table(path), path.suffix[1:]
+    (table, _, _), kind = _table(path), path.suffix[1:]
     return [
         ChannelFacts(n, kind, str(c.type), len(c) - c.null_count, None, None, images=False)
         for n, c in zip(table.column_names, table.columns, strict=True)
@@ -141,30 +164,53 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 
 def table_notes(path: Path) -> list[str]:
     """What the user should know of a table that can be read; raises as `TableNumbers`."""
-    table, words = _table(path)
+    table, words, notes = _table(path)
     return [
+        *notes,
         *(f"{path}: {said}" for said in words.values()),
         f"{path}: {table.num_rows} rows of {table.num_columns} columns can be read; a table has "
         "no checksums, changed numbers would go unnoticed",
     ]
 
 
-def _table(path: Path) -> tuple[Any, dict[str, Words]]:
-    """A table, and of its columns of numbers those with words."""
+def _called(path: Path, row: int) -> str:
+    """What a row is called: the line of a CSV file, from 1; of others the row, from 0."""
+    return f"line {line_of(path, row)}" if path.suffix.lower() == ".csv" else f"row {row}"
+
+
+def _has_digits(path: Path, table: Any, name: str) -> bool:
+    """Whether the file may hold a field more exactly than float64 does."""
+    import pyarrow.types as kinds
+
+    if path.suffix.lower() == ".csv":
+        return True
+    kind = table[name if name in table.column_names else Field(name).first].type
+    while kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind):
+        kind = kind.value_type
+    return not kinds.is_floating(kind)
+
+
+def _beyond(numbers: NDArray[np.float64]) -> bool:
+    """Whether a whole number may be rounded among some, all of which are finite."""
+    return bool((np.abs(numbers) > EXACT).any())
+
+
+def _table(path: Path) -> tuple[Any, dict[str, Words], list[str]]:
+    """A table, of its columns of numbers those with words, and what else is to be known."""
     check_regular(path, MAX_BYTES)
     with arrow_explained(path, remedy="write fewer columns or rows into a file"):
         if path.suffix.lower() == ".csv":
-            table, words = read_csv(path)
+            table, words, notes = read_csv(path)
         else:
             import pyarrow.parquet
 
-            table, words = pyarrow.parquet.ParquetFile(path).read(), {}
+            table, words, notes = pyarrow.parquet.ParquetFile(path).read(), {}, []
         if table.num_rows > max(MAX_ROWS, path.stat().st_size):
             raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for its few bytes")
         twice = [n for n in table.column_names if table.column_names.count(n) > 1]
         if twice:
-            raise LogDamagedError(f"{path}: two columns are called {twice[0]!r}")
-        return table, words
+            raise UsageError(f"{path}: two columns are called {twice[0]!r}: rename one of them")
+        return table, words, notes
 
 
 def _said_instead(table: Any) -> str:
@@ -204,27 +250,27 @@ def _column(path: Path, table: Any, name: str) -> NDArray[np.float64]:
     Raises:
         UsageError: there is none in the table, or no number in it.
     """
-    if name in table.column_names and _is_numeric(table[name]):
-        return _floats(table[name])[:, None]
-    field = Field(name)
-    first = next((n for n in (name, field.first) if n in table.column_names), None)
-    if first is None:
+    field = Field.named(name) if name in table.column_names else Field(name)
+    first = field.first
+    if first not in table.column_names:
         there = ", ".join(table.column_names[:20])
         raise UsageError(f"{path}: there is no column {name}; it has {there}")
-    if first == name:  # whatever its name is made of
-        field = Field.named(name)
+    if table[first].null_count == len(table[first]):
+        raise UsageError(f"{path}: {first} is empty in every row: leave it out")
+    if first == name and _is_numeric(table[name]):
+        return _floats(table[name])[:, None]
     found: list[list[float] | None] = []
     for place, value in enumerate(table[first].to_pylist()):
         try:
             found.append(None if value is None else field.numbers({first: value}))
         except UsageError as error:
-            raise UsageError(f"{path}: row {place}: {error}") from None
+            raise UsageError(f"{path}: {_called(path, place)}: {error}") from None
     size = next((len(own) for own in found if own is not None), 1)
     for place, own in enumerate(found):
         if own is not None and len(own) != size:
             raise UsageError(
-                f"{path}: {name} holds {size} numbers, and {len(own)} in row {place}: choose a "
-                f"part of it, as --field {field.first}[0:{min(len(own), size)}]"
+                f"{path}: {name} holds {size} numbers, and {len(own)} in {_called(path, place)}: "
+                f"choose a part of it, as --field {field.first}[0:{min(len(own), size)}]"
             )
     return np.array([[np.nan] * size if own is None else own for own in found], np.float64)
 
