@@ -110,6 +110,17 @@ def test_a_video_is_shown_again_from_the_next_whole_picture(tmp_path: Path) -> N
             source.take(0, 1)
 
 
+def test_pictures_of_a_lost_one_are_not_made_up(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    packets = video("h264")[: 2 * GROUP] + video("h264")[2 * GROUP + 1 :]
+    messages = [foxglove(packet, "h264") for packet in packets]
+    path = write_mcap(tmp_path / "a.mcap", FOXGLOVE, {"/cam": every(STEP, messages)})
+    with contextlib.closing(ForeignSource(path, size=SIZE)) as source:
+        source.seek(2 * GROUP)
+        with pytest.raises(LogDamagedError, match="is broken there, or one that it needs: learn"):
+            source.take(0, 1)
+
+
 def film(path: Path, packets: Sequence[bytes]) -> tuple[int, int]:
     """Write a film of packets of H.264; gives place and size of the one of frame 17."""
     av: Any = pytest.importorskip("av")

@@ -87,8 +87,10 @@ class VideoPackets:
                 "a picture of its video waits for later ones (B-frames), which messages of one "
                 "picture each rule out: encode it without them, or take it as an .mp4 file"
             )
-        if len(frames) != 1 or frames[0].is_corrupt:
-            raise MalformedImage(f"{len(frames)} pictures of its video can be shown there, not 1")
+        if len(frames) > 1:
+            raise MalformedImage(f"its message holds {len(frames)} pictures of its video, not 1")
+        if not frames or frames[0].is_corrupt:
+            raise MalformedImage("a picture of its video is broken there, or one that it needs")
         return self._shown(frames[0])
 
     def _of(self, codec: str, av: Any) -> Any:

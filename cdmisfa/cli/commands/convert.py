@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 @uploads.out("Folder of the recording, or s3://...; --dry-run needs none.")
 @camera_options
 @live_options
-@click.option("--salvage", is_flag=True, help="Pass over damaged parts of a log.")
+@click.option("--salvage", is_flag=True, help="Pass over damaged parts and images of a log.")
 @click.option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
 @options.server_limits
 @options.fsync_every

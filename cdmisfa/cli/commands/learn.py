@@ -65,7 +65,7 @@ TICK = 0.1
 )
 @click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
 @click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
-@click.option("--salvage", is_flag=True, help="Pass over damaged parts of a recording or log.")
+@click.option("--salvage", is_flag=True, help="Pass over damaged parts and images of a log.")
 @click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
 @click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
 @click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
