@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from cdmisfa.cli.progress import Bar, compiling_said
+from cdmisfa.core.arithmetic import kept
 from cdmisfa.core.arithmetic.compiled import before_compiling, compiled
 from cdmisfa.core.arithmetic.kept import MARKS
 
@@ -294,3 +296,11 @@ def test_the_wait_for_compiling_is_said_without_a_terminal(
     with compiling_said(Bar()):
         numba.njit(lambda x: x + 1)(1)
     assert capsys.readouterr().err.startswith("compiling for this machine")
+
+
+def test_another_version_of_the_compiler_keeps_what_it_compiles_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert metadata.version("numba").startswith(kept.NUMBA)  # else: is kept code run as before?
+    monkeypatch.setattr(kept, "_versions", lambda: ("3.11", "0.69.0", "0.51.0", "2.4.6"))
+    assert not kept.runs_alone.__wrapped__()

@@ -29,6 +29,10 @@ MARKS = (
 """What files contain that hold compiled functions, or say how they are kept."""
 
 
+NUMBA = "0.68."
+"""What the versions of numba begin with whose machine code is run without it."""
+
+
 def kept_while_sources_last(dispatcher: Any) -> Any:
     """Let a result on disk count only as long as no compiled function has changed.
 
@@ -58,10 +62,11 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
 def runs_alone() -> bool:
     """Whether machine code is kept here, and run without the compiler: where this was tested.
 
-    Not where numba was told of more than folders and threads: it may be to profile what runs, or
+    It takes what the compiler made from where this version of it has that. Not where numba was told of more than folders and threads: it may be to profile what runs, or
     to compile nothing. Then it keeps what it compiles itself.
     """
-    return sys.platform == "linux" and platform.machine() == "x86_64" and not any(_told())
+    here = sys.platform == "linux" and platform.machine() == "x86_64"
+    return here and _versions()[1].startswith(NUMBA) and not any(_told())
 
 
 def folder_of(source: Path) -> Path | None:
