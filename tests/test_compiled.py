@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from cdmisfa.cli.progress import Bar, compiling_said
-from cdmisfa.core.arithmetic import kept
 from cdmisfa.core.arithmetic.compiled import before_compiling, compiled
-from cdmisfa.core.arithmetic.kept import MARKS
+from cdmisfa.core.arithmetic.kept import MARKS, NUMBA, runs_alone
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -301,6 +300,7 @@ def test_the_wait_for_compiling_is_said_without_a_terminal(
 def test_another_version_of_the_compiler_keeps_what_it_compiles_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert metadata.version("numba").startswith(kept.NUMBA)  # else: is kept code run as before?
-    monkeypatch.setattr(kept, "_versions", lambda: ("3.11", "0.69.0", "0.51.0", "2.4.6"))
-    assert not kept.runs_alone.__wrapped__()
+    assert metadata.version("numba").startswith(NUMBA)  # else: is kept code run as before?
+    other = ("3.11", "0.69.0", "0.51.0", "2.4.6")
+    monkeypatch.setattr("cdmisfa.core.arithmetic.kept._versions", lambda: other)
+    assert not runs_alone.__wrapped__()

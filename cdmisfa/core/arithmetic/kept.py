@@ -62,8 +62,9 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
 def runs_alone() -> bool:
     """Whether machine code is kept here, and run without the compiler: where this was tested.
 
-    It takes what the compiler made from where this version of it has that. Not where numba was told of more than folders and threads: it may be to profile what runs, or
-    to compile nothing. Then it keeps what it compiles itself.
+    It takes what the compiler made from where these versions of it have that. Not where numba was
+    told of more than folders and threads: it may be to profile what runs, or to compile nothing.
+    Then it keeps what it compiles itself.
     """
     here = sys.platform == "linux" and platform.machine() == "x86_64"
     return here and _versions()[1].startswith(NUMBA) and not any(_told())
