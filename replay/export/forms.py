@@ -131,16 +131,17 @@ def _export_recording(
     if holds_run(path):
         raise UsageError(f"{path} is a run, {form} is for recordings: name the recording")
     with contextlib.closing(open_to_look(paths, cameras)) as source:
-        about(source)
         if form in ("images", "mp4") and not source.spec.images:
             raise UsageError(f"{path} holds no images: its frames are values")
         if form == "mp4" and out.suffix == ".mp4" and not out.is_dir():
             if len(source.spec.streams) > 1:
                 raise UsageError(f"{path} has several views: name a folder, not {out.name}")
+            about(source)
             with whole(out) as film:
                 write_film(source, 0, film, lossless=lossless)
             return source.frames
         _refuse_others(out)
+        about(source)
         options: dict[str, Any] = {"lossless": lossless} if FORMS[form].lossy else {}
         if form == "lerobot":
             options["name"] = out.name
