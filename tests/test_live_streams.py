@@ -411,7 +411,9 @@ def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
     rec = str(tmp_path / "rec")
     options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
     words = [f"{robot.address}/words", "--field", "k"]
-    run = cdmisfa("learn", *words, "--record", rec, *options).json
+    learned = cdmisfa("learn", *words, "--record", rec, *options)
+    assert (" messages;" in learned.err, "pictures" in learned.err) == (True, False)
+    run = learned.json
     assert run["source"]["fields"] == ["k"]
     assert cdmisfa("learn", rec, *options).json["signals_sha256"] == run["signals_sha256"]
     with contextlib.closing(RecordedSource(rec)) as source:

@@ -217,11 +217,12 @@ def warn(line: str) -> None:
 
 
 def say_counts(source: FrameSource) -> None:
-    """Say on stderr what became of each live stream's pictures."""
+    """Say on stderr what became of each live stream's pictures, or messages with numbers."""
+    what = "pictures" if source.spec.images else "messages"
     for name, counts in getattr(source, "alignment", {}).items():
         tell(
-            f"{name}: {counts['messages']} pictures; {counts['repeated']} frames repeated, "
-            f"{counts['missing']} missing; pictures: {counts['dropped']} between frames, "
+            f"{name}: {counts['messages']} {what}; {counts['repeated']} frames repeated, "
+            f"{counts['missing']} missing; {what}: {counts['dropped']} between frames, "
             f"{counts['late']} late, {counts['disordered']} out of order, {counts['lost']} thrown "
             "away"
         )
