@@ -156,7 +156,7 @@ def test_what_is_wrong_with_a_table_is_said(
         taken(path, **options)
 
 
-def test_a_last_line_that_was_cut_is_left_out_and_said(tmp_path: Path) -> None:
+def test_a_last_line_that_was_cut_is_left_out_and_said(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     path = written(tmp_path, {}, names="\ufefft,a,\xb5")
     path.write_text(path.read_text() + "1.2,1")
     frames, said = taken(path)
@@ -166,6 +166,8 @@ def test_a_last_line_that_was_cut_is_left_out_and_said(tmp_path: Path) -> None:
         "t.csv: line 14 holds 2 cells, '1.2,1', and the line of names 3 cells: the file was cut "
         "there, and the line is left out"
     )
+    checked = cdmisfa("verify", path)
+    assert (checked.code, "line 14 holds 2 cells" in checked.out) == (3, True)
 
 
 def test_lines_are_counted_as_an_editor_does(tmp_path: Path) -> None:
@@ -231,6 +233,10 @@ def test_whole_numbers_that_float64_rounds_are_said(tmp_path: Path, name: str) -
     ]
     assert taken(tmp_path / name, fields=["b"])[1] == ()
     assert taken(tmp_path / name, depth=(0, 9))[1] == ()
+    part = ForeignSource(tmp_path / name, time="t", start=0.2, salvage=True)
+    with contextlib.closing(part) as source:
+        source.take(0, source.frames)
+        assert source.changes == {}  # said once
     if name == "t.parquet":  # they were rounded before
         floats = pa.table({"t": np.arange(ROWS) / 10, "a": [1e300] * ROWS})
         pq.write_table(floats, tmp_path / name)

@@ -123,6 +123,7 @@ class Excerpt(ImageStream):
     def __init__(self, images: ImageStream, start: int, stop: int) -> None:
         self.path, self.topic = images.path, images.topic
         self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
+        self.told_rounded = images.told_rounded
         self.parts = getattr(images, "parts", [images])
         self.times = images.times[start:stop]
         self._images, self._start, self._length = images, start, stop - start

@@ -30,6 +30,7 @@ class WholeImages(ImageStream):
     def __init__(self, images: ImageStream) -> None:
         self.path, self.topic, self.encoding = images.path, images.topic, images.encoding
         self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
+        self.told_rounded = images.told_rounded
         self.parts = getattr(images, "parts", [images])
         self.times = images.times
         self.broken: dict[int, LogDamagedError] = {}
