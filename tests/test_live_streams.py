@@ -8,6 +8,7 @@ import io
 import json
 import re
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -23,8 +24,10 @@ import pytest
 from conftest import Cdmisfa
 from foxglove.channels import CompressedImageChannel, RawImageChannel
 from foxglove.messages import CompressedImage, RawImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage as FoxgloveRaw
 from PIL import Image
 from waiting import Clock, wait_for
+from websockets.sync.server import ServerConnection, serve
 
 from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
@@ -35,6 +38,7 @@ from recorder.cameras.words import LiveOptions, is_live, open_live, stream_names
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_header
 
+RAW = "foxglove.RawImage"
 TEST = "av:lavfi:testsrc=size=160x120:rate=30"
 
 
@@ -466,6 +470,40 @@ def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     finally:
         over.set()
         thread.join()
+
+
+def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> None:
+    told: list[dict[str, Any]] = []
+    data = FoxgloveRaw(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
+
+    def talk(connection: ServerConnection) -> None:
+        channel = {
+            "id": 1,
+            "topic": "/cam",
+            "encoding": "protobuf",
+            "schema": "",
+            "schemaName": RAW,
+        }
+        connection.send(json.dumps({"op": "advertise", "channels": [channel]}))
+        for message in connection:
+            told.append(json.loads(message))
+            if len(told) < 3:
+                refused = "Unknown channel ID: 1"
+                connection.send(json.dumps({"op": "status", "level": 2, "message": refused}))
+                continue
+            for k in range(20):
+                head = struct.pack("<BIQ", 1, 1, 10**18 + k * 10**7)
+                connection.send(head + data.SerializeToString())
+
+    with serve(talk, "127.0.0.1", 0, subprotocols=["foxglove.websocket.v1"]) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        word = f"foxglove://127.0.0.1:{server.socket.getsockname()[1]}/cam"
+        with contextlib.closing(open_live([word], LiveOptions(rate=100))) as source:
+            assert source.take(0, 1).frames.shape == (1, 4, 5)
+        server.shutdown()
+        thread.join()
+    assert [message["op"] for message in told[:3]] == ["subscribe"] * 3
 
 
 def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(

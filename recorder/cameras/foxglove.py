@@ -36,6 +36,12 @@ TOPIC_SECONDS: Final = 5.0
 _QUIET: Final = 0.5
 """Seconds without a further topic after which the server is taken to have named those it has."""
 
+_TRIES: Final = 5
+"""Times to subscribe again: servers name a new channel a moment before they know it."""
+
+_AGAIN: Final = 0.2
+"""Seconds before each."""
+
 _HEADER: Final = struct.Struct("<BIQ")
 """Of a message: what it is, the subscription it is for, and its log time."""
 
@@ -100,13 +106,16 @@ class FoxgloveCamera:
         with connection:
             number, kind, decode = self._find(connection)
             wanted = [{"id": _SUBSCRIPTION, "channelId": number}]
-            connection.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            subscribe = json.dumps({"op": "subscribe", "subscriptions": wanted})
+            connection.send(subscribe)
+            tries = _TRIES
             steady = Steady()
             video = decode if isinstance(decode, VideoPackets) else None
             for message in connection:
                 if isinstance(message, bytes) and len(message) >= _HEADER.size:
                     what, subscription, log_time = _HEADER.unpack_from(message)
                     if (what, subscription) == (_DATA, _SUBSCRIPTION):
+                        tries = 0
                         logged = log_time / NANOSECONDS if log_time else None
                         age = steady.age(time.monotonic(), logged)
                         data = message[_HEADER.size :]
@@ -117,6 +126,10 @@ class FoxgloveCamera:
                             yield age, decode(data)
                 elif isinstance(message, str) and self._is_gone(message, number):
                     return
+                elif isinstance(message, str) and tries and self._is_refused(message):
+                    tries -= 1
+                    time.sleep(_AGAIN)
+                    connection.send(subscribe)
 
     def describe(self) -> Mapping[str, Any]:
         """The server and the topic."""
@@ -165,6 +178,12 @@ class FoxgloveCamera:
 
     def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
         return decoder_of(_kind(channel), self._reading)
+
+    @staticmethod
+    def _is_refused(message: str) -> bool:
+        """Whether a server says that something is wrong, as with what was subscribed to."""
+        told = _told(message)
+        return told.get("op") == "status" and told.get("level") in (1, 2)
 
     @staticmethod
     def _is_gone(message: str, number: int) -> bool:
