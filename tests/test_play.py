@@ -217,7 +217,7 @@ def test_topics_are_played_as_they_are_and_fields_as_numbers(tmp_path: Path) -> 
     assert [(each.topic.schema_name, each.time_ns // 10**9) for each in told] == [
         ("cdmisfa.Vector", second) for second in (0, 1, 2)
     ]
-    assert ["row 2 is left out: a holds no number" in line for line in said] == [True]
+    assert ["line 4 is left out: a holds no number" in line for line in said] == [True]
 
 
 def test_the_viewer_is_handed_every_frame(
