@@ -246,11 +246,9 @@ def say_about(source: FrameSource) -> None:
 
 def say_changes(source: FrameSource) -> None:
     """Say on stderr what showed while a source was read: changes of size, broken images."""
-    from replay.camera_logs.source import ForeignSource
-
-    if isinstance(source, ForeignSource):
-        for line in (*source.changes.values(), *source.salvaged()):
-            warn(line)
+    changes = getattr(source, "changes", {}).values()  # only logs of others have these
+    for line in (*changes, *getattr(source, "salvaged", list)()):
+        warn(line)
 
 
 def print_plan(source: FrameSource, *, as_json: bool) -> None:
