@@ -160,11 +160,9 @@ class FoxgloveCamera:
                 return int(channel["id"]), _kind(channel), images[found]
             if found in channels:
                 kind = channels[found].get("schemaName")
-                lacks = (
-                    "has no fields"
-                    if self._reading.fields
-                    else "is no image: its numbers are taken with --field"
-                )
+                lacks = "is no image: its numbers are taken with --field"
+                if self._reading.fields:
+                    lacks = "has no fields"
                 raise CdmisfaError(f"{self._where}{found} holds {kind}, which {lacks}")
         remedy = f"; name one as {self._where}/TOPIC" if images else ""
         raise CdmisfaError(f"{self._lacking(images)}{remedy}")

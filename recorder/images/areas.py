@@ -2,8 +2,8 @@
 
 Pillow averages along the rows, rounds to bytes, and then along the columns, with weights that are
 whole numbers of 2^-22. All pixels of an area weigh the same, so their sum decides, and eight bytes
-are summed at once. Each size is compared with Pillow before it is used, and left
-to Pillow where it differs.
+are summed at once. Each size is compared with Pillow before it is used, and left to Pillow where
+it differs.
 """
 
 from __future__ import annotations

@@ -165,8 +165,8 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 def table_notes(path: Path) -> list[str]:
     """What the user should know of a table; raises as `TableNumbers`, and where it was cut."""
     table, words, notes = _table(path)
-    for cut in notes:
-        raise LogDamagedError(cut)
+    if notes:
+        raise LogDamagedError(notes[0])
     return [
         *(f"{path}: {said}" for said in words.values()),
         f"{path}: {table.num_rows} rows of {table.num_columns} columns can be read; a table has "
