@@ -93,8 +93,8 @@ def main(*, quick: bool = False, full: bool = False) -> None:
                 row += [middle(times["decoding"], 1), middle(times["converting"], 1)]
                 row.append(f"{share:.0f} %")
             rows.append(row)
-    ours = ["decoding", "converting", "share"]
-    header = ["log", *(f"CPU us: {part}" for part in ours), *(f"wall us: {part}" for part in ours)]
+    ours = ["decoding, us", "converting, us", "share"]
+    header = ["log", *(f"CPU: {part}" for part in ours), *(f"wall: {part}" for part in ours)]
     save(
         "converting",
         "Converting",

@@ -51,7 +51,7 @@ PANELS: Mapping[str, Sequence[Kept]] = {
         *(_kernel(K, "vs plain numba") for K in (16, 32, 64)),
         Kept("still pixels, K = 32", "kernels", {"K": 32, "J": 5}, "gain"),
     ),
-    "Iteration, preset icub, of none": (
+    "Iteration, preset icub, times that without a log": (
         _logs("preset icub", "run.mcap"),
         _logs("preset icub", "run.mcap and run.rrd"),
     ),
@@ -59,7 +59,7 @@ PANELS: Mapping[str, Sequence[Kept]] = {
         Kept("sample log, vs mcap", "reader", {"file": "sample log"}, "vs mcap"),
         Kept("noise, vs mcap", "reader", {"file": "noisy pictures"}, "vs mcap"),
     ),
-    "Iteration with modules, of none": (
+    "Iteration with modules, times that without": (
         Kept("10 modules", "modules", {"modules": 10}, "of none"),
         Kept("100 modules", "modules", {"modules": 100}, "of none"),
     ),
@@ -110,14 +110,19 @@ def ratios(document: Mapping[str, Any]) -> dict[str, float]:
 def keep(name: str, root: Path = report.RESULTS.parent.parent) -> Path | None:
     """Add a benchmark's result to results/history/COMMIT.json; None where no commit holds the code.
 
+    The result itself is told the commit, too, which the page shows.
+
     Args:
         name: of the benchmark, measured before.
         root: of the repository.
     """
-    document = json.loads((report.RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    path = report.RESULTS / f"{name}.json"
+    document = json.loads(path.read_text(encoding="utf-8"))
     if _git(root, "status", "--porcelain", "--", *CODE) != "":
         return None
     commit, date = _git(root, "show", "-s", "--format=%H %cI", "HEAD").split()
+    document["code"] = f"at {commit[:7]}"
+    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     return add(commit, date, ratios(document))
 
 
@@ -149,7 +154,7 @@ def draw(picture: Path) -> bool:
     commits.sort(key=lambda told: (told["date"], told["commit"]))
     if not commits:
         return False
-    figure = Figure(figsize=(9.0, 6.2), layout="constrained")
+    figure = Figure(figsize=(11.0, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     for axes, (panel, all_kept) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
         for kept in all_kept:
@@ -163,7 +168,7 @@ def draw(picture: Path) -> bool:
         axes.tick_params(labelsize=7)
         axes.set_xticks(*_days([told["date"][:10] for told in commits]))
         if axes.lines:
-            axes.legend(fontsize=7)
+            axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))  # beside the lines
     figure.savefig(picture, dpi=100, metadata={"Software": None})
     return True
 

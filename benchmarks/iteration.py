@@ -22,6 +22,8 @@ from replay.recordings.source import RecordedSource
 from replay.runs import writer
 from replay.runs.writer import RunWriter
 
+CONFIG = LearnerConfig(**load_preset("icub")["learner"])
+
 PARTS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "reading": (RecordedSource, ("take",)),
     "kernel": (iteration, ("feed",)),
@@ -68,12 +70,11 @@ def timed(parts: dict[str, tuple[Any, tuple[str, ...]]], times: Times) -> Iterat
 
 def measured(rounds: int, iterations: int) -> dict[str, list[float]]:
     """Microseconds an iteration by part, one entry a round; `all` and `log` are wholes."""
-    config = LearnerConfig(**load_preset("icub")["learner"])
     found: dict[str, list[float]] = defaultdict(list)
     clock = time.thread_time_ns
     for turn in range(rounds + 1):
         source, times = RecordedSource(SAMPLE, loop=True), defaultdict[str, float](float)
-        learner, digest = CuriousLearner(config, source.spec, 0), SignalsHash()
+        learner, digest = CuriousLearner(CONFIG, source.spec, 0), SignalsHash()
         with tempfile.TemporaryDirectory() as folder, timed({**PARTS, **LOG_PARTS}, times):
             log = RunWriter(Path(folder) / "run.mcap", source.spec, {})
             for _ in range(iterations):
@@ -106,18 +107,18 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     save(
         "iteration",
         "An iteration by its parts",
-        f"Of the preset icub (K = 7, 40 frames of the sample log, 48 x 128 pixels): CPU time of "
-        f"the learning thread, the median of {rounds} runs of {iterations} iterations, the "
-        "clock included that is asked before and after each part. The second table is of "
-        "run.mcap, whose chunks are compressed in a thread of their own, and in shares of an "
-        "iteration without a log. What limits an iteration: reading is zstd (50 us a chunk where "
-        "nothing else runs, 1.1 chunks an iteration) and the checksum of the chunk (6 us); "
-        "decompressing the next chunk in a thread took no time off the learning thread, which "
-        "holds the interpreter, and added a fifth to that of all threads. Projecting converts "
-        "pixels to doubles; the digest is the getting of 42 signals (SHA-256 itself takes 0.7 "
-        "us), which takes 11 us in a loop of its own and twice that here, because frames and "
-        "vectors have driven all else out of the CPU's cache. Of a log, LZ4 takes 10 us an "
-        "iteration in the other thread.",
+        f"Of the preset icub (K = {CONFIG.components}, {CONFIG.tau} frames of the sample log, 48"
+        f" x 128 pixels): CPU time of the learning thread, the median of {rounds} runs of "
+        f"{iterations} iterations, the clock included that is asked before and after each part. "
+        "The second table is of run.mcap, whose chunks are compressed in a thread of their own,"
+        " and in shares of an iteration without a log. What limits an iteration: reading is "
+        "zstd (50 us a chunk where nothing else runs, 1.1 chunks an iteration) and the checksum"
+        " of the chunk (6 us); decompressing the next chunk in a thread took no time off the "
+        "learning thread, which holds the interpreter, and added a fifth to that of all "
+        "threads. Projecting converts pixels to doubles; the digest is the getting of 42 "
+        "signals (SHA-256 itself takes 0.7 us), which takes 11 us in a loop of its own and "
+        "twice that here, because frames and vectors have driven all else out of the CPU's "
+        "cache. Of a log, LZ4 takes 10 us an iteration in the other thread.",
         [
             (["part", "of it"], table(times, "all", list(PARTS))),
             (

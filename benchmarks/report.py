@@ -101,8 +101,9 @@ def section(document: Mapping[str, Any]) -> str:
     """The part of the page that shows one benchmark's results."""
     tables = [markdown(t["header"], t["rows"]) for t in document["tables"]]
     facts = ", ".join(f"{key} {value}" for key, value in document["platform"].items())
+    of = f" {document['code']}" if "code" in document else ""
     return "\n\n".join(
-        [f"## {document['title']}", document["note"], *tables, f"Measured on: {facts}."]
+        [f"## {document['title']}", document["note"], *tables, f"Measured{of} on: {facts}."]
     )
 
 
@@ -124,14 +125,17 @@ def write_page() -> Path:
         "`benchmarks/results/*.json`; `python -m benchmarks NAME [--quick]` measures one part, "
         "`python -m benchmarks page` makes the page. Candidates take turns, times are CPU time, "
         "and what counts is the median of the ratios within each round: a slow spell of the "
-        "machine hits all of them."
+        "machine hits all of them. So the ratio of two cells need not be the ratio beside them. "
+        "Below each part stands the commit that it measured: parts of different commits are not "
+        "to be compared with each other."
     )
     parts = [head, *map(section, documents)]
     if (PAGE.parent / PICTURE).exists():
         parts.insert(
             1,
             f"![Ratios over the commits]({PICTURE})\n\nRatios of `benchmarks/results/history`, "
-            "which holds those of each commit that was measured, by the day of the commit.",
+            "which holds those of each commit that was measured, in the order of the commits; a "
+            "day stands where its first one is.",
         )
     PAGE.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return PAGE

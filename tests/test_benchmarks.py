@@ -107,7 +107,7 @@ def test_the_ratios_of_each_commit_are_kept_and_drawn(results: Path, tmp_path: P
     rows = [["all threads", "run.mcap", 110, "+10.0 %", 105, "+5.0 %"]]
     report.save("learn", "Learning", "", [(["K"], [[1]]), (header, rows)])
     document = json.loads((results / "learn.json").read_text())
-    name = "Iteration, preset icub, of none: run.mcap"
+    name = "Iteration, preset icub, times that without a log: run.mcap"
     assert history.ratios(document) == {name: 1.1}
     assert history.keep("learn", tmp_path) is None  # of no repository
     history.add("b" * 40, "2026-02-01T00:00:00+00:00", {name: 1.1})
@@ -115,6 +115,14 @@ def test_the_ratios_of_each_commit_are_kept_and_drawn(results: Path, tmp_path: P
     assert json.loads(path.read_text())["ratios"] == {name: 1.1, "other": 2.0}
     assert history.draw(tmp_path / "some.png")
     assert (tmp_path / "some.png").stat().st_size > 1000
+
+
+def test_what_the_history_holds_is_drawn() -> None:
+    drawn = {
+        f"{panel}: {kept.name}" for panel, all_kept in history.PANELS.items() for kept in all_kept
+    }
+    for path in (report.RESULTS / "history").glob("*.json"):
+        assert set(json.loads(path.read_text())["ratios"]) <= drawn
 
 
 def test_results_are_kept_only_of_code_that_a_commit_holds(results: Path, tmp_path: Path) -> None:
@@ -132,7 +140,9 @@ def test_results_are_kept_only_of_code_that_a_commit_holds(results: Path, tmp_pa
     assert path is not None
     told = json.loads(path.read_text())
     assert told["commit"].startswith(path.stem)
-    assert told["ratios"] == {"Iteration with modules, of none: 10 modules": 1.38}
+    page = report.write_page().read_text(encoding="utf-8")
+    assert f"Measured at {told['commit'][:7]} on: " in page
+    assert told["ratios"] == {"Iteration with modules, times that without: 10 modules": 1.38}
     (tmp_path / "cdmisfa" / "code.py").write_text("2\n")
     assert history.keep("modules", tmp_path) is None
 

@@ -73,7 +73,8 @@ def markdown(found: dict[str, Any]) -> str:
         "",
         "Made by `make torture`, then `python -m tests.torture --minutes 0 --page "
         "docs/reliability.md`;",
-        "figures are of the runs named here, failures included.",
+        "figures are of the runs named here, failures included. A defect is told as it was",
+        "found; the command behind it repeats its case with the code of today.",
         "",
         f"{cases} cases in {hours:.1f} hours of work, {len(found['defects'])} defects. "
         f"Commit {_distinct(runs, 'commit')}; Python {_distinct(runs, 'python')}; "
