@@ -62,6 +62,21 @@ def test_a_file_of_another_kind_is_a_wrong_word_and_no_damage(
     assert [path.name for path in tmp_path.iterdir()] == ["numbers.npz"]
 
 
+@pytest.mark.parametrize("name", ["numbers.csv", "pictures"])
+def test_recover_says_that_it_is_for_mcap_files(
+    cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("numbers.csv").write_text("a,b\n1,2\n")
+    Path("pictures").mkdir()
+    Path("pictures", "0.png").write_bytes(b"")
+    done = cdmisfa("recover", name, "-o", "out.mcap")
+    assert (done.code, done.err.count("\n")) == (2, 1), done.err
+    assert f"{name} is no MCAP file, and others are not recovered" in done.err
+    assert "--salvage" in done.err
+    assert not Path("out.mcap").exists()
+
+
 def test_export_writes_no_file_named_dash(
     cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.logfile import LogFile
 from recorder.log.whole import PARTIAL, make_folder
+from replay.camera_logs.opening import only_foreign
 from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
 from replay.mcap.chunks import UNUSED
 from replay.mcap.mending import mended
@@ -82,7 +83,8 @@ def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) ->
     first.
 
     Raises:
-        UsageError: no such log, or the output exists and `force` is not set.
+        UsageError: no such log, one of another kind than MCAP, or the output exists and `force` is
+            not set.
         LogDamagedError: not an MCAP file, or nothing in it can be saved.
         LogWriteError: the disk does not take it.
     """
@@ -94,6 +96,11 @@ def recover_log(src: str | Location, dst: str | Path, *, force: bool = False) ->
 
 
 def _recover(src: Path, dst: Path, force: bool) -> Recovery:
+    if src.exists() and only_foreign(src):
+        raise UsageError(
+            f"{src} is no MCAP file, and others are not recovered: learn and convert pass over "
+            "broken images of them with --salvage"
+        )
     files = [file for file in log_files(src) if isinstance(file, Path)]
     targets = [dst]
     if src.is_dir():

@@ -43,7 +43,9 @@ def _print_info(found: LogInfo) -> None:
     if found.seed is not None:
         words.append(f"seed {found.seed}")
     if found.ended is not None:
-        words.append(f"ended: {found.ended}")
+        from cdmisfa.experiments.loop import ENDINGS
+
+        words.append(f"ended: {ENDINGS.get(found.ended, found.ended)}")
     click.echo(f"{found.path}: {', '.join(words)}")
     if found.signals is not None and found.signals.missing:
         version, lacks = found.signals.version, ", ".join(found.signals.missing)
