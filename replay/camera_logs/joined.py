@@ -14,7 +14,7 @@ from recorder.images.framing import Size
 from recorder.images.pixels import MalformedImage, Shown
 from replay.camera_logs.alignment import Times, even_times, step_of
 from replay.camera_logs.formats.table import TableNumbers
-from replay.camera_logs.stream import ImageStream, sorted_times
+from replay.camera_logs.stream import ImagesOf, ImageStream, sorted_times
 from replay.mcap.records import MalformedRecord
 from replay.storage.location import Location
 
@@ -37,14 +37,17 @@ class JoinedImages(ImageStream):
         self.warnings = [joined, *warnings] if len(parts) > 1 else [*warnings]
         self.warnings += [warning for part in parts for warning in part.warnings]
         self.told_rounded = all(part.told_rounded for part in parts)
-        self.parts = [log for part in parts for log in getattr(part, "parts", [part])]
+        self.decode = parts[0].decode
         self._streams = list(parts)
-        self.decode = getattr(parts[0], "decode", None)
         times = np.concatenate([part.times for part in parts])
         order = np.argsort(times, kind="stable")
         self.times = times[order]
         self._part_of = np.repeat(np.arange(len(parts)), [part.count for part in parts])[order]
         self._row_in = np.concatenate([np.arange(part.count) for part in parts])[order]
+
+    @property
+    def parts(self) -> Sequence[ImageStream]:
+        return [log for part in self._streams for log in part.parts]
 
     def image(self, row: int) -> Shown:
         return self._streams[int(self._part_of[row])].image(int(self._row_in[row]))
@@ -72,7 +75,7 @@ class JoinedImages(ImageStream):
             part.close()
 
 
-class Stamped(ImageStream):
+class Stamped(ImagesOf):
     """The images of a stream in the order and at the times that their messages say.
 
     Every message is read for it.
@@ -83,10 +86,6 @@ class Stamped(ImageStream):
     """
 
     def __init__(self, images: ImageStream) -> None:
-        self.path, self.topic, self.encoding = images.path, images.topic, images.encoding
-        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
-        self.parts = getattr(images, "parts", [images])
-        self._images = images
         stamps = np.empty(images.count, np.int64)
         for row in range(images.count):
             try:
@@ -95,57 +94,30 @@ class Stamped(ImageStream):
                 raise LogDamagedError(f"{images.where(row)}: {error}") from None
         if len(stamps) > 1 and stamps.min() == stamps.max():
             raise UsageError(
-                f"{self.path}: the headers on {self.topic} all say {stamps[0]} ns: leave out "
+                f"{images.path}: the headers on {images.topic} all say {stamps[0]} ns: leave out "
                 "--stamp header"
             )
         self._order = np.argsort(stamps, kind="stable")
-        self.times = sorted_times(f"{self.path}: {self.topic}", stamps[self._order])
+        times = sorted_times(f"{images.path}: {images.topic}", stamps[self._order])
+        super().__init__(images, times)
 
-    def image(self, row: int) -> Shown:
-        return self._images.image(int(self._order[row]))
-
-    def distances(self) -> bool:
-        return self._images.distances()
-
-    def stated_size(self, row: int) -> Size | None:
-        return self._images.stated_size(int(self._order[row]))
-
-    def where(self, row: int) -> str:
-        return self._images.where(int(self._order[row]))
-
-    def close(self) -> None:
-        self._images.close()
+    def _row(self, row: int) -> int:
+        return int(self._order[row])
 
 
-class Excerpt(ImageStream):
-    """The images of a stream from one to another."""
+class Excerpt(ImagesOf):
+    """The images [start, stop) of a stream."""
 
     def __init__(self, images: ImageStream, start: int, stop: int) -> None:
-        self.path, self.topic = images.path, images.topic
-        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
-        self.told_rounded = images.told_rounded
-        self.parts = getattr(images, "parts", [images])
-        self.times = images.times[start:stop]
-        self._images, self._start, self._length = images, start, stop - start
+        super().__init__(images, images.times[start:stop])
+        self._start, self._length = start, stop - start
 
     @property
     def count(self) -> int:
         return self._length
 
-    def image(self, row: int) -> Shown:
-        return self._images.image(self._start + row)
-
-    def distances(self) -> bool:
-        return self._images.distances()
-
-    def stated_size(self, row: int) -> Size | None:
-        return self._images.stated_size(self._start + row)
-
-    def where(self, row: int) -> str:
-        return self._images.where(self._start + row)
-
-    def close(self) -> None:
-        self._images.close()
+    def _row(self, row: int) -> int:
+        return self._start + row
 
 
 def known_times(streams: Sequence[ImageStream], fps: float) -> list[Times]:

@@ -12,7 +12,11 @@ from replay.storage.location import Url
 
 
 def stream_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
-    """Topics as names of streams, with the file's and folders' where topics are shared."""
+    """Topics as names of streams, with the file's and folders' where topics are shared.
+
+    Raises:
+        UsageError: a topic of a log is named twice.
+    """
     topics = [s.topic for s in streams]
     if len(set(topics)) == len(topics):
         return tuple(topics)

@@ -25,7 +25,18 @@ from replay.storage.location import Location, Url, location
 def open_images(
     path: Location, topic: str | None, *, salvage: bool = False, reading: Reading = IMAGES
 ) -> ImageStream:
-    """Open what `_open` does, by the times that are wanted; raises the same."""
+    """Open the images on a topic of a log, or in a folder, or numbers, at the times wanted.
+
+    Args:
+        path: an MCAP log or its URL, a ROS bag, a video, a table or a folder of pictures.
+        topic: may be left out where there is one topic of images.
+        salvage: leave out what is damaged.
+        reading: what is taken of messages and tables, and by which times.
+
+    Raises:
+        UsageError: no such topic, or not what is wanted on it.
+        LogDamagedError: the log is damaged.
+    """
     images = _open(path, topic, salvage=salvage, reading=reading)
     try:
         images = in_order(images)
@@ -42,18 +53,7 @@ def open_images(
 
 
 def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
-    """Open the images on a topic of a log, or in a folder, or numbers.
-
-    Args:
-        path: an MCAP log or its URL, a ROS bag, a video, a table or a folder of pictures.
-        topic: may be left out where there is one topic of images.
-        salvage: leave out what is damaged.
-        reading: what is taken of messages and tables.
-
-    Raises:
-        UsageError: no such topic, or not what is wanted on it.
-        LogDamagedError: the log is damaged.
-    """
+    """Open a log with the reader of its format, which raises as `open_images` does."""
     if isinstance(path, Path):
         if is_table(path):
             return TableNumbers(path, topic, reading)

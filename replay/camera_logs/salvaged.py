@@ -6,9 +6,8 @@ import itertools
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.images.framing import Size
 from recorder.images.pixels import MalformedImage, Shown
-from replay.camera_logs.stream import ImageStream, UnreadableError
+from replay.camera_logs.stream import ImagesOf, ImageStream, UnreadableError
 from replay.mcap.records import MalformedRecord
 
 BROKEN = (MalformedImage, MalformedRecord, UnreadableError)
@@ -18,7 +17,7 @@ SALVAGE: Final = "learn and convert pass over what is broken with --salvage"
 """What to do about it."""
 
 
-class WholeImages(ImageStream):
+class WholeImages(ImagesOf):
     """A stream's images, for a broken one the last whole one before it, else the first of all.
 
     Which one that is depends on the log alone, not on what was asked for before.
@@ -28,13 +27,8 @@ class WholeImages(ImageStream):
     """
 
     def __init__(self, images: ImageStream) -> None:
-        self.path, self.topic, self.encoding = images.path, images.topic, images.encoding
-        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
-        self.told_rounded = images.told_rounded
-        self.parts = getattr(images, "parts", [images])
-        self.times = images.times
+        super().__init__(images, images.times)
         self.broken: dict[int, LogDamagedError] = {}
-        self._images = images
         self._last: tuple[int, Shown] | None = None
 
     @property
@@ -55,20 +49,11 @@ class WholeImages(ImageStream):
                 self.broken[near] = error
         raise self.broken[row]
 
-    def stated_size(self, row: int) -> Size | None:
-        return self._images.stated_size(row)
-
     def distances(self) -> bool:
         try:
             return self._images.distances()
         except BROKEN:
             return True  # who knows
-
-    def where(self, row: int) -> str:
-        return self._images.where(row)
-
-    def close(self) -> None:
-        self._images.close()
 
     def said(self) -> str | None:
         """That images are broken, as far as they were met; None where none was."""

@@ -196,7 +196,7 @@ class ForeignSource(LoggedSource):
         return {}
 
     def _logs(self) -> list[Hashed]:
-        parts = [p for s in self._streams for p in getattr(s, "parts", [s])]
+        parts = [part for stream in self._streams for part in stream.parts]
         return [hashed_log(path, parts) for path in self._files]
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -15,9 +16,10 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.decoding import Taken, decoder_of
 from recorder.images.framing import Size
-from recorder.images.messages import SCHEMAS
+from recorder.images.messages import SCHEMAS, holds_distances
 from recorder.images.pixels import RECIPE, Shown
 from recorder.images.reading import MessageKind, Reading
+from recorder.images.stamps import Stamp, stamp_of
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
 
@@ -68,6 +70,7 @@ class ImageStream(ABC):
         fields: the numbers that are taken instead of images, in their order.
         warnings: what the user should know: what was cut or left out.
         told_rounded: whether warnings say of every number that is held rounded.
+        decode: what makes an image of a message; None where they are no messages of a log.
     """
 
     path: Location
@@ -78,11 +81,17 @@ class ImageStream(ABC):
     fields: Sequence[str] = ()
     warnings: Sequence[str] = ()
     told_rounded: bool = False
+    decode: Taken | None = None
 
     @property
     def count(self) -> int:
         """How many there are."""
         return len(self.times)
+
+    @property
+    def parts(self) -> Sequence[ImageStream]:
+        """The streams of single logs that it is made of."""
+        return (self,)
 
     @abstractmethod
     def image(self, row: int) -> Shown:
@@ -121,6 +130,84 @@ class ImageStream(ABC):
     @abstractmethod
     def close(self) -> None:
         """Let go of the files; harmless when called twice."""
+
+
+class MessageImages(ImageStream):
+    """The images, or the numbers, in the messages on one topic of a log.
+
+    Attributes:
+        kind: of the messages.
+    """
+
+    kind: MessageKind
+    decode: Taken
+
+    @abstractmethod
+    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
+        """What is taken of a message.
+
+        Raises:
+            MalformedRecord, LogDamagedError: as for `image`.
+        """
+
+    def image(self, row: int) -> Shown:
+        return self.taken(row, self.decode)
+
+    def distances(self) -> bool:
+        return self.taken(0, partial(holds_distances, self.kind.schema, self.kind.encoding))
+
+    def stamp(self, row: int) -> int:
+        if self._stamp is None:
+            raise UsageError(
+                f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
+            )
+        return self.taken(row, self._stamp)
+
+    @cached_property
+    def _stamp(self) -> Stamp | None:
+        return stamp_of(self.kind)
+
+
+class ImagesOf(ImageStream):
+    """Images of another stream; a class that derives from it says which, or what is done to them.
+
+    Args:
+        images: the other stream, which is closed with this one.
+        times: of those that are taken of it, (n,) nanoseconds; empty where nobody knows.
+    """
+
+    def __init__(self, images: ImageStream, times: NDArray[np.uint64]) -> None:
+        self.path, self.topic, self.encoding = images.path, images.topic, images.encoding
+        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
+        self.told_rounded = images.told_rounded
+        self.times = times
+        self._images = images
+
+    @property
+    def parts(self) -> Sequence[ImageStream]:
+        return self._images.parts
+
+    def _row(self, row: int) -> int:
+        """Which row of the other stream a row is."""
+        return row
+
+    def image(self, row: int) -> Shown:
+        return self._images.image(self._row(row))
+
+    def stamp(self, row: int) -> int:
+        return self._images.stamp(self._row(row))
+
+    def distances(self) -> bool:
+        return self._images.distances()
+
+    def stated_size(self, row: int) -> Size | None:
+        return self._images.stated_size(self._row(row))
+
+    def where(self, row: int) -> str:
+        return self._images.where(self._row(row))
+
+    def close(self) -> None:
+        self._images.close()
 
 
 def choose_images(

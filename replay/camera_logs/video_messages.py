@@ -8,11 +8,11 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.frames import VIDEO_RECIPE
 from recorder.images.pixels import MalformedImage, Shown
 from recorder.images.videos import VideoPackets
-from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.stream import ImagesOf, ImageStream
 from replay.mcap.records import MalformedRecord
 
 
-class VideoMessages(ImageStream):
+class VideoMessages(ImagesOf):
     """The pictures of a video in a log's messages, from the first that needs none before it.
 
     Args:
@@ -24,19 +24,16 @@ class VideoMessages(ImageStream):
         LogDamagedError: the log is damaged.
     """
 
-    recipe = VIDEO_RECIPE
-
     def __init__(self, messages: Any, packets: VideoPackets) -> None:
-        self.path, self.topic = messages.path, messages.topic
-        self.parts = getattr(messages, "parts", [messages])
         self._messages, self._packets = messages, packets
         self._next = -1
         self._broken: dict[int, MalformedImage | MalformedRecord] = {}
         rows = range(len(messages.times))
         self._first = next((row for row in rows if self._begins(row)), len(rows))
         if self._first == len(rows):
-            raise UsageError(f"{self.path}: {self.topic}: {self._why()}")
-        self.times = messages.times[self._first :]
+            raise UsageError(f"{messages.path}: {messages.topic}: {self._why()}")
+        super().__init__(messages, messages.times[self._first :])
+        self.recipe = VIDEO_RECIPE
         lost = f"{self.path}: {self._first} pictures that need earlier ones are left out"
         self.warnings = [*messages.warnings, *([lost] if self._first else [])]
 
@@ -67,14 +64,11 @@ class VideoMessages(ImageStream):
             raise
         return shown
 
-    def stamp(self, row: int) -> int:
-        return int(self._messages.stamp(self._first + row))
+    def distances(self) -> bool:
+        return False  # known without a message, which may be broken
 
-    def where(self, row: int) -> str:
-        return str(self._messages.where(self._first + row))
-
-    def close(self) -> None:
-        self._messages.close()
+    def _row(self, row: int) -> int:
+        return self._first + row
 
     def _why(self) -> str:
         """Why nothing of the video can be decoded."""
@@ -93,5 +87,5 @@ class VideoMessages(ImageStream):
 
 def in_order(images: ImageStream) -> ImageStream:
     """A stream of a log's messages, its pictures in any order where these are of a video."""
-    decode = getattr(images, "decode", None)
+    decode = images.decode
     return VideoMessages(images, decode) if isinstance(decode, VideoPackets) else images

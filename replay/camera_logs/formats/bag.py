@@ -15,14 +15,11 @@ import numpy as np
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.images.decoding import Taken, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.messages import holds_distances
-from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
-from recorder.images.stamps import stamp_of
 from replay.camera_logs.formats.bag_folder import plain_bag, unpacked_message
 from replay.camera_logs.stream import (
     ChannelFacts,
-    ImageStream,
+    MessageImages,
     choose_images,
     explained,
     sorted_times,
@@ -34,7 +31,7 @@ BAGS: Final = (".bag", ".db3")
 Found = TypeVar("Found")
 
 
-class BagImages(ImageStream):
+class BagImages(MessageImages):
     """The images, or the numbers, on a topic of a .bag, .db3 or rosbag2's folder, by stamps.
 
     Raises:
@@ -65,21 +62,7 @@ class BagImages(ImageStream):
             raise
         self.warnings = [f"{path}: a ROS bag has no checksums, damaged pixels would go unnoticed"]
 
-    def image(self, row: int) -> Shown:
-        return self.taken(row, self.decode)
-
-    def distances(self) -> bool:
-        return holds_distances(self._kind.schema, self._kind.encoding, self._message(0))
-
-    def stamp(self, row: int) -> int:
-        if self._stamp is None:
-            raise UsageError(
-                f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
-            )
-        return self._stamp(self._message(row))
-
     def taken(self, row: int, take: Callable[[bytes], Found]) -> Found:
-        """What is taken of a message."""
         return take(self._message(row))
 
     def _message(self, row: int) -> bytes:
@@ -130,8 +113,7 @@ class BagImages(ImageStream):
         kinds = _kinds(self._reader, ros1=self._ros1)
         channels = [(name, kind, name) for name, kind in kinds.items()]
         chosen, decode = choose_images(self.path, topic, channels, reading)
-        self._kind = kinds[chosen[0]]
-        self._stamp = stamp_of(self._kind)
+        self.kind = kinds[chosen[0]]
         return [c for c in self._reader.connections if c.topic == chosen[0]], decode
 
 

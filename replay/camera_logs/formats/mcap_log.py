@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -12,12 +11,9 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.messages import holds_distances
-from recorder.images.pixels import Shown
 from recorder.images.reading import IMAGES, MessageKind, Reading
-from recorder.images.stamps import stamp_of
 from replay.camera_logs.stream import (
-    ImageStream,
+    MessageImages,
     NothingLoggedError,
     choose_images,
     explained,
@@ -35,7 +31,7 @@ _Messages = tuple[list[Segment], Sequence[int], NDArray[np.uint64], NDArray[np.i
 """Chunks with messages of a topic, how many each has, their log times, and the row of each."""
 
 
-class McapImages(ImageStream):
+class McapImages(MessageImages):
     """The images, or the numbers, on one topic of one log, in the order of log time.
 
     Raises:
@@ -61,29 +57,14 @@ class McapImages(ImageStream):
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
             own, self.decode = choose_images(path, topic, channels, reading)
             self._channels = {channel.id for channel in own}
-            self.topic, self._kind = own[0].topic, _kind(self.reader, own[0])
-            self._stamp = stamp_of(self._kind)
+            self.topic, self.kind = own[0].topic, _kind(self.reader, own[0])
             self._index()
         except BaseException:
             self.reader.close()
             raise
         self.warnings = self.reader.warnings
 
-    def image(self, row: int) -> Shown:
-        return self.taken(row, self.decode)
-
-    def distances(self) -> bool:
-        return self.taken(0, partial(holds_distances, self._kind.schema, self._kind.encoding))
-
-    def stamp(self, row: int) -> int:
-        if self._stamp is None:
-            raise UsageError(
-                f"{self.path}: messages on {self.topic} have no header: leave out --stamp header"
-            )
-        return self.taken(row, self._stamp)
-
     def taken(self, row: int, take: Callable[[memoryview], Found]) -> Found:
-        """What is taken of a message."""
         table = self.reader.table(self._segments[int(self._segment_of[row])])
         if table is None:
             raise MalformedRecord("it is damaged")
