@@ -25,9 +25,9 @@ from recorder.images.messages import holds_distances, image_decoder
 from recorder.images.pixels import (
     ENCODINGS,
     MalformedImage,
-    compressed_gray,
-    gray,
+    compressed_image,
     picture_size,
+    raw_image,
     shrink,
 )
 from replay.camera_logs.source import ForeignSource
@@ -118,7 +118,7 @@ def test_a_bayer_pattern_becomes_gray(order: str, bits: int, big: bool) -> None:
     data = mosaic.tobytes()
     if bits == 16:
         data = (mosaic.astype(np.uint16) << 8 | 55).astype(">u2" if big else "<u2").tobytes()
-    found = gray(data, 7, 9, f"bayer_{order}{bits}", big_endian=big)
+    found = raw_image(data, 7, 9, f"bayer_{order}{bits}", big_endian=big)
     np.testing.assert_array_equal(found, np.asarray(Image.fromarray(COLOUR).convert("L"))[:3, :4])
 
 
@@ -243,21 +243,21 @@ def test_an_image_stands_upright_as_its_exif_says(kind: str, orientation: int) -
     file = io.BytesIO()
     Image.fromarray(GRAY).save(file, kind, exif=exif)
     turned = ImageOps.exif_transpose(Image.open(file))
-    np.testing.assert_array_equal(compressed_gray(file.getvalue()), np.asarray(turned))
+    np.testing.assert_array_equal(compressed_image(file.getvalue()), np.asarray(turned))
     assert picture_size(file) == turned.size[::-1]
 
 
 def test_an_image_with_broken_exif_is_taken_as_it_is() -> None:
     file = io.BytesIO()
     Image.fromarray(GRAY).save(file, "PNG", exif=b"Exif\0\0II*\0\xff\xff\xff\x7f")
-    np.testing.assert_array_equal(compressed_gray(file.getvalue()), GRAY)
+    np.testing.assert_array_equal(compressed_image(file.getvalue()), GRAY)
     assert picture_size(file) == GRAY.shape
 
 
 @pytest.mark.parametrize("encoding", ["bayer_rggb12", "64FC1", "yuv422", ""])
 def test_other_formats_are_refused_by_name(encoding: str) -> None:
     with pytest.raises(MalformedImage, match=repr(encoding)):
-        gray(bytes(48), 6, 8, encoding, 8)
+        raw_image(bytes(48), 6, 8, encoding, 8)
 
 
 @given(data=st.binary(max_size=300), which=st.sampled_from(sorted(RAW)))

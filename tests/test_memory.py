@@ -15,7 +15,7 @@ import resource, sys
 import numpy as np
 from PIL import Image
 from cdmisfa.core.errors import CdmisfaError
-from recorder.images.pixels import MAX_PIXELS, MalformedImage, gray
+from recorder.images.pixels import MAX_PIXELS, MalformedImage, raw_image
 from replay.camera_logs.opening import open_images
 from replay.runs.modules import load_modules
 from pathlib import Path
@@ -57,5 +57,5 @@ def test_pictures(tmp_path: Path, mode: str, name: str) -> None:
 
 @pytest.mark.parametrize(("encoding", "size"), [("rgba8", 4), ("mono16", 2)])
 def test_raw_images(tmp_path: Path, encoding: str, size: int) -> None:
-    work = f"gray(bytes({size} * MAX_PIXELS), *size, {encoding!r})"
+    work = f"raw_image(bytes({size} * MAX_PIXELS), *size, {encoding!r})"
     assert peak(tmp_path, work) < MOST

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from recorder.images.pixels import RECIPE, Bytes, gray
+from recorder.images.pixels import RECIPE, Bytes, raw_image
 
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
@@ -86,7 +86,7 @@ def _colors(frame: Any) -> Bytes:
     height, width = luma.shape
     chroma = []
     for plane in frame.planes[1:3]:
-        values = gray(memoryview(plane), plane.height, plane.width, "mono8", plane.line_size)
+        values = raw_image(memoryview(plane), plane.height, plane.width, "mono8", plane.line_size)
         rows, columns = -(-height // plane.height), -(-width // plane.width)
         large = values.repeat(rows, axis=0).repeat(columns, axis=1)[:height, :width]
         chroma.append(large.astype(np.int32) - 128)
@@ -104,9 +104,9 @@ def _luma(frame: Any) -> Bytes:
     if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
         colours = frame.to_ndarray(format="rgb24")
         height, width = colours.shape[:2]
-        return gray(colours.tobytes(), height, width, "rgb8")
+        return raw_image(colours.tobytes(), height, width, "rgb8")
     plane = frame.planes[0]
-    luma = gray(memoryview(plane), frame.height, frame.width, "mono8", plane.line_size)
+    luma = raw_image(memoryview(plane), frame.height, frame.width, "mono8", plane.line_size)
     full = form.name.startswith(("yuvj", "gray")) or frame.color_range == _FULL_RANGE
     if full:
         return luma

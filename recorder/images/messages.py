@@ -23,9 +23,9 @@ from recorder.images.pixels import (
     Bytes,
     Depth,
     MalformedImage,
-    compressed_gray,
+    compressed_image,
     compressed_words,
-    gray,
+    raw_image,
 )
 from recorder.images.videos import Packet, VideoPackets
 
@@ -37,7 +37,7 @@ One that is `VideoPackets` has to be called with the messages in their order.
 
 
 class Pixels(NamedTuple):
-    """What a message with pixels says; see `gray`."""
+    """What a message with pixels says; see `raw_image`."""
 
     data: bytes | memoryview
     height: int
@@ -69,11 +69,11 @@ def image_decoder(
     Args:
         schema: type of the messages.
         encoding: of the messages.
-        depth: how distances are shown; see `gray`.
-        color: give what has colours as they are; see `gray`.
+        depth: how distances are shown; see `raw_image`.
+        color: give what has colours as they are; see `raw_image`.
     """
     if (pixels := _RAW.get((schema, encoding))) is not None:
-        return lambda data: gray(**pixels(data)._asdict(), depth=depth, color=color)
+        return lambda data: raw_image(**pixels(data)._asdict(), depth=depth, color=color)
     if (packet := _PACKETS.get((schema, encoding))) is not None:
         return VideoPackets(packet, color=color)
     if (packed := _COMPRESSED.get((schema, encoding))) is not None:
@@ -93,15 +93,15 @@ def _foxglove_raw(data: bytes | memoryview) -> Pixels:
 
 
 def _unpacked(image: Compressed, depth: Depth | None, *, color: bool) -> Bytes:
-    """What a compressed image shows; see `gray`."""
+    """What a compressed image shows; see `raw_image`."""
     if image.encoding not in DISTANCES:
-        return compressed_gray(image.data, color=color)
+        return compressed_image(image.data, color=color)
     words = compressed_words(image.data[_DEPTH_HEADER.size :] if image.depth else image.data)
     distances: NDArray[Any] = words.astype("<u2")
     if image.encoding == "32FC1":
         distances = _metres(words, image.data).astype("<f4")
     height, width = words.shape
-    return gray(distances.tobytes(), height, width, image.encoding, depth=depth)
+    return raw_image(distances.tobytes(), height, width, image.encoding, depth=depth)
 
 
 def _metres(words: NDArray[np.uint16], data: bytes) -> NDArray[np.float32]:

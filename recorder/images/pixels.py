@@ -18,7 +18,8 @@ from cdmisfa.core.untrusted.memory import BUDGET, budget
 Bytes = NDArray[np.uint8]
 
 Shown = NDArray[Any]
-"""What one message shows: a gray image, (height, width) uint8, or numbers, (I,) float64."""
+"""What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
+3), or numbers, (I,) float64."""
 
 MAX_PIXELS: Final = 36_000_000
 """Largest image that is decoded, more than one of 7680x4320."""
@@ -87,7 +88,7 @@ class UnknownPixels(MalformedImage):
     """Pixels in a format that is not read."""
 
 
-def gray(
+def raw_image(
     data: bytes | memoryview,
     height: int,
     width: int,
@@ -98,7 +99,7 @@ def gray(
     depth: Depth | None = None,
     color: bool = False,
 ) -> Bytes:
-    """Turn pixels of any supported format into gray, (height, width) uint8.
+    """The image that pixels of any supported format show, gray, (height, width) uint8.
 
     Of a Bayer pattern each two by two pixels become one, (height // 2, width // 2).
 
@@ -250,8 +251,12 @@ def shrink(
     return np.asarray(small, np.uint8)
 
 
-def compressed_gray(data: bytes, *, color: bool = False) -> Bytes:
-    """Decode a JPEG or PNG into gray, or into colours where it has them; see `gray`.
+def compressed_image(data: bytes, *, color: bool = False) -> Bytes:
+    """The image in a JPEG or PNG, gray, (height, width) uint8.
+
+    Args:
+        data: the file.
+        color: give what has colours as they are, (height, width, 3) red, green and blue.
 
     Raises:
         MalformedImage: it is neither, broken, or too large.

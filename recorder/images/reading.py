@@ -15,10 +15,10 @@ class Reading:
     """What is taken of messages and files.
 
     Attributes:
-        depth: what is shown of distances, see `gray`, and the range that numbers are kept in.
+        depth: what is shown of distances, see `raw_image`, and the range that numbers are kept in.
         fields: the numbers that are taken instead of images; see `Field`.
         stamp: the times of messages: those of the log, or those in their headers.
-        color: whether images are taken in their colours; see `gray`.
+        color: whether images are taken in their colours; see `raw_image`.
         time: the column of a table's times, with its unit; see `TableNumbers`.
     """
 

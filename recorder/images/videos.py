@@ -41,7 +41,7 @@ class VideoPackets:
 
     Args:
         opened: what a message holds; raises MalformedImage.
-        color: give the colours; see `gray`.
+        color: give the colours; see `raw_image`.
     """
 
     def __init__(

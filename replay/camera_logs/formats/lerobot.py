@@ -15,7 +15,7 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
 from recorder.images.framing import Size
-from recorder.images.pixels import compressed_gray
+from recorder.images.pixels import compressed_image
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -127,7 +127,7 @@ class LeRobotImages(ImageStream):
         if not isinstance(data, bytes):
             raise MalformedRecord("its table holds no picture there")
         with explained(self.path, "Pillow", held=table.nbytes + len(data)):
-            return compressed_gray(data, color=self._color)
+            return compressed_image(data, color=self._color)
 
 
 def is_dataset(path: Path) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
 from recorder.images.framing import Size
-from recorder.images.pixels import compressed_gray, picture_size
+from recorder.images.pixels import compressed_image, picture_size
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 
@@ -42,7 +42,7 @@ class FolderImages(ImageStream):
         return len(self._files)
 
     def image(self, row: int) -> Bytes:
-        return compressed_gray(read_regular(self._files[row], MAX_BYTES), color=self._color)
+        return compressed_image(read_regular(self._files[row], MAX_BYTES), color=self._color)
 
     def stated_size(self, row: int) -> Size | None:
         with opened_regular(self._files[row], MAX_BYTES) as file:
