@@ -261,6 +261,7 @@ def recorded(folder: Path) -> list[ViewRecording]:
 
 
 def view_recording(view: str, path: Path, frames: int) -> ViewRecording:
+    """A finished file of a view, with its size and checksum, for which all of it is read."""
     with path.open("rb") as file:
         checksum = hashlib.file_digest(file, "sha256").hexdigest()
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)

@@ -77,7 +77,7 @@ def packed(rgb: Rgb) -> int:
 
 
 def packed_all(colours: Sequence[Rgb]) -> NDArray[np.uint32]:
-    """Colours as the viewer takes several of them without doubt."""
+    """Colours, (n,), as the viewer takes several of them without doubt."""
     return np.array([packed(rgb) for rgb in colours], dtype=np.uint32)
 
 

@@ -97,7 +97,11 @@ def clip(name: str) -> Callable[[Rng, int], Shown]:
 
 
 def icub(view: str, thing: str) -> Callable[[Rng, int], Shown]:
-    """A view of the sample recording, and where the thing is that is seen in it."""
+    """A view of the sample recording, and where the thing is that is seen in it.
+
+    Raises:
+        UsageError: there is no sample recording.
+    """
 
     def make(rng: Rng, n: int) -> Shown:
         from replay.recordings.source import RecordedSource

@@ -51,12 +51,15 @@ class Stream:
 
     @property
     def learned_from(self) -> NDArray[Any]:
-        """The frames that a learner is shown, over and over."""
+        """The frames that a learner is shown, over and over, (n, *frame_shape)."""
         return self.frames if self.loops else self.frames[:LEARNED_FROM]
 
     @property
     def held_out(self) -> NDArray[Any]:
-        """The frames on which it is judged: of one that loops a round, with the cut of it."""
+        """The frames on which it is judged, (n, *frame_shape).
+
+        Of one that loops they are a round, with the cut of it.
+        """
         if self.loops:
             return np.concatenate([self.frames, self.frames[:1]])
         return self.frames[LEARNED_FROM:]

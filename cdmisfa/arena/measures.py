@@ -67,7 +67,7 @@ class Output:
 
 
 def slowest(module: Module, frames: NDArray[Any]) -> Output:
-    """The slowest output of a module on frames."""
+    """The slowest output of a module on frames, (n, *frame_shape)."""
     y = module.transform(frames)
     still = y.max(axis=0) == y.min(axis=0)
     eta = np.full(y.shape[1], math.inf)

@@ -36,12 +36,12 @@ class Shown:
 
 
 def stateless(frames: NDArray[Any]) -> Shown:
-    """Frames behind which there is nothing to be known."""
+    """Frames, (n, *frame_shape), behind which there is nothing to be known."""
     return Shown(frames, np.zeros((len(frames), 0)))
 
 
 def pixels(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Values as pixels: rounded, and cut off at black and white."""
+    """Values, of any shape, as pixels: rounded, and cut off at black and white."""
     return np.asarray(np.rint(values).clip(0, 255), np.uint8)
 
 
@@ -135,7 +135,7 @@ def picture(rng: Rng) -> Float:
 
 
 def flicker(rng: Rng, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Exposure that differs by 10 % from frame to frame, and a sensor's noise of 5."""
+    """Frames, (n, height, width), whose exposure differs by 10 % each; a sensor's noise of 5."""
     return _filtered(
         frames,
         lambda part: part * rng.normal(1, 0.1, (len(part), 1, 1)) + 5 * _normal(rng, len(part)),
@@ -143,7 +143,7 @@ def flicker(rng: Rng, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def shake(rng: Rng, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture is off by a pixel at most, to any side, anew in every frame."""
+    """Frames, (n, height, width), each off by a pixel at most, to any side."""
     moves = rng.integers(0, 3, (len(frames), 2))
     shaken = np.empty_like(frames)
     for frame, out, (down, right) in zip(frames, shaken, moves, strict=True):
@@ -153,7 +153,7 @@ def shake(rng: Rng, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def dim(rng: Rng, frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A tenth of the contrast, about the stream's mean picture."""
+    """Frames, (n, height, width), at a tenth of the contrast, about their mean picture."""
     mean = frames.mean(axis=0)
     return _filtered(frames, lambda part: mean + 0.1 * (part - mean))
 

@@ -93,11 +93,11 @@ class SourceSpec:
         return time_of(t, self.fps, self.start_ns)
 
     def times(self, start: int, stop: int) -> Times:
-        """Log times of the frames [start, stop), in nanoseconds."""
+        """Log times of the frames [start, stop), (stop - start,) nanoseconds."""
         return times_of(np.arange(start, stop), self.fps, self.start_ns)
 
     def frames_at(self, times: NDArray[Any]) -> Times:
-        """The frames nearest to log times in nanoseconds."""
+        """The frames nearest to log times, (n,) nanoseconds."""
         return frames_of(times, self.fps, self.start_ns)
 
 

@@ -226,7 +226,11 @@ class DaskPool:
 
     @property
     def width(self) -> int:
-        """Two for each thread of the workers that are there now."""
+        """Two for each thread of the workers that are there now.
+
+        Raises:
+            EngineError: the scheduler went away.
+        """
         try:
             threads: int = sum(self._client.ncores().values())
         except OSError as error:

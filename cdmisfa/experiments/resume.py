@@ -194,7 +194,7 @@ class Keyframes(Sink):
 
 
 def restore(learner: Learner, keyframe: Keyframe) -> None:
-    """Put a learner where a keyframe of this configuration stands."""
+    """Put a learner where a keyframe of this configuration stands; of another: LogDamagedError."""
     try:
         learner.restore(keyframe.state)
     except (LookupError, TypeError, ValueError) as error:
@@ -223,8 +223,9 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> 
     Args:
         log: of the run that is to be resumed.
         learner: of its configuration.
-        source: what it learns from.
-        forked_at: the iteration from which on a fork is itself; None where it is none.
+        source: what it learns from; a LogDamagedError where it does not show that any more.
+        forked_at: the iteration from which on a fork is itself, None where it is none; a UsageError
+            where it was cut before.
 
     Returns:
         The keyframe; None where the log has none, and all begins anew.
@@ -257,7 +258,7 @@ def bring_back(
     """Write what a run that is resumed keeps: all until the keyframe that it went back to.
 
     Args:
-        log: of the run.
+        log: of the run; a LogWriteError where the disk does not take it.
         keyframe: see `go_back`.
         digest: of its signals, at their beginning.
         versions: of the packages that go on computing it.
@@ -285,7 +286,7 @@ def bring_back(
 
 
 def log_to_resume(run: Path) -> Path:
-    """The log of a run that was stopped, wherever it is."""
+    """The log of a run that was stopped, wherever it is; a UsageError where there is none."""
     from replay.runs.folders import RUN_FILE
 
     finished = run / RUN_FILE

@@ -165,7 +165,7 @@ def _log_likelihood(x: Float, hits: Float, total: Float, m: Float, k: Float) -> 
 
 
 def correlation(a: Float, b: Float) -> float:
-    """Absolute Pearson correlation; 0 where one does not vary."""
+    """Absolute Pearson correlation of two (n,) series; 0 where one does not vary."""
     if a.max() == a.min() or b.max() == b.min():
         return 0.0
     a, b = a - a.mean(), b - b.mean()

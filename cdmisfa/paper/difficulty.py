@@ -145,7 +145,15 @@ def compare(task: Task, seed: int) -> Output:
 
 
 def slowest(frames: NDArray[Any], components: int) -> NDArray[np.float64]:
-    """Weights of the slowest feature within the leading principal components, by batch SFA."""
+    """Weights of the slowest feature within the leading principal components, by batch SFA.
+
+    Args:
+        frames: (n, I).
+        components: how many.
+
+    Returns:
+        (I,).
+    """
     x = frames / _unit(frames)
     x = x - x.mean(axis=0)
     leading = leading_directions(x, components)

@@ -16,6 +16,9 @@ def write_page(root: Path, page: Path) -> None:
     """Write a Markdown page of every experiment below a folder.
 
     Its figures go into a folder of the page's name next to it.
+
+    Raises:
+        UsageError: there is no result below the folder, or one cannot be read.
     """
     documents = [
         read_results(root / name) for name in NAMES if (root / name / "results.json").exists()
@@ -54,7 +57,11 @@ def write_page(root: Path, page: Path) -> None:
 
 
 def read_results(folder: Path) -> dict[str, Any]:
-    """The results.json of an experiment."""
+    """The results.json of an experiment.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
     path = folder / "results.json"
     try:
         document = read_json(path, "run it again", most=MAX_LIST)

@@ -68,7 +68,14 @@ def stack(curves: Sequence[NDArray[Any]]) -> Float:
 
 
 def mean_sd(stacked: Float) -> tuple[Float, Float]:
-    """Mean and standard deviation over trials, of those that still run."""
+    """Mean and standard deviation over trials, of those that still run.
+
+    Args:
+        stacked: (trials, n, ...), NaN where a trial has ended; see `stack`.
+
+    Returns:
+        (n, ...) each, NaN where none runs.
+    """
     count = np.isfinite(stacked).sum(axis=0)
     safe = np.maximum(count, 1)
     mean = np.where(count > 0, np.nansum(stacked, axis=0) / safe, np.nan)
@@ -98,7 +105,7 @@ def band(
     within: tuple[float, float] = (-np.inf, np.inf),
     alpha: float = 0.2,
 ) -> None:
-    """One SD around a stream's mean, as far as it is `within` what can be."""
+    """One SD, (n,), around a stream's mean, (n,), as far as it is `within` what can be."""
     low, high = np.clip(mean - sd, *within), np.clip(mean + sd, *within)
     at = np.arange(len(mean)) if x is None else x
     axes.fill_between(at, low, high, color=COLOURS[stream], alpha=alpha, linewidth=0)

@@ -195,7 +195,11 @@ class Experiment(Protocol):
 
 
 def experiment(name: str) -> Experiment:
-    """The module of an experiment."""
+    """The module of an experiment.
+
+    Raises:
+        UsageError: there is none of that name.
+    """
     if name not in NAMES:
         raise UsageError(f"no experiment {name!r}: {did_you_mean(name, (*NAMES, 'all'))}")
     return cast(Experiment, importlib.import_module(f"cdmisfa.paper.{name}"))
@@ -281,7 +285,11 @@ def run_one(task: tuple[str, Settings]) -> Output:
 
 
 def check(document: Mapping[str, Any]) -> None:
-    """Complain, naming them, when claims of the paper did not come out."""
+    """Complain, naming them, when claims of the paper did not come out.
+
+    Raises:
+        NotReproducedError: one did not.
+    """
     failed = [c for c in document["claims"] if not c["holds"]]
     if failed:
         words = "; ".join(f"{c['claim']} ({c['detail']})" for c in failed)
@@ -289,7 +297,11 @@ def check(document: Mapping[str, Any]) -> None:
 
 
 def read_arrays(path: Path) -> Arrays:
-    """What was kept of a trial for the figures."""
+    """What was kept of a trial for the figures.
+
+    Raises:
+        UsageError: the file is damaged.
+    """
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             return dict(stored)

@@ -6,6 +6,6 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "recorder.images.messages": "image_decoder",
-        "recorder.images.pixels": "MalformedImage gray shrink",
+        "recorder.images.pixels": "MalformedImage raw_image shrink",
     },
 )

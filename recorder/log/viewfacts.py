@@ -86,11 +86,14 @@ class ViewFacts:
         )
 
     def times(self, frames: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Log times of frames, as `SourceSpec.time_ns` gives them."""
+        """Log times of frames, (n,) nanoseconds, as `SourceSpec.time_ns` gives them."""
         return times_of(frames, self.fps, self.start_ns).astype(np.uint64)
 
     def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Frames at log times; one that is not exactly a frame's gets a frame near it."""
+        """Frames at log times, (n,) nanoseconds.
+
+        A time that is not exactly a frame's gets a frame near it.
+        """
         return np.clip(frames_of(times, self.fps, self.start_ns), -1, MAX_FRAMES)
 
     def as_metadata(self) -> dict[str, str]:

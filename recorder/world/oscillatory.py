@@ -22,7 +22,7 @@ Float = NDArray[np.float64]
 
 
 def x1(theta: Float) -> Float:
-    """Stream 1; its slow feature has frequency 4/500.
+    """Stream 1, (n, 2), at phases theta, (n,); its slow feature has frequency 4/500.
 
     Equation: 7
     """
@@ -31,7 +31,7 @@ def x1(theta: Float) -> Float:
 
 
 def x2(theta: Float) -> Float:
-    """Stream 2; its slow feature has frequency 3/500.
+    """Stream 2, (n, 2), at phases theta, (n,); its slow feature has frequency 3/500.
 
     Equation: 8
     """
@@ -40,7 +40,7 @@ def x2(theta: Float) -> Float:
 
 
 def x3(theta: Float) -> Float:
-    """Stream 3; its slow feature has frequency 2/500.
+    """Stream 3, (n, 2), at phases theta, (n,); its slow feature has frequency 2/500.
 
     Equation: 9
     """
@@ -49,7 +49,7 @@ def x3(theta: Float) -> Float:
 
 
 def zero(theta: Float) -> Float:
-    """The stream that shows nothing, of the non-stationary environment."""
+    """The stream that shows nothing, (n, 2), of the non-stationary environment."""
     return np.zeros((len(theta), 2))
 
 

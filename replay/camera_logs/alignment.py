@@ -45,7 +45,7 @@ def step_of(times: Times) -> float:
 
 
 def even_times(count: int, fps: float) -> Times:
-    """Times of images of which only the rate is known, from 0, in nanoseconds."""
+    """Times of images of which only the rate is known, from 0, (count,) nanoseconds."""
     return times_of(np.arange(count), fps, 0).astype(np.uint64)
 
 

@@ -96,6 +96,9 @@ def hashed_log(path: Location, streams: Sequence[ImageStream]) -> Hashed:
     """What tells a log from others: its bytes; of a folder, names and contents count.
 
     The streams hold the log open, where it is an MCAP file.
+
+    Raises:
+        ValueError: it is at a URL, and none of the streams holds it open.
     """
     readers = [s.reader for s in streams if isinstance(s, McapImages) and s.path == path]
     if readers:

@@ -282,7 +282,7 @@ def holds_none(path: Location, reading: Reading) -> str:
 
 
 def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) -> NDArray[np.uint64]:
-    """The times of a stream in their order, as every stream holds them.
+    """The times of a stream in their order, (n,) nanoseconds, as every stream holds them.
 
     Args:
         where: what has them, for the error.
@@ -305,6 +305,9 @@ def explained(path: Location, program: str, *, held: int = 0, remedy: str = "") 
         program: the library.
         held: bytes of the memory that it may take which are taken already.
         remedy: what to do where it takes more.
+
+    Raises:
+        UnreadableError: it raised, or would take more memory.
     """
     with in_one_line(path, program, remedy), budget(max(BUDGET - held, 0)):
         yield
@@ -325,7 +328,11 @@ def arrow_explained(path: Location, *, held: int = 0, remedy: str = "") -> Itera
 
 @contextmanager
 def in_one_line(path: Location, program: str, remedy: str = "") -> Iterator[None]:
-    """Say in one line what a library cannot read that lets any exception through."""
+    """Say in one line what a library cannot read that lets any exception through.
+
+    Raises:
+        UnreadableError: instead of each that is no CdmisfaError.
+    """
     try:
         yield
     except CdmisfaError:

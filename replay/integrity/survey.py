@@ -36,7 +36,7 @@ class ChannelSurvey:
     end: int | None = None
 
     def add(self, times: NDArray[Any]) -> None:
-        """Take more log times in."""
+        """Take more log times in, (n,) nanoseconds."""
         if len(times):
             low, high = int(times.min()), int(times.max())
             self.messages += len(times)

@@ -92,6 +92,11 @@ class Fields:
         self.at = 0
 
     def take(self, count: int) -> memoryview:
+        """Take the next `count` bytes.
+
+        Raises:
+            MalformedRecord: there are fewer left.
+        """
         if count > len(self.data) - self.at:
             raise MalformedRecord(
                 f"{self.what} is cut short or lies about a length ({count} bytes wanted, "
@@ -109,7 +114,11 @@ class Fields:
         return layout.unpack(self.take(layout.size))
 
     def text(self) -> str:
-        """Take a text with its length in front."""
+        """Take a text with its length in front.
+
+        Raises:
+            MalformedRecord: it is not UTF-8.
+        """
         raw = self.take(self.integer(4))
         try:
             return str(raw, "utf-8")
@@ -117,7 +126,11 @@ class Fields:
             raise MalformedRecord(f"{self.what} holds a text that is not UTF-8") from None
 
     def texts(self) -> dict[str, str]:
-        """Take a map of texts, where no key may stand twice: readers would disagree."""
+        """Take a map of texts, where no key may stand twice: readers would disagree.
+
+        Raises:
+            MalformedRecord: one does.
+        """
         inner = Fields(self.take(self.integer(4)), self.what)
         result: dict[str, str] = {}
         while inner.at < len(inner.data):
@@ -129,6 +142,7 @@ class Fields:
 
 
 def schema(content: bytes | memoryview) -> Schema:
+    """A Schema record; raises MalformedRecord."""
     fields = Fields(content, "a schema")
     number = fields.integer(2)
     if number == 0:
@@ -137,6 +151,7 @@ def schema(content: bytes | memoryview) -> Schema:
 
 
 def channel(content: bytes | memoryview) -> Channel:
+    """A Channel record; raises MalformedRecord."""
     fields = Fields(content, "a channel")
     return Channel(
         fields.integer(2), fields.integer(2), fields.text(), fields.text(), fields.texts()
@@ -144,6 +159,7 @@ def channel(content: bytes | memoryview) -> Channel:
 
 
 def statistics(content: bytes | memoryview) -> Statistics:
+    """A Statistics record; raises MalformedRecord."""
     fields = Fields(content, "the statistics")
     messages = fields.integer(8)
     fields.take(2 + 4)  # schemas and channels
@@ -158,7 +174,11 @@ def statistics(content: bytes | memoryview) -> Statistics:
 
 
 def walk(data: memoryview, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Each record within a chunk as (opcode, place of its first byte, place after its last)."""
+    """Each record within a chunk as (opcode, place of its first byte, place after its last).
+
+    Raises:
+        MalformedRecord: bytes are left over, a record runs over the end, or is none.
+    """
     unpack = RECORD_HEADER.unpack_from
     while at < stop:
         if stop - at < RECORD_HEADER.size:

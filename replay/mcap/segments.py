@@ -155,7 +155,11 @@ class Definitions:
         self._bytes = 0
 
     def add(self, opcode: int, content: bytes, where: str) -> None:
-        """Take a Schema or Channel record in, and refuse one whose id means something else."""
+        """Take a Schema or Channel record in; one whose id means something else is refused.
+
+        Raises:
+            MalformedRecord: it is no such record, or all of them take too much memory.
+        """
         key = (opcode, content)
         if key in self._seen:
             return

@@ -148,7 +148,11 @@ def header_at(file: Store, at: int) -> tuple[int, int]:
 
 
 def definition(file: Store, content: int, length: int) -> bytes:
-    """Read a record that is kept in memory, and must not be too large for that."""
+    """Read a record that is kept in memory, and must not be too large for that.
+
+    Raises:
+        MalformedRecord: it is.
+    """
     if length > MAX_DEFINITION:
         raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
     return file.read(content, length)
@@ -201,7 +205,11 @@ def stated_chunks(summary: Summary) -> list[Segment]:
 
 
 def stated_spans(summary: Summary, opcode: int) -> list[tuple[int, int]]:
-    """Where a summary says that attachments or metadata are, as spans [start, stop) of the file."""
+    """Where a summary says that attachments or metadata are, as spans [start, stop) of the file.
+
+    Raises:
+        MalformedRecord: one is not within the data.
+    """
     spans = []
     for content, length, _ in summary.indexes[opcode]:
         fields = _index(summary.file, content, length)

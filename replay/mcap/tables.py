@@ -52,13 +52,16 @@ class MessageTable:
 
     @property
     def channel(self) -> NDArray[np.uint16]:
+        """Channel of each message, (n,)."""
         return self.headers["channel"]
 
     @property
     def log_time(self) -> NDArray[np.uint64]:
+        """Log time of each message, (n,) nanoseconds."""
         return self.headers["log_time"]
 
     def select(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MessageTable:
+        """The messages of some rows, given by number, (k,), or by a truth value each, (n,)."""
         return MessageTable(self.data, self.headers[rows], self.at[rows], self.size[rows])
 
     def rows(self) -> Iterator[tuple[int, int, int, int, bytes]]:
@@ -78,6 +81,7 @@ class MessageTable:
         return self.select(np.argsort(times, kind="stable"))
 
     def payload(self, row: int) -> bytes:
+        """A copy of a payload."""
         return self.view(row).tobytes()
 
     def view(self, row: int) -> memoryview:
@@ -87,7 +91,15 @@ class MessageTable:
 
 
 def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
-    """Build the table of the message records that begin at n places of a chunk, and check them."""
+    """Build the table of the message records that begin at places of a chunk, and check them.
+
+    Args:
+        data: the chunk's records.
+        offsets: (n,) places in `data`.
+
+    Raises:
+        MalformedRecord: at one is no message, or one that does not lie within the chunk.
+    """
     _check_count(len(offsets))
     if len(offsets) == 0:
         return MessageTable(data, np.empty(0, MESSAGE_HEADER), offsets, offsets)

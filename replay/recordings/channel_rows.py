@@ -29,6 +29,7 @@ class Span:
     row: int
 
     def row_of(self, frame: int) -> int:
+        """Which message of the channel a frame is in."""
         return self.row + frame - self.start
 
 
@@ -109,6 +110,7 @@ class ChannelRows:
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
+        """The frames [start, stop) that there are messages of."""
         return [(span.start, span.stop) for span in self.spans]
 
     def _take_segments(self) -> int:
@@ -207,6 +209,7 @@ class ChannelRows:
         return own[0] if len(own) == 1 else np.concatenate(own)
 
     def payload(self, frame: int) -> bytes:
+        """The message of a frame."""
         row = self._row(frame)
         number = bisect.bisect_right(self._starts, row) - 1
         return self._table(number).payload(row - self._starts[number])

@@ -47,7 +47,11 @@ class RowLayout:
     width: int
 
     def checked_ends(self, path: Location, segment: Segment, table: MessageTable) -> Places:
-        """Place after each message of the channel in its chunk, (n,), if all are laid out so."""
+        """Place after each message of the channel in its chunk, (n,), if all are laid out so.
+
+        Raises:
+            LogDamagedError: one is not.
+        """
         ends = table.at + table.size
         if (table.size < self.least).any():
             wrong = "shorter than"
@@ -116,7 +120,14 @@ class ChunkScanner:
         return found
 
     def copy(self, chunk: ScannedChunk, which: int, low: int, out: NDArray[Any]) -> None:
-        """Copy the values of a channel's messages from the `low`th of a chunk on, as bytes."""
+        """Copy the values of a channel's messages from the `low`th of a chunk on, as bytes.
+
+        Args:
+            chunk: as it was decoded.
+            which: the channel, a place in the layouts.
+            low: the first message.
+            out: (n, bytes of a message's values), written.
+        """
         layout = self._layouts[which]
         ends = chunk.ends[which, low : low + len(out)]
         self._kernels.gather(chunk.buffer, ends, layout.distances, layout.width, out)

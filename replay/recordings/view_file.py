@@ -155,6 +155,7 @@ class ViewFile:
         self._find_ranges()
 
     def close(self) -> None:
+        """Let go of the file."""
         self.reader.close()
 
     def _find_layouts(self, first: bytes) -> list[RowLayout]:

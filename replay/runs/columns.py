@@ -78,11 +78,11 @@ class Blocks:
     streams: NDArray[np.int64]
 
     def places(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Number, from 0, of the last block here that had begun at each frame."""
+        """Number, from 0, of the last block here that had begun at each frame, (n,) both."""
         return np.maximum(np.searchsorted(self.starts, frames, side="right") - 1, 0)
 
     def iteration(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The last iteration that had begun at each frame; 0 before the first."""
+        """The last iteration that had begun at each frame, (n,) both; 0 before the first."""
         if not len(self.starts):
             return np.zeros(len(frames), dtype=np.int64)
         return self.iterations[self.places(frames)]

@@ -121,7 +121,7 @@ def encode_matrix(t: int, matrix: NDArray[np.float64]) -> bytes:
 
 
 def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.float64]]:
-    """The frame counter and the (rows, columns) values of a message; see `parsed`."""
+    """The frame counter and (rows, columns) values of a message; raises as `parsed` does."""
     decoded = parsed(_MATRIX, data, where)
     values = np.array(decoded.values, dtype=np.float64)
     if values.size and (decoded.columns == 0 or values.size % decoded.columns):

@@ -48,7 +48,11 @@ class Run:
 
     @cached_property
     def modules(self) -> tuple[Module, ...]:
-        """What it learned, in order."""
+        """What it learned, in order.
+
+        Raises:
+            LogDamagedError: the modules are of other streams, or cannot be read.
+        """
         found = load_modules(self.log.parent)
         names = self.streams
         if any(module.stream_index >= len(names) for module in found):

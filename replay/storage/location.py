@@ -28,6 +28,7 @@ class Url:
 
     @property
     def scheme(self) -> str:
+        """One of s3, http and https."""
         return self.address.split("://", 1)[0]
 
     @property
@@ -39,14 +40,17 @@ class Url:
 
     @property
     def stem(self) -> str:
+        """See `Path.stem`."""
         return Path(self.name).stem
 
     @property
     def suffix(self) -> str:
+        """See `Path.suffix`."""
         return Path(self.name).suffix
 
     @property
     def parent(self) -> Url:
+        """What it lies in, without a password, or what follows the path."""
         return Url(str(self).rstrip("/").rsplit("/", 1)[0])
 
     @property

@@ -88,7 +88,11 @@ def build_view(
 def view_of(
     path: Path, every: int, all_views: Path | None, tab: str | None = None
 ) -> Iterator[Path]:
-    """The view of a run, a recording or an .rrd file, there for as long as it is looked at."""
+    """The view of a run, a recording or an .rrd file, there for as long as it is looked at.
+
+    Raises:
+        UsageError: there is no such file, or an .rrd file cannot have the tab.
+    """
     if path.suffix == ".rrd":
         if not path.is_file():
             raise UsageError(f"{path} does not exist: name a run, a recording or an .rrd file")

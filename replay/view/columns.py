@@ -61,7 +61,7 @@ def time_columns(
 
 
 def power_of_ten(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Logarithms of values to the base of ten; NaN of what has none."""
+    """Logarithms of values, of any shape, to the base of ten; NaN of what has none."""
     return np.log10(np.where(values > 0, values, np.nan))
 
 
@@ -104,7 +104,7 @@ class Column:
     def add(
         self, frames: Frames, iterations: NDArray[np.int64] | int | None, values: NDArray[Any]
     ) -> None:
-        """Take values of n rows, at n frames of one iteration or of n."""
+        """Take values of n rows, (n, ...), at n frames of one iteration or of n."""
         self._frames.append(frames)
         if iterations is not None:
             self._iterations.append(np.broadcast_to(iterations, (len(frames),)))
@@ -214,7 +214,7 @@ class ImageColumn(Column):
         super().__init__(recording, spec, path, rr.Image.from_fields(format=form))
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand n images over."""
+        """Hand n images over, (n, height, width) uint8."""
         batch: Any = ImageBatch(values.reshape(len(values), -1))
         self._recording.send_columns(self.path, times, [batch])
 
@@ -256,7 +256,7 @@ class TensorColumn(Column):
         self._names = names
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand n tensors over."""
+        """Hand n tensors over, (n, *shape)."""
         batch: Any = TensorBatch(np.asarray(values, dtype=np.float64), self._names)
         self._recording.send_columns(self.path, times, [batch])
 

@@ -182,7 +182,7 @@ class RunView:
         self._recording.log("events", rr.TextLog(label(text), level=level))
 
     def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
-        """Draw the lines below which something is learned, through these frames."""
+        """Draw the lines below which something is learned, through frames, (n,)."""
         for path, (name, value) in self._thresholds.items():
             line = self._line(path, [name], rgbs=[GREY])
             line.add(frames, iterations, np.full((len(frames), 1), value))

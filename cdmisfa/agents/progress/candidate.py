@@ -173,7 +173,7 @@ class Candidate:
         return learning_error(self.change, float(self.tested[0]), self.fitted)
 
     def recent_errors(self, most: int) -> Float:
-        """The last learning errors, at most so many, the newest last."""
+        """The last learning errors, (n,) with n at most `most`, the newest last."""
         recent = self.errors[-most:]
         return np.asarray(recent[np.isfinite(recent)])
 

@@ -39,7 +39,7 @@ class Candidates(dict[int, Candidate]):
 
         Args:
             stream: which.
-            streams: the table of all.
+            streams: the table of all, (S,) of `STREAM`.
         """
         if stream not in self:
             while len(self) >= self.most:

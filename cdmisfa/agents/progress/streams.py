@@ -82,7 +82,14 @@ def differs(own: Any, window: int) -> bool:
 def outcomes(
     names: Sequence[str], streams: NDArray[Any], held: Mapping[int, Candidate], test_frames: int
 ) -> list[dict[str, Any]]:
-    """The `outcome` of every stream."""
+    """The `outcome` of every stream.
+
+    Args:
+        names: of the S streams.
+        streams: their table, (S,) of `STREAM`.
+        held: the candidates that there are, by their stream.
+        test_frames: see `outcome`.
+    """
     return [
         outcome(name, streams[place], held.get(place), test_frames)
         for place, name in enumerate(names)

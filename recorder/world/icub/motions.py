@@ -58,7 +58,7 @@ def walk(config: SphereConfig, generator: np.random.Generator) -> Motion:
 
 
 def reflect(values: Float, limits: Range) -> Float:
-    """A free walk as one that turns round at the limits."""
+    """A free walk, (n,), as one that turns round at the limits."""
     low, high = limits
     width = high - low
     if width == 0:

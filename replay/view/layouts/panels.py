@@ -114,7 +114,7 @@ class Panels:
         )
 
     def values(self, *names: str) -> NDArray[np.float64]:
-        """Values of signals that the outline keeps, one after the other."""
+        """Values of signals that the outline keeps, one after the other, (n,)."""
         return np.concatenate([self.outline.lines[name] for name in names])
 
     def _is_told(self, entity: str) -> bool:

@@ -64,7 +64,7 @@ def _promised(panels: Panels) -> str:
 
 
 def tested_only(panels: Panels, name: str) -> NDArray[np.float64]:
-    """A signal's values where the candidate was tested: those that are drawn."""
+    """A signal's values, (n,), where the candidate was tested: those that are drawn."""
     return np.where(np.isnan(panels.values("tested")), np.nan, panels.values(name))
 
 

@@ -38,7 +38,7 @@ class PlacesColumn(Column):
     """Where something is, (n, 3), in its parent's frame."""
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand n places over."""
+        """Hand n places over, (n, 3)."""
         moved = rr.Transform3D.columns(translation=np.array(values, dtype=np.float32))
         self._recording.send_columns(self.path, times, moved)
 
