@@ -513,7 +513,7 @@ def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
         "import sys, threading\n"
         "from pathlib import Path\n"
         "from websockets.sync.client import connect\n"
-        "from replay.playing.robot import play_as_robot\n"
+        "from replay.playing.as_robot import play_as_robot\n"
         "left = []\n"
         "def leave(line):\n"
         "    client = connect(line.split()[2].strip(','), subprotocols=['foxglove.sdk.v1'])\n"

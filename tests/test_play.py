@@ -30,9 +30,9 @@ from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged
+from replay.playing.as_robot import play_as_robot
 from replay.playing.feed import Told, Topic, opened_feed
 from replay.playing.pace import Played, paced, rounds
-from replay.playing.robot import play_as_robot
 from replay.recordings.source import RecordedSource
 
 FRAMES, FPS = 21, 8.0  # of so few a second that a busy machine is not late by a tick
@@ -224,7 +224,7 @@ def test_the_viewer_is_handed_every_frame(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RERUN_STRICT", "1")
-    from replay.playing.picture import play_in_rerun
+    from replay.playing.in_rerun import play_in_rerun
 
     taken: list[bytes] = []
 

@@ -29,6 +29,9 @@ _VIDEO: Final = ("camera", "av", "http", "https", "rtsp", "rtsps", "rtmp", "tcp"
 
 _STREAMED: Final = (".mjpg", ".mjpeg", ".m3u8")
 
+_NO_FIELDS: Final = "shows images: --field is for messages, of foxglove://"
+_NO_DISTANCES: Final = "shows no distances: --range is for those of foxglove://"
+
 _TIMEOUT: Final = 10.0
 """Seconds that opening a network stream may take."""
 
@@ -130,36 +133,17 @@ def open_live(
         UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
     """
     names = stream_names(words)
-    simulated = [word.startswith("gym:") for word in words]
-    if any(simulated):
-        from recorder.cameras.gym import GymSource
-
-        if not all(simulated):
-            raise UsageError(
-                "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
-            )
-        if options.fields:
-            raise UsageError(f"{words[0]} shows images: --field is for messages, of foxglove://")
-        if options.depth is not None:
-            raise UsageError(f"{words[0]} shows no distances: --range is for those of foxglove://")
-        tasks = [word.removeprefix("gym:") for word in words]
-        return GymSource(
-            tasks,
-            names=names,
-            size=options.size,
-            fit=options.fit,
-            fps=options.rate,
-            seed=options.seed,
-            color=options.color,
-        )
-    kinds = [CAMERAS[word.partition(":")[0].lower()] for word in words]
+    if any(word.startswith("gym:") for word in words):
+        return _simulated(words, names, options)
+    schemes = [word.partition(":")[0].lower() for word in words]
+    kinds = [CAMERAS[scheme] for scheme in schemes]
     for kind, word in zip(kinds, words, strict=True):
         if options.fields and "fields" not in kind.takes:
-            raise UsageError(f"{word} shows images: --field is for messages, of foxglove://")
+            raise UsageError(f"{word} {_NO_FIELDS}")
         if options.color and "color" not in kind.takes:
             raise UsageError(f"{word} shows gray images: leave out --color")
     if options.depth is not None and not any("depth" in kind.takes for kind in kinds):
-        raise UsageError(f"{words[0]} shows no distances: --range is for those of foxglove://")
+        raise UsageError(f"{words[0]} {_NO_DISTANCES}")
     told = {"depth": options.depth, "fields": options.fields, "color": options.color, "say": say}
     opened = [
         kind.open(word, name, **{key: told[key] for key in kind.takes})
@@ -176,7 +160,7 @@ def open_live(
         about |= {"recipe": NUMBERS_RECIPE, "fields": list(options.fields)}
     if options.color:
         about["recipe"] = COLOR_RECIPE
-    if packages := CAMERAS.versions(*(word.partition(":")[0].lower() for word in words)):
+    if packages := CAMERAS.versions(*schemes):
         about[PACKAGES] = packages
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
@@ -189,6 +173,29 @@ def open_live(
         source.close()
         raise UsageError(f"{words[0]} shows no distances (16UC1, 32FC1): --range is for these")
     return source
+
+
+def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions) -> FrameSource:
+    """Simulated tasks on one clock."""
+    from recorder.cameras.gym import GymSource
+
+    if not all(word.startswith("gym:") for word in words):
+        raise UsageError(
+            "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
+        )
+    if options.fields:
+        raise UsageError(f"{words[0]} {_NO_FIELDS}")
+    if options.depth is not None:
+        raise UsageError(f"{words[0]} {_NO_DISTANCES}")
+    return GymSource(
+        [word.removeprefix("gym:") for word in words],
+        names=names,
+        size=options.size,
+        fit=options.fit,
+        fps=options.rate,
+        seed=options.seed,
+        color=options.color,
+    )
 
 
 def stream_names(words: Sequence[str]) -> tuple[str, ...]:

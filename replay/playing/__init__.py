@@ -4,5 +4,5 @@ from cdmisfa.core.faces import face
 
 __getattr__, __dir__, __all__ = face(
     __name__,
-    {"replay.playing.robot": "play_as_robot", "replay.playing.picture": "play_in_rerun"},
+    {"replay.playing.as_robot": "play_as_robot", "replay.playing.in_rerun": "play_in_rerun"},
 )

@@ -1,4 +1,4 @@
-"""`cdmisfa info`, `verify` and `recover`: what is in a log, is it whole, what can be saved."""
+"""`cdmisfa info`, `verify`, `recover`, `upload`: what is in a log, is it whole, can it be saved."""
 
 from __future__ import annotations
 

@@ -229,7 +229,7 @@ def play_command(
     cameras = CameraOptions(**chosen)
     with bar("playing", "s") as shown, stoppable(notice="") as stop:
         if target == "foxglove":
-            from replay.playing.robot import PORT, play_as_robot
+            from replay.playing.as_robot import PORT, play_as_robot
 
             played = play_as_robot(
                 recording,
@@ -245,7 +245,7 @@ def play_command(
                 progress=shown.update,
             )
         else:
-            from replay.playing.picture import play_in_rerun
+            from replay.playing.in_rerun import play_in_rerun
 
             played = play_in_rerun(
                 recording,
