@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -80,35 +80,29 @@ class TableNumbers(ImageStream):
         # What is missing is beyond no bounds.
         known = ~np.any([np.isnan(own).all(axis=1) for own in columns], axis=0)
         whole = known & (np.isfinite(numbers).all(axis=1) | (reading.depth is not None))
-        numbers = bounded(numbers, reading.depth)
         lacks = partial(_lacking, table, words, names, columns)
-        if times is None:
-            if not whole.all():
-                row = int(np.argmin(whole))
-                raise UsageError(
-                    f"{path}: {_called(path, row)} lacks a number ({lacks(row)}): name the column "
-                    "of its times with --time, so that it can be left out"
-                    f"{', or keep numbers in a range, with --range' if known[row] else ''}"
-                )
-            times = np.empty(0, np.int64)
-        else:
+        if times is not None:
             whole &= times >= 0
-            times = times[whole]
+        elif not whole.all():
+            row = int(np.argmin(whole))
+            raise UsageError(
+                f"{path}: {_called(path, row)} lacks a number ({lacks(row)}): name the column "
+                "of its times with --time, so that it can be left out"
+                f"{', or keep numbers in a range, with --range' if known[row] else ''}"
+            )
         self._places = np.flatnonzero(whole)
-        self._numbers = numbers if whole.all() else numbers[whole]
         self.fields = tuple(names)
-        if not len(self._numbers):
+        if not len(self._places):
             raise UsageError(f"{path}: there is no row with all of {', '.join(names)}")
-        late = self._places[:0]
-        if len(times):
-            late = self._places[times < np.maximum.accumulate(times)]
-            if len(late):
-                order = np.argsort(times, kind="stable")
-                times = times[order]
-                self._numbers, self._places = self._numbers[order], self._places[order]
-            self.times = sorted_times(str(path), times.astype(np.uint64))
-        else:
-            self.times = np.empty(0, np.uint64)
+        self.times, late = np.empty(0, np.uint64), self._places[:0]
+        if times is not None:
+            stamps = times[whole]
+            late = self._places[stamps < np.maximum.accumulate(stamps)]
+            order = np.argsort(stamps, kind="stable")
+            self._places = self._places[order]
+            self.times = sorted_times(str(path), stamps[order])
+        numbers = bounded(numbers, reading.depth)
+        self._numbers = numbers if whole.all() and not len(late) else numbers[self._places]
         used = {of_times, *names} if reading.fields else set(table.column_names)
         self.warnings = [*notes]
         self.warnings += [f"{path}: {said}" for name, said in words.items() if name in used]
@@ -119,19 +113,7 @@ class TableNumbers(ImageStream):
             for name, own in zip(names, columns, strict=True)
             if _has_digits(path, table, name) and _beyond(bounded(own[whole], reading.depth))
         ]
-        left = len(whole) - len(self._numbers)
-        if left:
-            row = int(np.argmin(whole))
-            rows = f"{_called(path, row)} is left out"
-            if left > 1:
-                rows = f"{left} of {len(whole)} rows lack a number or their time and are left out"
-                rows += f", the first is {_called(path, row)}"
-            self.warnings += [f"{path}: {rows}: {lacks(row)}"]
-        if len(late):
-            self.warnings += [
-                f"{path}: rows that stand after later ones: {len(late)} of {len(times)}, the first "
-                f"is {_called(path, late[0])}; they are taken in the order of {of_times}"
-            ]
+        self.warnings += _said_of_rows(path, whole, late, of_times, lacks)
 
     @property
     def count(self) -> int:
@@ -212,6 +194,37 @@ def _table(path: Path) -> tuple[Any, dict[str, Words], list[str]]:
         if twice:
             raise UsageError(f"{path}: two columns are called {twice[0]!r}: rename one of them")
         return table, words, notes
+
+
+def _said_of_rows(
+    path: Path,
+    whole: NDArray[np.bool_],
+    late: NDArray[np.intp],
+    of_times: str,
+    lacks: Callable[[int], str],
+) -> Iterator[str]:
+    """What the user should know of rows.
+
+    Args:
+        path: of the table.
+        whole: (n,) which of them are taken.
+        late: those of these that stand after later ones.
+        of_times: the column of their times.
+        lacks: what a row that is left out lacks, in words.
+    """
+    left, taken = int((~whole).sum()), int(whole.sum())
+    if left:
+        row = int(np.argmin(whole))
+        rows = f"{_called(path, row)} is left out"
+        if left > 1:
+            rows = f"{left} of {len(whole)} rows lack a number or their time and are left out"
+            rows += f", the first is {_called(path, row)}"
+        yield f"{path}: {rows}: {lacks(row)}"
+    if len(late):
+        yield (
+            f"{path}: rows that stand after later ones: {len(late)} of {taken}, the first is "
+            f"{_called(path, late[0])}; they are taken in the order of {of_times}"
+        )
 
 
 def _said_instead(table: Any) -> str:
