@@ -13,6 +13,7 @@ from lying_server import Exchange, lying
 from server_cases import CAMERAS, CASES, Case, Given, check, prepare
 from server_lies import LIES
 
+from cdmisfa.core.errors import CdmisfaError
 from replay.mcap.reader import LogReader
 from replay.storage import tries
 from replay.storage.limits import Limits, limited, limits
@@ -172,7 +173,7 @@ def test_a_server_is_not_asked_for_ever() -> None:
 def test_what_does_not_get_better_is_asked_once() -> None:
     for lie in ("403", "410", "501", "to a file", "packed", "always all of it", "another part"):
         with lying(BODY, LIES[lie]) as server:
-            with pytest.raises(Exception, match=r"^http://127\.0\.0\.1"):
+            with pytest.raises(CdmisfaError, match=r"^http://127\.0\.0\.1"):
                 RemoteStore(Url(server.address))
             assert server.requests == 1, lie
 

@@ -62,7 +62,9 @@ def test_objects_are_where_the_truth_says(recorded):
     truth = source.take(0, FRAMES).truth
     source.close()
     things = [scenery_of(as_table(IcubConfig())).table, *scenery_of(as_table(IcubConfig())).objects]
-    for t, (_, data) in enumerate(messages(recorded / "right.mcap", "/scene")):
+    told = [*messages(recorded / "right.mcap", "/scene")]
+    assert len(told) == FRAMES
+    for t, (_, data) in enumerate(told):
         entities = SceneUpdate_pb2.SceneUpdate.FromString(data).entities
         assert [e.id for e in entities] == ["table", "box", "cylinder", "ball"]
         assert {e.frame_id for e in entities} == {"root"}

@@ -26,7 +26,6 @@ from replay.view.world.first import First
 ITERATIONS, TAU = 420, 40
 NOTHING = First(scene=False, wall=None)
 MIN_MAX = rr.components.AggregationPolicy.MinMax.value
-STEP_AFTER = rr.components.InterpolationMode.StepAfter.value
 
 LEARNERS = {
     "2.0": {"algorithm": "2.0"},
