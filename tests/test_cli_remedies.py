@@ -77,6 +77,25 @@ def test_recover_says_that_it_is_for_mcap_files(
     assert not Path("out.mcap").exists()
 
 
+@pytest.mark.parametrize("key", ["scene.seed", "record.fps"])
+def test_what_only_a_live_scene_can_be_told_is_not_set_in_vain(
+    cdmisfa: Cdmisfa, oscillatory_recording: Path, tmp_path: Path, key: str
+) -> None:
+    """The manifest would state it, whatever was recorded."""
+    table = tmp_path / "numbers.csv"
+    table.write_text("a,b\n" + "1,2\n" * 200)
+    cases: tuple[tuple[object, ...], ...] = (
+        ("learn", oscillatory_recording, "--set", f"{key}=9"),
+        ("learn", table, "--rate", 10, "--set", f"{key}=9"),
+        ("learn", "av:lavfi:testsrc=rate=30", "--set", f"{key}=9"),
+        ("sweep", oscillatory_recording, "--grid", f"{key}=9,10", "-o", tmp_path / "sweep"),
+    )
+    for words in cases:
+        done = cdmisfa(*words)
+        assert (done.code, done.err.count("\n")) == (2, 1), done.err
+        assert f"{key} is for live scenes, and {words[1]} is none: leave it out" in done.err
+
+
 def test_export_writes_no_file_named_dash(
     cdmisfa: Cdmisfa, oscillatory_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,10 +82,11 @@ class CuriousLearner:
         self.modules: list[Module] = []
         self.events: tuple[str, ...] = ()
         self._feature = feature
-        self._n_inputs = count_inputs(config.expansion, spec)
-        if config.components > self._n_inputs:
+        self._n_inputs = inputs = count_inputs(config.expansion, spec)
+        if config.components > inputs:
             raise UsageError(
-                f"learner.components is {config.components}, more than the {self._n_inputs} inputs"
+                f"learner.components is {config.components}, more than the {inputs} inputs: "
+                f"set learner.components={inputs}, or less"
             )
         self.scale = PIXEL if spec.dtype == "uint8" else 1.0
         self.policy_rng = np.random.Generator(

@@ -178,7 +178,7 @@ def outputs_within_components(section: Any, prefix: str) -> None:
     if section.outputs > section.components:
         raise UsageError(
             f"{prefix}.outputs is {section.outputs}, more than {prefix}.components "
-            f"{section.components}"
+            f"{section.components}: lower the one, or raise the other"
         )
 
 

@@ -27,6 +27,7 @@ from cdmisfa.experiments.sources import (
     is_scene,
     learner_of,
     open_logs,
+    refuse_keys_of_scenes,
     scene_kind_for,
     streams_of,
 )
@@ -173,6 +174,8 @@ def plan(
     cameras = cameras or CameraOptions()
     kind, recorded, spec = _identify(words, preset, loop, cameras)
     streams = "" if recorded is None else streams_of(recorded)
+    if recorded is not None:
+        refuse_keys_of_scenes([*settings, *(f"{key}=" for key in grid)], str(words[0]))
     points = [
         dict(zip(grid, map(str, values), strict=True))
         for values in itertools.product(*grid.values())
