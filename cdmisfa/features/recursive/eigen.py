@@ -74,16 +74,16 @@ def eigen(matrix: Float, values: Float, vectors: Float) -> None:
         for _ in range(SWEEPS):
             if not _ql_step(k, values, beside, vectors):
                 break
-    _sort(values, vectors, row)
+    _sort(values, vectors)
 
 
 @reordered
 def _reflectors_to_vectors(product: Float, factors: Float, vectors: Float, row: Float) -> None:
     """Multiply the reflectors in the rows of `vectors` out, and leave their product there."""
     n = product.shape[0]
-    product[:] = 0.0
     for i in range(n):
-        product[i, i] = 1.0
+        for j in range(n):
+            product[i, j] = 1.0 if i == j else 0.0
     for k in range(n - 3, -1, -1):
         if factors[k] == 0.0:
             continue
@@ -145,7 +145,7 @@ def _ql_step(first: int, values: Float, beside: Float, vectors: Float) -> bool:
 
 
 @reordered
-def _sort(values: Float, vectors: Float, row: Float) -> None:
+def _sort(values: Float, vectors: Float) -> None:
     """The largest eigenvalue first, by selection: few change places."""
     n = len(values)
     for i in range(n - 1):
@@ -155,6 +155,5 @@ def _sort(values: Float, vectors: Float, row: Float) -> None:
                 k = j
         if k != i:
             values[i], values[k] = values[k], values[i]
-            row[:] = vectors[i]
-            vectors[i] = vectors[k]
-            vectors[k] = row
+            for j in range(n):
+                vectors[i, j], vectors[k, j] = vectors[k, j], vectors[i, j]

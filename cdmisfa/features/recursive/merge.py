@@ -11,6 +11,7 @@ Source: incremental PCA with a moving mean, Ross et al. 2008.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,16 @@ def multiply(a: Float, b: Float) -> Float:
             share, other = a[i, k], b[k]
             for j in range(b.shape[1]):
                 row[j] += share * other[j]
+    return out
+
+
+@compiled
+def transposed(a: Float) -> Float:
+    """A' with its own rows along memory."""
+    out = np.empty((a.shape[1], a.shape[0]))
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            out[j, i] = a[i, j]
     return out
 
 
@@ -122,14 +133,15 @@ def pivoted_cholesky(gram: Float, most: int, floor: float) -> tuple[Int, Float]:
     )
     for i in range(r):
         left[i] = gram[i, i]
-    floor = max(floor, RANK_TOLERANCE * 1e-2 * left.max())
+    floor = max(floor, RANK_TOLERANCE * 1e-2 * left[_largest(left)])
     count = 0
     while count < len(pivots):
-        pivot = np.argmax(left)
+        pivot = _largest(left)
         if not left[pivot] > floor:
             break
         row, root = factor[count], np.sqrt(left[pivot])
-        row[:] = gram[pivot]
+        for i in range(r):
+            row[i] = gram[pivot, i]
         for k in range(count):
             share, other = factor[k, pivot], factor[k]
             for i in range(r):
@@ -145,6 +157,16 @@ def pivoted_cholesky(gram: Float, most: int, floor: float) -> tuple[Int, Float]:
         for k in range(count - 1):
             row[pivots[k]] = 0.0
     return pivots[:count], factor[:count]
+
+
+@compiled
+def _largest(values: Float) -> int:
+    """Index of the first of the largest values, and of the first NaN where there is one."""
+    largest = 0
+    for i in range(1, len(values)):
+        if not (values[i] <= values[largest] or math.isnan(values[largest])):
+            largest = i
+    return largest
 
 
 @compiled
@@ -167,7 +189,7 @@ def merge(
         gram_of_rows(variance, seen, e, g, m), size + size // 2, floor
     )
     p = len(pivots)
-    rows = np.ascontiguousarray(factor.T)
+    rows = transposed(factor)
     values, vectors = np.zeros(p), np.zeros((p, p))
     eigen(multiply(factor, rows), values, vectors)
     k = 0
@@ -176,30 +198,43 @@ def merge(
     by_row = np.zeros((p, k))  # solves by_row' rows[pivots] = vectors, from the last row on
     for i in range(p - 1, -1, -1):
         own = by_row[i]
-        own[:] = vectors[:k, i]
+        for j in range(k):
+            own[j] = vectors[j, i]
         for q in range(i + 1, p):
             share, other = rows[pivots[q], i], by_row[q]
             for j in range(k):
                 own[j] -= share * other[j]
         for j in range(k):
             own[j] /= rows[pivots[i], i]
-    from_old = pivots < rank
-    old, chosen = pivots[from_old], pivots[~from_old] - rank
+    of_old = 0
+    for i in range(p):
+        if pivots[i] < rank:
+            of_old += 1
+    old, chosen = np.empty(of_old, np.int64), np.empty(p - of_old, np.int64)
     weights, parts = np.zeros((k, p + 1)), np.zeros((p + 1, rank + n))
     moved = 1.0 - np.sqrt(seen / (seen + m))
-    a, b = 0, len(old)
+    a, b = 0, of_old
     for i in range(p):
         pivot = pivots[i]
         if pivot < rank:
-            weights[:, a] = by_row[i] * np.sqrt(seen * variance[pivot])
+            old[a] = pivot
+            weight = np.sqrt(seen * variance[pivot])
+            for j in range(k):
+                weights[j, a] = by_row[i, j] * weight
             parts[a, pivot] = 1.0
-            parts[a, rank:] = e[pivot]
+            for s in range(n):
+                parts[a, rank + s] = e[pivot, s]
             a += 1
         else:
-            weights[:, b] = by_row[i]
-            weights[:, p] -= moved * by_row[i]
-            parts[b, :rank] = e[:rank, pivot - rank + 1]
-            parts[b, rank:] = g[pivot - rank + 1]
+            frame = pivot - rank
+            chosen[b - of_old] = frame
+            for j in range(k):
+                weights[j, b] = by_row[i, j]
+                weights[j, p] -= moved * by_row[i, j]
+            for j in range(rank):
+                parts[b, j] = e[j, frame + 1]
+            for s in range(n):
+                parts[b, rank + s] = g[frame + 1, s]
             b += 1
     for t in range(1, m + 1):
         for j in range(rank):
@@ -207,5 +242,11 @@ def merge(
         for s in range(n):
             parts[p, rank + s] += g[t, s] / m
     seen_by = multiply(weights, parts)
-    turn, frames = np.ascontiguousarray(seen_by[:, :rank]), np.ascontiguousarray(seen_by[:, rank:])
-    return Merge(old, chosen, weights, values[:k] / (seen + m), turn, frames)
+    turn, frames, new = np.empty((k, rank)), np.empty((k, n)), np.empty(k)
+    for i in range(k):
+        new[i] = values[i] / (seen + m)
+        for j in range(rank):
+            turn[i, j] = seen_by[i, j]
+        for s in range(n):
+            frames[i, s] = seen_by[i, rank + s]
+    return Merge(old, chosen, weights, new, turn, frames)

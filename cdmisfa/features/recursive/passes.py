@@ -104,7 +104,9 @@ def rebuild(
         _gather_tile(basis, old, frames, chosen, scale, mean, start, width, rows)
         _combine_tile(weights, rows, width, out)
         for j in range(rank):
-            basis[j, start : start + width] = out[j, :width]
+            own, new = basis[j, start : start + width], out[j]
+            for i in range(width):
+                own[i] = new[i]
         for i in range(width):
             mean[start + i] += step * rows[parts - 1, i]
 

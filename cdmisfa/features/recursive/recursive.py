@@ -23,7 +23,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.features.inner_products import ROWS
 from cdmisfa.features.projection import outputs
 from cdmisfa.features.recursive.eigen import eigen
-from cdmisfa.features.recursive.merge import merge, multiply
+from cdmisfa.features.recursive.merge import merge, multiply, transposed
 from cdmisfa.features.recursive.passes import measure, rebuild
 
 Float = NDArray[np.float64]
@@ -105,16 +105,21 @@ def advance(state: State, frames: NDArray[Any], scale: float, gap: bool, window:
     k = len(done.variance)
     first = 1 if gap or seen == 0 else 0
     count = m - first
-    steps = np.ascontiguousarray(done.frames[:, first + 1 : m + 1] - done.frames[:, first:m])
-    turned = multiply(
-        multiply(done.turn, np.ascontiguousarray(state.differences[:rank, :rank])),
-        np.ascontiguousarray(done.turn.T),
-    )
-    new = multiply(steps, np.ascontiguousarray(steps.T))
+    steps, differences = np.empty((k, count)), np.empty((rank, rank))
+    for i in range(k):
+        for t in range(count):
+            steps[i, t] = done.frames[i, first + t + 1] - done.frames[i, first + t]
+    for i in range(rank):
+        for j in range(rank):
+            differences[i, j] = state.differences[i, j]
+    back = transposed(done.turn)
+    turned = multiply(multiply(done.turn, differences), back)
+    new = multiply(steps, transposed(steps))
     share = 1.0 / max(pairs + count, 1)
-    state.variance[:] = 0.0
-    state.variance[:k] = done.variance
-    state.differences[:] = 0.0
+    for i in range(size):
+        state.variance[i] = done.variance[i] if i < k else 0.0
+        for j in range(size):
+            state.differences[i, j] = 0.0
     for i in range(k):
         for j in range(k):
             both = 0.5 * (turned[i, j] + turned[j, i])  # symmetric whatever rounding does
@@ -122,9 +127,11 @@ def advance(state: State, frames: NDArray[Any], scale: float, gap: bool, window:
     state.counts[0] = k
     state.counts[1] = min(seen + m, window)
     state.counts[2] = min(pairs + count, window)
-    before = multiply(
-        np.ascontiguousarray(state.weights[:, :rank]), np.ascontiguousarray(done.turn.T)
-    )
+    weights = np.empty((len(state.weights), rank))
+    for o in range(len(weights)):
+        for j in range(rank):
+            weights[o, j] = state.weights[o, j]
+    before = multiply(weights, back)
     _slowest(state)
     return _align(state, before)
 
@@ -142,8 +149,11 @@ def _slowest(state: State) -> None:
             matrix[i, j] = state.differences[i, j] * scale[i] * scale[j]
     values, vectors = np.zeros(k), np.zeros((k, k))
     eigen(matrix, values, vectors)
-    state.weights[:] = 0.0
-    state.spectrum[:] = np.nan
+    for o in range(outputs):
+        for i in range(state.weights.shape[1]):
+            state.weights[o, i] = 0.0
+    for o in range(components):
+        state.spectrum[o] = np.nan
     for o in range(k):
         slow = k - 1 - o
         state.spectrum[o] = np.sqrt(max(values[slow], 0.0)) / (2.0 * np.pi)
@@ -178,10 +188,12 @@ def _align(state: State, before: Float) -> float:
                 alike[o, p] += before[o, j] * state.weights[p, j] * state.variance[j]
             alike[o, p] /= np.sqrt(power)
         if alike[o, o] < 0.0:
-            state.weights[o] *= -1.0
-            alike[:, o] *= -1.0
+            for i in range(state.weights.shape[1]):
+                state.weights[o, i] *= -1.0
+            for p in range(outputs):
+                alike[p, o] *= -1.0
     values, vectors = np.zeros(outputs), np.zeros((outputs, outputs))
-    eigen(multiply(alike, np.ascontiguousarray(alike.T)), values, vectors)
+    eigen(multiply(alike, transposed(alike)), values, vectors)
     total = 0.0
     for o in range(outputs):
         total += np.sqrt(max(values[o], 0.0)) / outputs
