@@ -26,10 +26,24 @@ class Bar:
 @contextmanager
 def compiling_said(shown: Bar) -> Iterator[None]:
     """Say so where the body waits for code to be compiled, also where there is no terminal."""
-    from cdmisfa.core.arithmetic.compiled import before_compiling
+    from cdmisfa.core.arithmetic.compiled import told_of_compiling
 
-    line = "compiling for this machine, which is kept: once, up to half a minute"
-    with before_compiling(lambda: shown.say(line)):
+    said = counted = False
+
+    def tell(done: int, of: int) -> None:
+        nonlocal said, counted
+        if not said:
+            said = True
+            shown.say("compiling for this machine, which is kept: once, up to half a minute")
+        if of and not counted:
+            shown.turn_to("compiling", "functions")
+        if of:
+            shown.update(done, of)
+            if done == of:
+                shown.turn_to("learning", "blocks")
+            counted = done < of
+
+    with told_of_compiling(tell):
         yield
 
 

@@ -32,12 +32,17 @@ def portable() -> bool:
     return _PORTABLE.get()
 
 
+def portable_wanted(of: Any) -> bool:
+    """What a learner, or its configuration, says of the arithmetic that it computes with."""
+    return bool(getattr(getattr(of, "config", of), "portable", False))
+
+
 def in_own_arithmetic(function: Function) -> Function:
     """Have a learner's method, or what takes its configuration first, do what `portable` says."""
 
     @functools.wraps(function)
     def computing(first: Any, *args: Any, **kwargs: Any) -> Any:
-        wanted = getattr(getattr(first, "config", first), "portable", False)
+        wanted = portable_wanted(first)
         if wanted == _PORTABLE.get():
             return function(first, *args, **kwargs)
         with portable_bits(wanted):

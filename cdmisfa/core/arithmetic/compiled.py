@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -144,13 +145,28 @@ class _ForPython:
         with contextlib.suppress(LookupError):
             name = self._name(args)
             if runs_alone():
-                code = self._from_disk(name) or self._compiled(name, args)
+                code = self._from_disk(name)
+                if code is None and _others_compiled():
+                    code = self._from_disk(name)
+                code = code or self._compiled(name, args)
         if code is None:
             return cast(Callable[..., Any], self._dispatcher)
         with contextlib.suppress(Exception):
             self._types = fingerprint()
             self._codes[self._types(args)] = code
         return code
+
+    def ready(self, args: tuple[Any, ...]) -> None:
+        """Have it compiled for arguments of these types, and on disk, without calling it."""
+        if not self.on_disk(args):
+            self._compiled(self._name(args), args)
+
+    def on_disk(self, args: tuple[Any, ...]) -> bool:
+        """Whether that is so, or cannot be."""
+        try:
+            return not runs_alone() or recalled(self._name(args), self._source) is not None
+        except Exception:
+            return False
 
     def _from_disk(self, name: str) -> Callable[..., Any] | None:
         with contextlib.suppress(Exception):
@@ -180,7 +196,7 @@ class _ForPython:
         function = self._function
         place = f"{function.__qualname__}:{function.__code__.co_firstlineno}"
         options = [(k, sorted(v) if isinstance(v, set) else v) for k, v in self._options.items()]
-        return f"{place} {options} {described(args)}"
+        return f"{place} {options} {json.dumps(described(args))}"
 
 
 def _unseen(args: tuple[Any, ...]) -> bytes:
@@ -207,7 +223,8 @@ def _named_apart(function: Callable[..., Any], form: str) -> Callable[..., Any]:
 
 
 _PREPARATIONS: list[Callable[[], None]] = []
-_WAITING: list[Callable[[], None]] = []
+_TOLD: list[Callable[[int, int], None]] = []
+_OTHERS: list[Callable[[], None]] = []
 
 
 @cache
@@ -219,8 +236,7 @@ def compiler() -> Any:
 
     class Tell(event.Listener):
         def on_start(self, event: Any) -> None:
-            while _WAITING:
-                _WAITING.pop()()
+            tell_compiling(0, 0)
 
         def on_end(self, event: Any) -> None:
             """Nothing."""
@@ -254,13 +270,46 @@ def before_the_first(prepare: Callable[[], None]) -> None:
 
 
 @contextmanager
-def before_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Call a function once, as soon as something is compiled that is not on disk yet."""
+def told_of_compiling(tell: Callable[[int, int], None]) -> Iterator[None]:
+    """Call a function whenever something is compiled that is not on disk yet.
+
+    Args:
+        tell: gets how many functions are compiled, and of how many; 0 where that is not known.
+    """
     if "numba" in sys.modules:  # others may compile, too
         compiler()
-    _WAITING.append(tell)
+    _TOLD.append(tell)
     try:
         yield
     finally:
-        if tell in _WAITING:
-            _WAITING.remove(tell)
+        _TOLD.remove(tell)
+
+
+def tell_compiling(done: int, of: int) -> None:
+    """Tell all who are to be told; see `told_of_compiling`."""
+    for tell in tuple(_TOLD):
+        tell(done, of)
+
+
+@contextmanager
+def before_one_is_compiled(compile_others: Callable[[], None]) -> Iterator[None]:
+    """Call a function once, where the first compiled one is called that is not on disk.
+
+    Args:
+        compile_others: may have that one compiled, too.
+    """
+    _OTHERS.append(compile_others)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):
+            _OTHERS.remove(compile_others)
+
+
+def _others_compiled() -> bool:
+    """Whether functions were compiled that had waited for the first one."""
+    waiting = list(_OTHERS)
+    for compile_others in waiting:
+        _OTHERS.remove(compile_others)
+        compile_others()
+    return bool(waiting)

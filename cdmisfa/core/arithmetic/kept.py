@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import os
 import pickle
 import platform
@@ -175,26 +176,61 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
-def described(args: tuple[Any, ...]) -> str:
-    """The types of arguments in words, the same in every process.
+def described(value: Any) -> Any:
+    """The type of an argument as JSON values, the same in every process.
 
     Raises:
-        LookupError: there are none for one of them.
+        LookupError: there is no description of it.
     """
-    return ", ".join(map(_described, args))
-
-
-def _described(value: Any) -> str:
     kind = type(value)
-    name = f"{kind.__module__}.{kind.__qualname__}"
+    name = f"{kind.__module__}:{kind.__qualname__}"
     if kind is np.ndarray:
         flags = value.flags
         order = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
-        return f"{order}{flags.aligned:d}{flags.writeable:d}{value.ndim}{value.dtype!r}"
+        order += "" if flags.aligned else " unaligned"
+        order += "" if flags.writeable else " readonly"
+        return [order, value.ndim, _as_json(np.lib.format.dtype_to_descr(value.dtype))]
     if isinstance(value, tuple):
-        return f"{name}({described(value)})"
+        return {name: [described(one) for one in value]}
     if kind in (bool, float) or isinstance(value, np.number | np.bool):
         return name
     if kind is int and -(2**63) <= value < 2**63:
         return name
     raise LookupError(f"{name} is not known here")
+
+
+def example_of(description: Any) -> Any:
+    """A value of a type that was described.
+
+    Raises:
+        Exception: there is no such type, or it cannot be made.
+    """
+    if isinstance(description, list):
+        (order, *but), ndim, dtype = description[0].split(), *description[1:]
+        array = np.zeros((4,) * ndim, _as_dtype(dtype), order="F" if order == "F" else "C")
+        array = array[(slice(None, None, 2),) * ndim] if order == "A" else array
+        array.flags.writeable = "readonly" not in but
+        value: Any = array
+    elif isinstance(description, dict):
+        ((name, parts),) = description.items()
+        values = map(example_of, parts)
+        value = tuple(values) if name == "builtins:tuple" else _named(name)(*values)
+    else:
+        value = _named(description)()
+    if described(value) != description:
+        raise LookupError(f"no value of {description}")
+    return value
+
+
+def _named(name: str) -> Any:
+    module, _, kind = name.partition(":")
+    return getattr(importlib.import_module(module), kind)
+
+
+def _as_json(descr: Any) -> Any:
+    return [_as_json(one) for one in descr] if isinstance(descr, list | tuple) else descr
+
+
+def _as_dtype(descr: Any) -> np.dtype[Any]:
+    fields = [tuple(field) for field in descr] if isinstance(descr, list) else descr
+    return np.lib.format.descr_to_dtype(fields)
