@@ -266,7 +266,10 @@ def choose_images(
     if topic in others and reading.fields:
         raise UsageError(f"{path}: {topic} holds {others[topic]}, whose fields are not known")
     if topic in others:
-        raise UsageError(f"{path}: {topic} holds {others[topic]}, images are {', '.join(SCHEMAS)}")
+        raise UsageError(
+            f"{path}: {topic} holds {others[topic]}, which is no image: numbers are taken with "
+            f"--field; images are {', '.join(SCHEMAS)}"
+        )
     raise UsageError(f"{path}: no topic {topic}; it has {what} on: {known}")
 
 
