@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import hashlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,20 +17,18 @@ from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig
-from recorder.log.begun import Begun, keep_recording, read_recording
+from recorder.log.begun import Begun, keep_recording
 from recorder.log.folder import (
     folder_here,
     holds_recording,
     prepared_folder,
     refuse_existing,
-    view_logs,
 )
 from recorder.log.resume import (
-    FramesHeld,
     finished_logs,
-    frames_held,
     other_recordings,
     resume_view,
+    resume_views,
     set_log_aside,
 )
 from recorder.log.split import Split
@@ -49,9 +47,6 @@ DEFAULT_FRAMES = 1000
 
 Progress = Callable[[float], None]
 """Told, after every block, how many frames have been written of every view."""
-
-Earlier = Mapping[str, Mapping[Path, FramesHeld]]
-"""What the files of each view hold that an earlier attempt left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,15 +129,7 @@ def record(
     settings = settings or (RecordConfig() if scene is None else scene.record)
     folder = folder_here(folder)
     length = source.spec.length
-    if frames is not None and not 1 <= frames <= (length or frames):
-        most = "" if length is None else f", and no more than the {length} that there are"
-        raise UsageError(f"--frames is {frames}: record at least one{most}")
-    if not 1 <= jobs <= MAX_JOBS:
-        raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
-    if jobs > 1 and scene is None:
-        raise UsageError(f"--jobs is {jobs}: only a scene can be opened by several processes")
-    if force and resume:
-        raise UsageError("--force starts anew and --resume goes on: use one of them")
+    _refuse_arguments(length, scene, frames, jobs, force=force, resume=resume)
     if not resume:
         refuse_existing(folder, force=force)
     elif not holds_recording(folder):
@@ -157,27 +144,12 @@ def record(
     with ExitStack() as open_logs:
         stale = other_recordings(folder, identity) if force else []
         open_logs.enter_context(prepared_folder(folder, chosen if force else (), stale))
-        earlier: Earlier = {view: {} for view in chosen}
-        wanted: Mapping[str, int] = {}
         if resume:
-            begun = read_recording(folder)
-            wanted = begun.options["frames"]
-            earlier, split, frames = _as_begun(folder, begun, identity, chosen, split, frames)
-        frames = frames or length or DEFAULT_FRAMES
-        places = {
-            view: resume_view(
-                folder,
-                view,
-                identity,
-                split,
-                there,
-                frames,
-                ended=identity.gaps and view not in wanted,
-            )
-            for view, there in earlier.items()
-        }
-        if resume and (others := other_recordings(folder, identity)):
-            raise UsageError(f"{others[0]} is of another recording: overwrite with --force")
+            default = length or DEFAULT_FRAMES
+            places, split, frames = resume_views(folder, identity, chosen, split, frames, default)
+        else:
+            frames = frames or length or DEFAULT_FRAMES
+            places = {v: resume_view(folder, v, identity, split, {}, frames) for v in chosen}
         unfinished = [view for view, place in places.items() if not place.complete]
         if unfinished:
             lengths = dict.fromkeys(unfinished, frames)
@@ -226,6 +198,27 @@ def record(
             log.finish()
         keep_recording(folder, chosen)
     return [view_recording(view, path, n) for view, done in parts.items() for path, n in done]
+
+
+def _refuse_arguments(
+    length: int | None,
+    scene: OpenScene | None,
+    frames: int | None,
+    jobs: int,
+    *,
+    force: bool,
+    resume: bool,
+) -> None:
+    """Refuse what `record` cannot do with a source of a length, or without a scene."""
+    if frames is not None and not 1 <= frames <= (length or frames):
+        most = "" if length is None else f", and no more than the {length} that there are"
+        raise UsageError(f"--frames is {frames}: record at least one{most}")
+    if not 1 <= jobs <= MAX_JOBS:
+        raise UsageError(f"--jobs is {jobs}: use 1 to {MAX_JOBS}")
+    if jobs > 1 and scene is None:
+        raise UsageError(f"--jobs is {jobs}: only a scene can be opened by several processes")
+    if force and resume:
+        raise UsageError("--force starts anew and --resume goes on: use one of them")
 
 
 def record_scene(
@@ -321,56 +314,6 @@ def identity_of(
         {"scene": scene.table(), "record": as_table(clock)},
         SCENES[scene.name].packages,
     )
-
-
-def _as_begun(
-    folder: Path,
-    begun: Begun,
-    identity: Identity,
-    views: Sequence[str],
-    split: Split | None,
-    frames: int | None,
-) -> tuple[Earlier, Split | None, int]:
-    """What there is of a recording that is resumed, where its parts end, and its frames.
-
-    Raises:
-        UsageError: it was begun with another scene, seed or split, or has more frames.
-    """
-    limits, lengths = (
-        [begun.options[name][view] for view in views if view in begun.options[name]]
-        for name in ("split", "frames")
-    )
-    limit = min(limits, default=None)
-    kind, seed = identity.kind, identity.seed
-    for option, before, now in (
-        ("", "".join(begun.source) or kind, kind),
-        ("--seed ", begun.options.get("seed", seed), seed),
-        ("--split ", limit, limit if split is None else str(split)),
-    ):
-        if before not in (None, now):
-            raise UsageError(
-                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
-                "same, or overwrite with --force"
-            )
-    if split is None and limit is not None:
-        split = Split.parse(limit)
-    earlier = {
-        view: {path: frames_held(path, view, gaps=identity.gaps) for path in logs}
-        for view, logs in view_logs(folder, views).items()
-    }
-    unfinished = not all(
-        files and all(p.suffix == ".mcap" for p in files) for files in earlier.values()
-    )
-    if unfinished and not lengths:
-        lengths = [identity.spec.length or DEFAULT_FRAMES]
-    for path, there in (item for files in earlier.values() for item in files.items()):
-        if frames is not None and there.end > frames:
-            raise UsageError(
-                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
-                f"nothing, give --frames {there.end} or more, or overwrite with --force"
-            )
-        lengths.append(there.end)
-    return earlier, split, frames or max(lengths)
 
 
 def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = False) -> None:

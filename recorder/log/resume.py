@@ -11,7 +11,7 @@ import contextlib
 import itertools
 import os
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from mcap.reader import NonSeekingReader
 from mcap.records import Channel, Message
 
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
+from recorder.log.begun import Begun, read_recording
 from recorder.log.folder import RECORDING, logs_in, part_name, part_number, view_logs
 from recorder.log.messages import RECORDING_METADATA, view_topic
 from recorder.log.split import Split
@@ -60,6 +61,10 @@ class FramesHeld(NamedTuple):
         """Up to before which frame all from a given one on are there."""
         follows = self.first == first or (self.gaps and self.first > first)
         return self.stop if self.end and follows else first
+
+
+Earlier = Mapping[str, Mapping[Path, FramesHeld]]
+"""What the files of each view hold that an earlier attempt left."""
 
 
 def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
@@ -185,6 +190,93 @@ def resume_view(
             "part first, or overwrite with --force"
         )
     return place
+
+
+def resume_views(
+    folder: Path,
+    identity: Identity,
+    views: Sequence[str],
+    split: Split | None,
+    frames: int | None,
+    default: int,
+) -> tuple[dict[str, Resume], Split | None, int]:
+    """Find where each view of a recording is resumed. Changes nothing.
+
+    Args:
+        folder: of the recording.
+        identity: what is recorded.
+        views: names of the views.
+        split: where parts end; None for where they did.
+        frames: how many each view shall have; None for as many as it was begun with.
+        default: as many, where the recording does not say how it was begun.
+
+    Returns:
+        The place of each view, where parts end, and the frames of each view.
+
+    Raises:
+        UsageError: it was begun with another source, seed or split, has more frames, or there are
+            files of another recording.
+    """
+    begun = read_recording(folder)
+    earlier, split, frames = _as_begun(folder, begun, identity, views, split, frames, default)
+    places = {}
+    for view, there in earlier.items():
+        ended = identity.gaps and view not in begun.options["frames"]
+        places[view] = resume_view(folder, view, identity, split, there, frames, ended=ended)
+    if others := other_recordings(folder, identity):
+        raise UsageError(f"{others[0]} is of another recording: overwrite with --force")
+    return places, split, frames
+
+
+def _as_begun(
+    folder: Path,
+    begun: Begun,
+    identity: Identity,
+    views: Sequence[str],
+    split: Split | None,
+    frames: int | None,
+    default: int,
+) -> tuple[Earlier, Split | None, int]:
+    """What there is of a recording that is resumed, where its parts end, and its frames.
+
+    Raises:
+        UsageError: it was begun with another scene, seed or split, or has more frames.
+    """
+    limits, lengths = (
+        [begun.options[name][view] for view in views if view in begun.options[name]]
+        for name in ("split", "frames")
+    )
+    limit = min(limits, default=None)
+    kind, seed = identity.kind, identity.seed
+    for option, before, now in (
+        ("", "".join(begun.source) or kind, kind),
+        ("--seed ", begun.options.get("seed", seed), seed),
+        ("--split ", limit, limit if split is None else str(split)),
+    ):
+        if before not in (None, now):
+            raise UsageError(
+                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
+                "same, or overwrite with --force"
+            )
+    if split is None and limit is not None:
+        split = Split.parse(limit)
+    earlier = {
+        view: {path: frames_held(path, view, gaps=identity.gaps) for path in logs}
+        for view, logs in view_logs(folder, views).items()
+    }
+    unfinished = not all(
+        files and all(p.suffix == ".mcap" for p in files) for files in earlier.values()
+    )
+    if unfinished and not lengths:
+        lengths = [default]
+    for path, there in (item for files in earlier.values() for item in files.items()):
+        if frames is not None and there.end > frames:
+            raise UsageError(
+                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
+                f"nothing, give --frames {there.end} or more, or overwrite with --force"
+            )
+        lengths.append(there.end)
+    return earlier, split, frames or max(lengths)
 
 
 def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
