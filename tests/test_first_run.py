@@ -79,7 +79,7 @@ def test_listed_is_what_runs_call() -> None:
 
 
 FIRST_RUN = """
-import json, sys
+import os, sys
 from pathlib import Path
 from cdmisfa.agents.exploration import decay
 from cdmisfa.core.arithmetic import first_run
@@ -87,6 +87,7 @@ from cdmisfa.core.arithmetic.choice import portable_bits
 from cdmisfa.core.arithmetic.compiled import told_of_compiling
 from cdmisfa.features.slowness import slowness, window_rate
 
+os.sched_getaffinity = lambda process: {0, 1}
 first_run.LISTED = Path(sys.argv[1])
 told = []
 with told_of_compiling(lambda *counts: told.append(counts)):
@@ -153,9 +154,17 @@ def test_what_is_listed_by_mistake_harms_nothing(tmp_path: Path) -> None:
     assert [line.split()[0] for line in functions] == ["True", "True", "False"]
 
 
+@pytest.mark.parametrize("cores", [1, 2])
 def test_without_another_process_one_compiles_all(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cores: int
 ) -> None:
+    tried: list[Any] = []
+
+    def refuse(*arguments: Any) -> None:
+        tried.append(arguments)
+        raise OSError("Resource temporarily unavailable")
+
+    monkeypatch.setattr("os.sched_getaffinity", lambda process: set(range(cores)))
     monkeypatch.setattr("cdmisfa.core.processes.Workers.submit", refuse)
     monkeypatch.setattr("cdmisfa.core.arithmetic.first_run.LISTED", tmp_path / "listed.json")
     (tmp_path / "listed.json").write_text(json.dumps({"learning": CALLS}))
@@ -165,11 +174,7 @@ def test_without_another_process_one_compiles_all(
 
     with compiled_by_two({"learning": False}):
         assert compiled(halved)(3.0) == 1.5
-
-
-def refuse(*arguments: Any) -> None:
-    """Stand for what a system says that starts no more processes."""
-    raise OSError("Resource temporarily unavailable")
+    assert len(tried) == cores - 1
 
 
 def halved(x: float) -> float:

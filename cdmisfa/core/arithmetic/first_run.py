@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -50,7 +51,7 @@ def _compile_all(parts: Mapping[str, bool]) -> None:
         for function, types in listed.get(part, ())
         if not _ready(call := _Call(function, types, portably), look=True)
     ]
-    if len(calls) < 2:
+    if len(calls) < 2 or len(os.sched_getaffinity(0)) < 2:
         return
     from cdmisfa.core.processes import Workers  # of no use to later runs
 
