@@ -38,7 +38,7 @@ from recorder.log.whole import refuse_taken, refuse_unless_png, whole
 from recorder.world.rendering import render_in_processes, take_here
 from recorder.world.scenes import SCENES, OpenScene, open_scene, scene_of
 
-MAX_JOBS = 256
+MAX_JOBS = 1024
 
 _FILE_NAME = re.compile(r"[\w-][\w.-]*")
 

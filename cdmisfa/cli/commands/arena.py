@@ -27,7 +27,11 @@ ALL = "all"
 )
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
 @click.option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")
-@click.option("--frames", type=click.IntRange(1), help="Stop a run after so many, not the set's.")
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    help="Stop a run after so many frames, instead of the set's number.",
+)
 @options.settings
 @options.jobs
 @options.engine

@@ -133,10 +133,14 @@ def _kernel_cache() -> Iterator[Check]:
     root = Path(__file__).parents[3]
     rooms = "cdmisfa/agents", "cdmisfa/features/incsfa", "recorder/images", "replay/recordings"
     folders = [folder_of(root / room / "__init__.py") for room in rooms]
+    found = sorted({str(folder) for folder in folders if folder is not None})
     kept = None not in folders
-    detail = ", ".join(dict.fromkeys(map(str, folders)))
     if not kept:
         detail = "no folder can be written: set NUMBA_CACHE_DIR to one"
+    elif len(found) == 1:
+        detail = found[0]
+    else:
+        detail = f"{len(found)} folders below {os.path.commonpath(found)}"
     yield Check("kernel cache", kept, detail, "a quick start the second time")
 
 

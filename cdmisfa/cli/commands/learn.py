@@ -127,7 +127,7 @@ def learn_command(
     Or it is live streams, one or several: camera:/dev/video0, rtsp://, http://.../x.mjpg, tcp://,
     av:ADDRESS, foxglove://HOST:PORT/TOPIC, gym:TASK.
 
-    With --resume it is that of the run, and need not be given.
+    With --resume it need not be given: it is what the run learned from.
     """
     if resume and out is None:
         raise click.UsageError("--resume needs -o RUN, the run to resume")

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 @click.command("reproduce")
 @click.argument("name", required=False)
 @options.out("Folder of the results [default: reproduction].")
-@click.option("--trials", type=click.IntRange(1), help="Trials per condition, not the paper's.")
+@click.option(
+    "--trials", type=click.IntRange(1), help="Trials per condition, instead of the paper's number."
+)
 @options.jobs
 @options.engine
 @click.option("--recording", type=click.Path(path_type=Path), help="Recording of the iCub scene.")
