@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,8 +24,13 @@ ROW = re.compile(r"^\| \((P?\d+)\) \|.*?\| `([\w/]+\.py)` `(\w+)` \|$", re.MULTI
 Place = tuple[str, str]
 
 
-def stated() -> Iterator[tuple[str, Place]]:
+@cache
+def stated() -> list[tuple[str, Place]]:
     """Every `Equation:` line of a docstring: what it says, and of which function."""
+    return list(_stated())
+
+
+def _stated() -> Iterator[tuple[str, Place]]:
     for package in ("cdmisfa", "recorder", "replay"):
         for file in sorted((ROOT / package).rglob("*.py")):
             for node in ast.walk(ast.parse(file.read_text("utf-8"))):
