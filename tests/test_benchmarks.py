@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -178,12 +180,23 @@ def test_recursive() -> None:
         assert call() >= 1
 
 
-def test_recorder(tmp_path: Path) -> None:
+def test_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert recorder.rendering("oscillatory", 4)() == 12
     assert recorder.recording("oscillatory", 4, tmp_path, 1)() == 12
-    frame, start = recorder.steady_and_start("oscillatory", 500, tmp_path, 1, 1)
-    assert 0 < frame < 1e6
-    assert start > -1
+    clock = 0.0
+
+    def recording(scene: str, frames: int, folder: Path, jobs: int) -> Callable[[], int]:
+        def call() -> int:
+            nonlocal clock
+            clock += 2.0 + 3 * frames * 1e-4
+            return 3 * frames
+
+        return call
+
+    monkeypatch.setattr(recorder, "recording", recording)
+    monkeypatch.setattr(recorder, "time", SimpleNamespace(perf_counter=lambda: clock))
+    found = recorder.steady_and_start("oscillatory", 500, tmp_path, 1, 2)
+    assert found == pytest.approx((100.0, 2.0))
 
 
 @pytest.mark.parametrize("name", list(foreign.CASES))
