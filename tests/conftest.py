@@ -20,6 +20,10 @@ if "TMPDIR" not in os.environ and MEMORY.is_dir() and shutil.disk_usage(MEMORY).
     # What tests write is synced some thousand times, which a disk takes milliseconds for.
     os.environ["TMPDIR"] = tempfile.tempdir = str(MEMORY)
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Other cores have processes of their own: threads for one product would wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Compiling takes longer than any deadline, and a test run says the same thing every time.
 hypothesis.settings.register_profile("cdmisfa", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("cdmisfa")
