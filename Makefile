@@ -3,12 +3,14 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: demo test lint bench pictures fuzz torture clean install
+.PHONY: demo test suite lint bench pictures fuzz torture clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
 
-test: lint
+test: lint suite
+
+suite: $(INSTALLED)
 	$(BIN)/pytest -n 2 --dist loadgroup
 
 lint: $(INSTALLED)
