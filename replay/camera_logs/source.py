@@ -143,7 +143,7 @@ class ForeignSource(LoggedSource):
                 self._streams.append(open_images(path, topic, salvage=salvage, reading=reading))
             if align != "index":
                 self._streams = join_parts(self._streams)
-            if len({bool(stream.fields) for stream in self._streams}) > 1:  # whatever the clock
+            if len({bool(stream.fields) for stream in self._streams}) > 1:  # with any --align
                 framings([self._image(i, 0) for i in range(len(self._streams))], None, fit)
             self._align_by = align
             self._fps = rate or rate_of(self._streams)

@@ -43,7 +43,7 @@ class VideoMessages(ImagesOf):
             start = row
             while start not in (self._first, self._next) and not self._begins(start):
                 start -= 1
-                if start in self._broken:  # of which all behind it are made
+                if start in self._broken:  # of which those behind it are made
                     raise self._broken[start]
             if start != self._next:
                 self._packets.forget()

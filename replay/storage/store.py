@@ -258,7 +258,7 @@ class FileStore(Store):
                 for one in [f for f in _OPEN if f is not self][:above]:
                     closed = _OPEN.pop(one)
                     if one.path.suffix == PARTIAL:
-                        with contextlib.suppress(OSError):  # it is not known again
+                        with contextlib.suppress(OSError):  # then it is not opened again
                             one._mark = one._marks(closed)
 
 

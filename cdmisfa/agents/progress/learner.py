@@ -261,7 +261,7 @@ class ProgressLearner:
                 if own["visits"] - own["decided"] < PATIENCE * self._window:
                     return self._say(stream, "is begun anew: what was slow in it has come to rest")
                 why = NO_PROGRESS
-            if why == NO_PROGRESS and module >= 0:  # then that module is the best there is
+            if why == NO_PROGRESS and module >= 0:  # it gives what can be found there
                 return self._settle(stream, candidate, module)
             if why:
                 decide(own, GIVEN_UP, -1, float(candidate.tested[0]), REASONS.index(why))

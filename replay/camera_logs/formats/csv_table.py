@@ -83,7 +83,7 @@ def line_of(path: Path, row: int) -> int:
         path: of the file.
         row: after the line of names, from 0.
     """
-    unread = contextlib.suppress(cells.Error, OSError)  # then most files have a row in each line
+    unread = contextlib.suppress(cells.Error, OSError)  # then a row in each line is the best guess
     with unread, path.open(encoding="latin-1", newline="") as file:
         separator = _separator(file.readline(_HEAD))
         file.seek(0)

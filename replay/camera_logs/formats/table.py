@@ -77,7 +77,7 @@ class TableNumbers(ImageStream):
         with arrow_explained(path, remedy="take fewer columns, with --field"):
             columns = [_column(path, table, name) for name in names]
         numbers = np.concatenate(columns, axis=1)
-        # What is missing is beyond no bounds.
+        # A missing number is not out of bounds: --range keeps no row without one.
         known = ~np.any([np.isnan(own).all(axis=1) for own in columns], axis=0)
         whole = known & (np.isfinite(numbers).all(axis=1) | (reading.depth is not None))
         lacks = partial(_lacking, table, words, names, columns)
