@@ -69,7 +69,7 @@ def test_a_field_names_numbers(path: str, found: list[float]) -> None:
         ("velocity", "there is no velocity, it has position, on, pose"),
         ("pose.position.z", "there is no z, it has x, y"),
         ("pose", "is no number but dict: name one of its fields: position"),
-        ("name", "is no number but str: name another"),
+        ("name", "is no number but a text: name another"),
         ("position[3]", "there are 3 members only"),
         ("pose[0]", "what the index is of is no list"),
         ("position.x", "there is no x, it is no message"),
@@ -321,7 +321,7 @@ def test_lists_in_a_table_are_taken_apart(tmp_path: Path) -> None:
     [
         ({}, "tells no rate: set one with --rate, or name the column of its times with --time"),
         ({"fields": ["z"], "rate": 5}, "there is no column z; it has s, a, word"),
-        ({"fields": ["word"], "rate": 5}, "line 2: --field word is no number but str"),
+        ({"fields": ["word"], "rate": 5}, "line 2: --field word is no number but a text"),
         ({"time": "z"}, "there is no column z; it has s, a, word"),
         ({"time": "word"}, "word holds string, as 'x', neither numbers nor dates"),
         ({"time": "s:h"}, "A unit is one of s, ms, us, ns"),

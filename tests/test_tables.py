@@ -70,7 +70,7 @@ def test_a_column_of_words_is_left_out_and_said_where_it_has_numbers(tmp_path: P
     assert frames == [[i] for i in range(ROWS)]
     (line,) = said
     assert line.endswith("in 6 of 12 rows, the first is 'ok' in line 4, and is left out")
-    with pytest.raises(UsageError, match="line 2: --field b is no number but str"):
+    with pytest.raises(UsageError, match="line 2: --field b is no number but a text"):
         taken(path, fields=["b"])
     assert taken(written(tmp_path, {i: f"{i / 10},{i},ok" for i in range(ROWS)}))[1] == ()
 
@@ -251,7 +251,7 @@ def test_whole_numbers_that_float64_rounds_are_said(tmp_path: Path, name: str) -
             "state[1:4]",
             r"row 0: --field state\[1:4\]: there are 3 members only, all of them are \[",
         ),
-        ("word", "t.parquet: row 0: --field word is no number but str: name another"),
+        ("word", "t.parquet: row 0: --field word is no number but a text: name another"),
         ("a.b", "t.parquet: row 0: --field a.b is no number but dict: name one of its fields: x"),
         ("n[0]", r"t.parquet: row 0: --field n\[0\]: what the index is of is no list"),
     ],
