@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections import deque
@@ -153,11 +152,10 @@ class Readers:
                 why = (
                     f"{name} ended" if reading.came else f"{name} ended before a picture of it came"
                 )
+            except CdmisfaError as error:
+                why = str(error)
             except Exception as error:
-                if not isinstance(error, CdmisfaError):
-                    why = f"{name} is gone: {one_line(error)}"
-                else:
-                    why = str(error)
+                why = f"{name} is gone: {one_line(error)}"
             if not self._is_on(reading, epoch):
                 return
             if not reading.came or reading.camera.finite or self._on_loss == "end":
@@ -174,7 +172,7 @@ class Readers:
                 self._say(f"{why}: connecting to it anew")
             self._closed.wait(delay)
             reading.away, reading.heard = False, self.now()
-            delay = math.ldexp(delay, 1) if delay < longest / 2 else longest
+            delay = min(2 * delay, longest)
 
     def _is_on(self, reading: _Reading, epoch: int) -> bool:
         return reading.epoch == epoch and not self._closed.is_set()
