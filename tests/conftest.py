@@ -48,6 +48,11 @@ collect_ignore = ["toy_plugin"]  # a package's own tests, run where it is instal
 Cdmisfa = Callable[..., Outcome]
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what would leave other processes idle at the end: a browser is slow to draw."""
+    items.sort(key=lambda item: item.path.name != "test_web.py")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _signalled_children() -> None:
     """What tests begin and end with signals ends, though the tests were begun under nohup."""
