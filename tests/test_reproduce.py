@@ -18,7 +18,15 @@ from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.core.errors import NotReproducedError, UsageError
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.paper import costs, difficulty, icub, nonstationary, oscillatory, reproduce
+from cdmisfa.paper import (
+    costs,
+    difficulty,
+    icub,
+    nonstationary,
+    oscillatory,
+    reproduce,
+    stability,
+)
 from cdmisfa.paper.reproduce import Request, Trial
 from recorder.world.oscillatory import OscillatorySource
 
@@ -27,6 +35,13 @@ SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 
 def request(folder: Path, trials: int | None = None, **keys: Any) -> Request:
     return Request(trials, True, None, folder, **keys)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figures, which take a second each, where they are not looked at."""
+    for module in (oscillatory, stability):
+        monkeypatch.setattr(module, "draw", lambda trials, folder: [])
 
 
 @pytest.mark.parametrize("name", ["oscillatory", "five", "stability", "costs", "difficulty"])
@@ -69,6 +84,7 @@ def test_finished_trials_are_kept_and_the_figures_are_the_same_bytes(
     assert {f: (tmp_path / f).read_bytes() for f in again["figures"]} == pictures
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_more_trials_run_only_what_is_missing(tmp_path: Path) -> None:
     reproduce.reproduce("stability", request(tmp_path, trials=1))
     counts: list[int] = []
@@ -78,6 +94,7 @@ def test_more_trials_run_only_what_is_missing(tmp_path: Path) -> None:
     assert counts == [2, 3, 4]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_results_of_more_or_other_trials_are_replaced_only_with_force(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +112,7 @@ def test_results_of_more_or_other_trials_are_replaced_only_with_force(
     assert json.loads((folder / "results.json").read_text())["trials"] == 2
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_killed_reproduction_goes_on_where_it_stopped(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cdmisfa", "reproduce", "oscillatory"]
     command += ["-o", str(tmp_path), "--trials", "400"]
@@ -113,17 +131,17 @@ def test_a_killed_reproduction_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert {n: (trials / n).stat().st_mtime_ns for n in kept} == kept
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_two_processes_give_the_rows_of_one(tmp_path: Path) -> None:
     one = reproduce.reproduce("stability", request(tmp_path / "1", trials=1))
     two = reproduce.reproduce("stability", request(tmp_path / "2", trials=1, jobs=2))
     assert two == one
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_claim_that_fails_exits_4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from cdmisfa.paper import stability
-
     monkeypatch.setattr(stability, "run", _unstable)
     assert cdmisfa(["reproduce", "stability", "--trials", "1", "-o", str(tmp_path)]) == 4
     assert "stability did not come out: 2.0 keeps its policy" in capsys.readouterr().err
@@ -159,6 +177,7 @@ def test_check_names_every_failed_claim() -> None:
         reproduce.check({"experiment": "x", "claims": claims})
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_damaged_trial_is_named(tmp_path: Path) -> None:
     reproduce.reproduce("stability", request(tmp_path, trials=1))
     damaged = next((tmp_path / "trials").glob("*.npz"))
