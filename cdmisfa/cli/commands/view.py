@@ -228,37 +228,24 @@ def play_command(
 
     cameras = CameraOptions(**chosen)
     with bar("playing", "s") as shown, stoppable(notice="") as stop:
+        how: dict[str, Any] = {
+            "rate": rate,
+            "fps": fps,
+            "cameras": cameras,
+            "about": say_about,
+            "loop": loop,
+            "stop": stop,
+            "progress": shown.update,
+        }
         if target == "foxglove":
             from replay.playing.as_robot import PORT, play_as_robot
 
-            played = play_as_robot(
-                recording,
-                rate=rate,
-                fps=fps,
-                cameras=cameras,
-                about=say_about,
-                loop=loop,
-                port=PORT if port is None else port,
-                wait=1 if wait is None else wait,
-                say=tell,
-                stop=stop,
-                progress=shown.update,
-            )
+            at, begin = PORT if port is None else port, 1 if wait is None else wait
+            played = play_as_robot(recording, port=at, wait=begin, say=tell, **how)
         else:
             from replay.playing.in_rerun import play_in_rerun
 
-            played = play_in_rerun(
-                recording,
-                rate=rate,
-                fps=fps,
-                cameras=cameras,
-                about=say_about,
-                loop=loop,
-                port=port,
-                announce=announce,
-                stop=stop,
-                progress=shown.update,
-            )
+            played = play_in_rerun(recording, port=port, announce=announce, **how)
     if played.behind > 1:
         tell(f"it came to lag {played.behind:.1f} s behind: play it with a smaller --rate")
     what = "messages" if target == "foxglove" else "frames"
