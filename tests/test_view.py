@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections import defaultdict
 from pathlib import Path
@@ -23,7 +24,7 @@ from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline
 from replay.view import run as run_view
 from replay.view.build import build_view
-from replay.view.columns import ImageBatch, TensorBatch, tensors
+from replay.view.columns import ImageBatch, ImageColumn, TensorBatch, tensors
 from replay.view.layouts.panels import Panels
 from replay.view.layouts.paper import feels
 from replay.view.summary import summary_text
@@ -291,6 +292,26 @@ def test_images_are_encoded_as_rerun_does():
     found = ImageBatch(images)
     assert found.component_descriptor() == theirs.component_descriptor()
     assert found.as_arrow_array().equals(theirs.as_arrow_array())
+
+
+def test_many_images_are_handed_over_in_pieces(monkeypatch):
+    """Of a few of them at once Rerun makes a view in half the time of very many."""
+    sent = []
+
+    def keep(self, times, values):
+        sent.append(([column.as_arrow_array().to_pylist() for column in times], values.copy()))
+
+    monkeypatch.setattr("replay.view.columns.ImageColumn.send", keep)
+    monkeypatch.setattr("replay.view.columns.MAX_BYTES", 3 * math.prod(IMAGE.frame_shape))
+    images = np.random.default_rng(0).integers(0, 256, (8, *IMAGE.frame_shape), np.uint8)
+    frames, iterations = np.arange(8) * 10, np.arange(8) // 2
+    with rr.RecordingStream("test") as recording:
+        column = ImageColumn(recording, IMAGE, "world/watched")
+        column.add(frames, iterations, images)
+    assert [len(values) for _, values in sent] == [3, 3, 2]
+    np.testing.assert_array_equal(np.concatenate([values for _, values in sent]), images)
+    for place, expected in ((0, frames), (2, iterations)):
+        assert [t for times, _ in sent for t in times[place]] == expected.tolist()
 
 
 def test_private_names_of_rerun_are_taken_in_one_place():

@@ -37,11 +37,14 @@ AGGREGATION = rr.components.AggregationPolicy.MinMax
 Their mean, which the viewer draws where nothing is said, may be a value that never was.
 """
 
-ROWS = 4000
+ROWS = 16000
 """Rows of a column that are handed over at once."""
 
 MAX_BYTES = 4 * 1024 * 1024
-"""Most bytes of a column that wait."""
+"""Bytes of a column that wait no longer, and about the most that are handed over at once.
+
+Of 12 MB of images at once Rerun's threads take twice as long, of .5 MB we do.
+"""
 
 Frames = NDArray[np.int64]
 
@@ -125,7 +128,10 @@ class Column:
             iterations = _joined(self._iterations) if self._iterations else None
             if self._every_frame:
                 frames, iterations, values = self._ended_at_gaps(frames, iterations, values)
-            self.send(time_columns(self._spec, frames, iterations), values)
+            rows = max(MAX_BYTES // max(values[:1].nbytes, 1), 1)
+            for part in (slice(i, i + rows) for i in range(0, len(values), rows)):
+                those = None if iterations is None else iterations[part]
+                self.send(time_columns(self._spec, frames[part], those), values[part])
         self._frames, self._iterations, self._values = [], [], []
         self._waiting = self._bytes = 0
 
