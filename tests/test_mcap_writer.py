@@ -53,9 +53,16 @@ def test_the_bytes_are_those_of_the_mcap_package(seed, monkeypatch):
             theirs.flush()
             ours.end_chunk()
         else:
-            time, channel, number = rng.randrange(2**62), rng.choice(channels), rng.randrange(2**32)
-            theirs.add_message(channel, time, data, time + 1, number)
-            ours.add_message(channel, time, data, time + 1, number)
+            messages = []
+            for _ in range(rng.choice([1, 1, 2, 5])):
+                time, number = rng.randrange(2**62), rng.randrange(2**32)
+                messages.append((rng.choice(channels), time, data, time + 1, number))
+                theirs.add_message(*messages[-1])
+                data = rng.randbytes(rng.randrange(300))
+            if len(messages) == 1:
+                ours.add_message(*messages[0])
+            else:
+                ours.add_messages(messages)
     theirs.finish()
     ours.finish()
     assert two.getvalue() == one.getvalue()

@@ -57,6 +57,17 @@ def test_images(time, height, width, frame_id):
     assert decode(encoder, message).data == frame.tobytes()
 
 
+@pytest.mark.parametrize("nanos", [0, 1, 127, 128, 2**21, 2**28 - 1, 2**28, 2**28 + 1, 999_999_999])
+@pytest.mark.parametrize("seconds", [0, 1, 127, 128, 1_451_606_400])
+def test_times_are_written_as_protobuf_writes_them(seconds, nanos):
+    time, wide = seconds * 10**9 + nanos, np.arange(16, dtype=np.uint8).reshape(2, 8)
+    message = ImageEncoder(2, 4, "left")(time, wide[:, ::2])
+    image = RawImage_pb2.RawImage.FromString(message)
+    assert image.timestamp.ToNanoseconds() == time
+    assert image.data == wide[:, ::2].tobytes()
+    assert message == image.SerializeToString()
+
+
 def test_images_of_another_size_are_refused():
     with pytest.raises(ValueError, match="a frame of 6 bytes given, not of 8"):
         ImageEncoder(2, 4, "left")(0, np.zeros((2, 3), np.uint8))

@@ -26,7 +26,12 @@ from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
 from replay.runs.folders import is_run
 from replay.runs.log import read_header
-from replay.runs.messages import decode_matrix, decode_signals, encode_signals
+from replay.runs.messages import (
+    decode_matrix,
+    decode_signals,
+    encode_matrix,
+    encode_signals,
+)
 from replay.runs.modules import load_modules, save_modules
 from replay.runs.stretches import PixelFinder
 from replay.runs.writer import RunWriter
@@ -254,6 +259,24 @@ def test_damaged_modules_are_refused_in_words(data, tmp_path):
         load_modules(tmp_path)
     with pytest.raises(UsageError, match="does not exist"):
         load_modules(tmp_path / "elsewhere")
+
+
+def test_a_message_does_not_depend_on_how_arrays_lie_in_memory():
+    rng = np.random.default_rng(1)
+    signals = signals_of(VECTOR, 3, rng, tau=6, modules=2, outputs=2)
+    fields = {name: getattr(signals, name) for name in SIGNALS}
+    fields |= {
+        "R": np.asfortranarray(signals.R),
+        "Q": signals.Q.astype(">f8"),
+        "policy": signals.policy.astype(np.int32),
+        "y": np.repeat(signals.y, 2, axis=0)[::2],
+    }
+    assert encode_signals(type(signals)(**fields)) == encode_signals(signals)
+    wide = rng.standard_normal((4, 6))
+    for matrix in (wide, wide[:, ::2], np.asfortranarray(wide), wide.astype(">f8"), wide[:0]):
+        t, back = decode_matrix(encode_matrix(7, matrix))
+        assert t == 7
+        np.testing.assert_array_equal(back, matrix)
 
 
 def test_pixels_are_found_as_protobuf_finds_them():

@@ -13,10 +13,10 @@ import dataclasses
 import hashlib
 import math
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -290,22 +290,23 @@ class Fields:
     """Some signals, whose values in a record are all got at once, to be made bytes of.
 
     Attributes:
-        signals: which, in the order in which `values` gives them.
-        arrays: places of the arrays among them.
+        scalars: those of them that are numbers.
+        arrays: the others.
+        numbers: values of `scalars` in a record, as they are.
     """
 
     def __init__(self, signals: Iterable[Signal]) -> None:
-        self.signals = tuple(signals)
-        self._get = attrgetter(*(s.name for s in self.signals))
-        self.arrays = tuple(place for place, s in enumerate(self.signals) if s.dims)
-        self._types = tuple(np.dtype(s.dtype).newbyteorder("<") for s in self.signals if s.dims)
+        signals = tuple(signals)
+        self.scalars = [s for s in signals if not s.dims]
+        self.arrays = [s for s in signals if s.dims]
+        self.numbers: Callable[[BlockSignals], Any] = attrgetter(*(s.name for s in self.scalars))
+        self._arrays = attrgetter(*(s.name for s in self.arrays))
+        # By this name it is the very one of numpy's own arrays, so that nothing is compared.
+        self._types = [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in self.arrays]
 
-    def values(self, record: BlockSignals) -> list[Any]:
-        """Scalars as they are, and arrays of the documented type, little-endian."""
-        values = list(self._get(record))
-        for place, dtype in zip(self.arrays, self._types, strict=True):
-            values[place] = np.asarray(values[place], dtype=dtype)
-        return values
+    def elements(self, record: BlockSignals) -> list[Any]:
+        """Values of `arrays`: contiguous, of the documented type, little-endian."""
+        return list(map(np.ascontiguousarray, self._arrays(record), self._types))
 
 
 class SignalsHash:
@@ -333,14 +334,14 @@ class SignalsHash:
 def canonical_bytes(signals: BlockSignals, version: int = SCHEMA_VERSION) -> bytes:
     """The bytes that stand for a record, as a version has it, wherever runs are compared."""
     fields = _fields(version)
-    values = fields.values(signals)
-    plan = _plan(version, tuple([values[place].shape for place in fields.arrays]))
-    data = bytearray(b"".join([values[part.place].tobytes() for part in plan.parts]))
+    arrays = fields.elements(signals)
+    plan = _plan(version, tuple([array.shape for array in arrays]))
+    data = bytearray(b"".join([arrays[i] for i in plan.order]))
     floats = np.frombuffer(data, "<f8", plan.floats)
     floats[np.isnan(floats)] = math.nan
-    for part in plan.parts:
-        values[part.place] = part.sizes + data[part.start : part.stop]
-    return plan.layout.pack(*[x if x == x else math.nan for x in values])
+    numbers = [x if x == x else math.nan for x in fields.numbers(signals)]
+    elements = [data[part] for part in plan.parts]
+    return plan.layout.pack(*plan.placed([*numbers, *plan.sizes, *elements]))
 
 
 @cache
@@ -348,41 +349,47 @@ def _fields(version: int) -> Fields:
     return Fields(s for s in SIGNALS.values() if s.since <= version)
 
 
-class _Part(NamedTuple):
-    """An array of a record: its place, its shape as bytes, and where its elements stand."""
-
-    place: int
-    sizes: bytes
-    start: int
-    stop: int
-
-
 class _Plan(NamedTuple):
     """How the bytes lie of records whose arrays have some shapes.
 
     Attributes:
-        layout: of all fields.
-        parts: the arrays, in the order of their elements: those of float64 first.
-        floats: how many these are together.
+        layout: of all fields; an array is its shape and its elements.
+        placed: brings scalars, shapes and elements of the arrays into its order.
+        sizes: the shape of each array as bytes.
+        order: the arrays, those of float64 first.
+        floats: how many elements these have.
+        parts: where the elements of each array lie, one after the other in that order.
     """
 
     layout: struct.Struct
-    parts: tuple[_Part, ...]
+    placed: Callable[[list[Any]], tuple[Any, ...]]
+    sizes: tuple[bytes, ...]
+    order: tuple[int, ...]
     floats: int
+    parts: tuple[slice, ...]
 
 
 @lru_cache
 def _plan(version: int, shapes: tuple[tuple[int, ...], ...]) -> _Plan:
     fields = _fields(version)
-    formats = [CODES[signal.dtype] for signal in fields.signals]
-    parts: list[_Part] = []
-    stop = floats = 0
-    places = list(zip(fields.arrays, shapes, strict=True))
-    for place, shape in sorted(places, key=lambda pair: formats[pair[0]] != "d"):
-        start, stop = stop, stop + 8 * math.prod(shape)
-        if formats[place] == "d":
+    sizes = tuple(struct.pack(f"<{len(shape)}q", *shape) for shape in shapes)
+    order = sorted(range(len(shapes)), key=lambda i: fields.arrays[i].dtype != "float64")
+    parts, stop, floats = dict[int, slice](), 0, 0
+    for i in order:
+        start, stop = stop, stop + 8 * math.prod(shapes[i])
+        parts[i] = slice(start, stop)
+        if fields.arrays[i].dtype == "float64":
             floats = stop // 8
-        parts.append(_Part(place, struct.pack(f"<{len(shape)}q", *shape), start, stop))
-    for part in parts:
-        formats[part.place] = f"{len(part.sizes) + part.stop - part.start}s"
-    return _Plan(struct.Struct("<" + "".join(formats)), tuple(parts), floats)
+    formats: list[str] = []
+    places: list[int] = []
+    for signal in (s for s in SIGNALS.values() if s.since <= version):
+        if signal.dims:
+            i = fields.arrays.index(signal)
+            formats += [f"{len(sizes[i])}s", f"{parts[i].stop - parts[i].start}s"]
+            places += [len(fields.scalars) + i, len(fields.scalars) + len(shapes) + i]
+        else:
+            formats.append(CODES[signal.dtype])
+            places.append(fields.scalars.index(signal))
+    layout = struct.Struct("<" + "".join(formats))
+    lie = tuple(parts[i] for i in range(len(shapes)))
+    return _Plan(layout, itemgetter(*places), sizes, tuple(order), floats, lie)

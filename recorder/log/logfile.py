@@ -11,7 +11,7 @@ import contextlib
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -167,14 +167,23 @@ class LogFile:
             sequence: the publisher's counter.
             publish_time: nanoseconds; the log time where none is given.
         """
+        published = log_time if publish_time is None else publish_time
+        self.write_all(((channel, log_time, data, published, sequence),))
+
+    def write_all(self, messages: Sequence[tuple[int, int, bytes, int, int]]) -> None:
+        """Write messages that are flushed together, at least one.
+
+        Args:
+            messages: channel, log time, data, publish time and sequence of each, as `write` says.
+        """
         self._stream.check()
+        log_time = messages[0][1]
         if self._chunk_start is None:
             self._chunk_start = log_time
         elif log_time - self._chunk_start >= self._flush_ns:
             self.flush()
             self._chunk_start = log_time
-        published = log_time if publish_time is None else publish_time
-        self._writer.add_message(channel, log_time, data, published, sequence)
+        self._writer.add_messages(messages)
 
     def flush(self) -> None:
         """Close the chunk in progress and hand everything to the operating system."""

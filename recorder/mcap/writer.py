@@ -101,8 +101,8 @@ class McapWriter:
         self._counts: dict[int, int] = {}
         # Only grow: memory that is used again is in the cache. One takes the next chunk while the
         # other is compressed.
-        self._records = bytearray()
-        self._spare = bytearray() if aside else self._records
+        self._records = memoryview(bytearray())
+        self._spare = memoryview(bytearray()) if aside else self._records
         self._aside = ThreadPoolExecutor(1) if aside else None
         self._pending: Future[None] | None = None
         self._size = 0
@@ -137,24 +137,28 @@ class McapWriter:
         self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int
     ) -> None:
         """Add a message to the chunk; times in nanoseconds."""
-        length, at = len(data), self._size
-        header = _MESSAGE.pack(
-            _OF_MESSAGE, _MESSAGE_FIELDS + length, channel, sequence, log_time, publish_time
-        )
-        start = at + _MESSAGE_SIZE
-        stop = start + length
-        if stop > len(self._records):
-            self._records.extend(bytes(stop - len(self._records)))
-        with memoryview(self._records) as records:  # takes bytes at once, a bytearray a copy
-            records[at:start] = header
+        self.add_messages(((channel, log_time, data, publish_time, sequence),))
+
+    def add_messages(self, messages: Iterable[tuple[int, int, bytes, int, int]]) -> None:
+        """Add messages, each as `add_message` takes it."""
+        for channel, log_time, data, publish_time, sequence in messages:
+            length, at = len(data), self._size
+            start = at + _MESSAGE_SIZE
+            stop = start + length
+            if stop > len(self._records):
+                self._grow(stop)
+            records, fields = self._records, _MESSAGE_FIELDS + length
+            _MESSAGE.pack_into(
+                records, at, _OF_MESSAGE, fields, channel, sequence, log_time, publish_time
+            )
             records[start:stop] = data
-        self._size = stop
-        pairs = self._index.get(channel)
-        if pairs is None:
-            pairs = self._index[channel] = []
-        pairs += (log_time, at)
-        if stop > self._chunk_size:
-            self.end_chunk()
+            self._size = stop
+            pairs = self._index.get(channel)
+            if pairs is None:
+                pairs = self._index[channel] = []
+            pairs += (log_time, at)
+            if stop > self._chunk_size:
+                self.end_chunk()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a named map of texts, outside the chunks."""
@@ -232,7 +236,7 @@ class McapWriter:
         crc = crc32(_FOOTER.pack(Opcode.FOOTER, 20, start, at), crc32(summary))
         self._append(summary + _encoded(Footer(start, at, crc)) + MAGIC)
 
-    def _append_chunk(self, buffer: bytearray, size: int, index: dict[int, list[int]]) -> None:
+    def _append_chunk(self, buffer: memoryview, size: int, index: dict[int, list[int]]) -> None:
         """Append a chunk with its message indexes.
 
         Args:
@@ -242,7 +246,7 @@ class McapWriter:
         """
         times = [pairs[::2] for pairs in index.values()]
         first, last = min(map(min, times)), max(map(max, times))
-        with memoryview(buffer) as whole, whole[:size] as records:
+        with buffer[:size] as records:
             stored, crc = self._compress(records), crc32(records)
         name = self._compression.encode()
         length = _CHUNK.size - 9 + 4 + len(name) + 8 + len(stored)
@@ -291,10 +295,22 @@ class McapWriter:
         )
 
     def _define(self, record: McapRecord) -> None:
-        self._records[self._size :] = data = _encoded(record)
-        self._size += len(data)
+        data = _encoded(record)
+        stop = self._size + len(data)
+        if stop > len(self._records):
+            self._grow(stop)
+        self._records[self._size : stop] = data
+        self._size = stop
         if self._size > self._chunk_size:
             self.end_chunk()
+
+    def _grow(self, size: int) -> None:
+        """Make room for so many bytes of records."""
+        grown = memoryview(bytearray(max(size, 2 * self._size)))
+        grown[: self._size] = self._records[: self._size]
+        self._records = grown
+        if self._aside is None:
+            self._spare = grown
 
     def _append(self, data: bytes) -> None:
         self._crc = crc32(data, self._crc)

@@ -77,51 +77,52 @@ _LATER = tuple(s.name for s in _BY_AGE if s.since > 1)
 NUMBERS = {name: number for number, name in enumerate((*_FIRST, SHAPES, *_LATER), start=1)}
 """Number of each signal's field."""
 
+_DOUBLE = np.dtype("<f8")
 _HEAD = struct.Struct("<BqBIB5s")
 """Tag and value of t, of the number of columns, and the values' tag and length.
 
 The length is a varint of five bytes, which any reader takes and which has a fixed place.
 """
+_length = lru_cache(lambda size: bytes(size >> 7 * k & 0x7F | (k < 4) << 7 for k in range(5)))
 
 
 def encode_signals(signals: BlockSignals) -> bytes:
     """A record as the bytes of its message."""
-    values = _FIELDS.values(signals)
     scalars = list(_TAGGED)
-    scalars[1::2] = values[: len(_SCALARS)]
-    arrays = values[len(_SCALARS) :]
-    before, sizes = _around(tuple(array.shape for array in arrays))
-    parts = [_STRUCT.pack(*scalars)]
-    for prefix, array in zip(before, arrays, strict=True):
-        if prefix:
-            parts += (prefix, array.tobytes())
-    parts.append(sizes)
+    scalars[1::2] = _FIELDS.numbers(signals)
+    arrays = _FIELDS.elements(signals)
+    before, sizes = _around(tuple([array.shape for array in arrays]))
+    parts: list[Any] = [_STRUCT.pack(*scalars), *before, sizes]
+    parts[2:-1:2] = arrays
     return b"".join(parts)
 
 
 @lru_cache
 def _around(shapes: tuple[tuple[int, ...], ...]) -> tuple[list[bytes], bytes]:
-    """What stands before each array in a message, nothing where it is empty, and behind all."""
-    counts = [math.prod(shape) for shape in shapes]
-    before = [
-        _length_prefix(_tag(s.name, _LENGTH_DELIMITED), n * np.dtype(s.dtype).itemsize)
-        if n
-        else b""
-        for s, n in zip(_ARRAYS, counts, strict=True)
-    ]
+    """What stands before each array, with room for it, and behind all; of no elements nothing."""
+    before = [b""] * (2 * len(shapes))
+    for i, (signal, shape) in enumerate(zip(_ARRAYS, shapes, strict=True)):
+        if size := math.prod(shape) * np.dtype(signal.dtype).itemsize:
+            before[2 * i] = _tag(signal.name, _LENGTH_DELIMITED) + varint(size)
     sizes = b"".join(varint(size) for shape in shapes for size in shape)
-    return before, _length_prefix(_tag(SHAPES, _LENGTH_DELIMITED), len(sizes)) + sizes
+    return before, _tag(SHAPES, _LENGTH_DELIMITED) + varint(len(sizes)) + sizes
 
 
 def encode_matrix(t: int, matrix: NDArray[np.float64]) -> bytes:
     """(rows, columns) values from frame t on as the bytes of a message."""
-    values = np.asarray(matrix, dtype="<f8")
-    length = bytes(values.nbytes >> 7 * k & 0x7F | (k < 4) << 7 for k in range(5))
-    return _HEAD.pack(0x09, t, 0x15, values.shape[1], 0x1A, length) + values.tobytes()
+    values: Any = np.ascontiguousarray(matrix, dtype=_DOUBLE)
+    return b"".join((_head(t, values.shape[1], values.nbytes), values))
+
+
+def _head(t: int, columns: int, size: int) -> bytes:
+    return _HEAD.pack(0x09, t, 0x15, columns, 0x1A, _length(size))
 
 
 def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.float64]]:
     """The frame counter and (rows, columns) values of a message; raises as `parsed` does."""
+    if _as_encoded(data):
+        _, t, _, columns, _, _ = _HEAD.unpack_from(data)
+        return t, np.frombuffer(data, _DOUBLE, offset=_HEAD.size).reshape(-1, columns).copy()
     decoded = parsed(_MATRIX, data, where)
     values = np.array(decoded.values, dtype=np.float64)
     if values.size and (decoded.columns == 0 or values.size % decoded.columns):
@@ -130,14 +131,20 @@ def decode_matrix(data: bytes, where: str = "record") -> tuple[int, NDArray[np.f
     return decoded.t, values.reshape(rows, decoded.columns)
 
 
+def _as_encoded(data: bytes) -> bool:
+    """Whether a matrix is laid out as `encode_matrix` does it, and needs no parser."""
+    size = len(data) - _HEAD.size
+    _, t, _, columns, _, _ = _HEAD.unpack_from(data) if size >= 0 else (0,) * 6
+    return columns > 0 and size % (8 * columns) == 0 and data.startswith(_head(t, columns, size))
+
+
 def decode_matrices(
     messages: Sequence[bytes], where: str = "record"
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Frames and rows of messages of one size, see `decode_matrix`; at once where it can be."""
     t, first = decode_matrix(messages[0], where)
     values = _HEAD.size, len(messages[0])
-    known = encode_matrix(t, first) == messages[0]
-    table = alike(messages, [(1, 9), values]) if known else None
+    table = alike(messages, [(1, 9), values]) if _as_encoded(messages[0]) else None
     if table is None:
         for data in messages:
             t, rows = decode_matrix(data, where)
@@ -348,10 +355,6 @@ def _sentence(signal: Signal) -> str:
 
 def _tag(name: str, wire_type: int) -> bytes:
     return varint(NUMBERS[name] << 3 | wire_type)
-
-
-def _length_prefix(tag: bytes, length: int) -> bytes:
-    return tag + varint(length)
 
 
 def _message_class(file: descriptor_pb2.FileDescriptorProto, name: str) -> Any:

@@ -126,24 +126,31 @@ class RunWriter(Sink):
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Write what one iteration gave; see `Sink`."""
-        at, k = signals.log_time, signals.iteration
-        self._write(SIGNALS_TOPIC, at, k, encode_signals(signals))
+        at, k, t = signals.log_time, signals.iteration, block.t
+        number = k & 0xFFFFFFFF
+        messages = [(self._channels[SIGNALS_TOPIC], at, encode_signals(signals), at, number)]
         if block.truth.shape[1]:
-            self._write(TRUTH_TOPIC, at, k, encode_matrix(block.t, block.truth))
+            truth = encode_matrix(t, block.truth)
+            messages.append((self._channels[TRUTH_TOPIC], at, truth, at, number))
+        watched = self._channels[WATCHED_TOPIC]
         if self._images:
-            encode = self._images[block.stream]
-            for i in range(-block.t % self._watched_every, len(block), self._watched_every):
-                shown = self.spec.time_ns(block.t + i)
-                self._write(WATCHED_TOPIC, shown, k, encode(shown, block.frames[i]))
+            encode, every = self._images[block.stream], self._watched_every
+            first = -t % every
+            times = map(self.spec.time_ns, range(t + first, t + len(block), every))
+            messages += [
+                (watched, shown, encode(shown, frame), shown, number)
+                for shown, frame in zip(times, block.frames[first::every], strict=True)
+            ]
         else:
             frames = block.frames.reshape(len(block), -1)
-            self._write(WATCHED_TOPIC, at, k, encode_matrix(block.t, frames))
+            messages.append((watched, at, encode_matrix(t, frames), at, number))
         other = self._by_progress and signals.action == 1
-        self._unweighed = at, k, block.t
+        self._unweighed = at, k, t
         if k % self._phi_every == 0 or signals.saved or other:
-            phi = weights_after(signals, learner)
-            self._write(PHI_TOPIC, at, k, encode_matrix(block.t, phi))
+            phi = encode_matrix(t, weights_after(signals, learner))
+            messages.append((self._channels[PHI_TOPIC], at, phi, at, number))
             self._unweighed = None
+        self._log.write_all(messages)
         if time.monotonic() >= self._next_flush:
             self.flush()
 
