@@ -51,6 +51,12 @@ def test_one_answer_only_has_no_midpoint_but_a_bound() -> None:
     assert (always.low, always.high) == (-math.inf, 0.2)
 
 
+def test_no_midpoint_where_the_question_was_asked_at_one_place_alone() -> None:
+    fit = statistics.logistic_midpoint([0.5, 0.5], [False, True])
+    assert math.isnan(fit.value)
+    assert (fit.low, fit.high) == (-math.inf, math.inf)
+
+
 def test_no_interval_where_the_answers_do_not_depend_on_x() -> None:
     fit = statistics.logistic_midpoint([0, 0, 1, 1] * 5, [0, 1, 0, 1] * 5)
     assert (fit.low, fit.high) == (-math.inf, math.inf)

@@ -91,7 +91,8 @@ class Midpoint:
     """Where a yes-or-no answer turns, from a logistic fit.
 
     Attributes:
-        value: x at which yes and no are equally likely; NaN where only one answer was seen.
+        value: x at which yes and no are equally likely; NaN where only one answer was seen, or
+            the question was asked at one x alone.
         low, high: 95 % profile likelihood interval; infinite where the data bound no side.
         slope: of the fit, per unit of x; positive where yes lies at large x.
         n: number of answers.
@@ -124,6 +125,8 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
     levels, inverse = np.unique(at, return_inverse=True)
     total: Float = np.bincount(inverse).astype(np.float64)
     hits = np.asarray(np.bincount(inverse, weights=answer), dtype=np.float64)
+    if len(levels) == 1:
+        return Midpoint(math.nan, -math.inf, math.inf, math.nan, n)
     span = float(levels[-1] - levels[0])
     slopes = np.geomspace(FLATTEST / span, STEEPEST / span, 61)
     low, high = float(levels[0] - 2 * span), float(levels[-1] + 2 * span)

@@ -105,7 +105,7 @@ class Stamped(ImagesOf):
         return int(self._order[row])
 
 
-class Excerpt(ImagesOf):
+class ImagesBetween(ImagesOf):
     """The images [start, stop) of a stream."""
 
     def __init__(self, images: ImageStream, start: int, stop: int) -> None:
@@ -150,7 +150,7 @@ def excerpts(
                 f"{images.path}: {images.topic} has no images there, its last is at {lasts:g} s: "
                 "choose another --from or --to"
             )
-        found.append(Excerpt(images, low, high))
+        found.append(ImagesBetween(images, low, high))
     return found
 
 

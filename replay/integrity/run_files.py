@@ -68,7 +68,7 @@ class RunPass:
         if final is None or not self._beside:
             return
         if not self._document:
-            yield Problem(str(folder / RUN_JSON), "is missing or no JSON")
+            yield Problem(str(folder / RUN_JSON), "is missing, empty or no JSON")
         elif facts_sha256(self._document) != final.get("facts_sha256"):
             what = "states something else than the run's final record"
             yield Problem(str(folder / RUN_JSON), what)
