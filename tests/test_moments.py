@@ -320,6 +320,16 @@ def test_a_fork_at_the_beginning_is_one_too(place: Path, tmp_path: Path, cdmisfa
     )
 
 
+def test_a_fork_of_a_recording_is_resumed_with_another_seed(
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
+) -> None:
+    fork, told = tmp_path / "fork", ("--keyframes", 15, "--no-rerun")
+    begun = ("fork", place / "2.0-loop", "--at", 31, "--seed", 9, *told, "-o", fork)
+    assert cdmisfa(*begun, "--max-iterations", 60).code == 0
+    resumed = cdmisfa("learn", "--resume", "-o", fork, "--max-iterations", 70, "--no-rerun")
+    assert (resumed.code, check_run(fork).difference) == (0, None)
+
+
 def test_forks_of_forks_are_resumed_and_checked(
     place: Path, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:

@@ -151,16 +151,20 @@ def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | No
                 )
 
 
-def refuse_keys_of_scenes(settings: Sequence[str], source: str) -> None:
+def refuse_keys_of_scenes(settings: Sequence[str], source: str | Path) -> None:
     """Refuse what would be set in vain: what is no live scene has a world and a clock of its own.
+
+    A run that is resumed may have been told so: as a fork, to keep the seed that its parent states.
 
     Args:
         settings: `section.key=value` words.
-        source: what is named instead of a scene, for the error.
+        source: the first word that names it.
 
     Raises:
-        UsageError: one of them is about either.
+        UsageError: one of them is about either, and the source is no scene.
     """
+    if source in SCENES:
+        return
     words = parse_settings(settings)
     vain = [f"scene.{key}" for key in words.get("scene", {})]
     vain += [f"record.{key}" for key in words.get("record", {}) if key in CLOCK]
@@ -253,7 +257,6 @@ def open_source(
         described = description(source, at_once=True)
         kind = scene_kind_for(source.spec, described, preset)
         streams = streams_of(described)
-        refuse_keys_of_scenes(settings, str(words[0]))
         configuration = configure(kind, preset, settings, seed, learner=learner_of(streams))
         return source, configuration.shown_by(source.spec, streams)
     except BaseException:
@@ -371,7 +374,6 @@ def open_cameras_now(
     theirs = CameraOptions(**framing).given()
     if of_logs := [option for option in cameras.given() if option not in theirs]:
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
-    refuse_keys_of_scenes(settings, str(words[0]))
     live = replace(live, **framing)
     source = open_live([str(word) for word in words], live, say=say, stop=stop)
     try:

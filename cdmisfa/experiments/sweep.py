@@ -174,8 +174,7 @@ def plan(
     cameras = cameras or CameraOptions()
     kind, recorded, spec = _identify(words, preset, loop, cameras)
     streams = "" if recorded is None else streams_of(recorded)
-    if recorded is not None:
-        refuse_keys_of_scenes([*settings, *(f"{key}=" for key in grid)], str(words[0]))
+    refuse_keys_of_scenes([*settings, *(f"{key}=" for key in grid)], words[0])
     points = [
         dict(zip(grid, map(str, values), strict=True))
         for values in itertools.product(*grid.values())

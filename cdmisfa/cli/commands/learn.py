@@ -139,7 +139,7 @@ def learn_command(
     from cdmisfa.experiments.loop import INTERRUPTED
     from cdmisfa.experiments.resume import command_of
     from cdmisfa.experiments.runs import RunExhaustedError, run
-    from cdmisfa.experiments.sources import open_source
+    from cdmisfa.experiments.sources import open_source, refuse_keys_of_scenes
     from recorder.cameras.words import is_live
     from replay.camera_logs.options import CameraOptions
 
@@ -148,6 +148,8 @@ def learn_command(
         settings = (*settings, f"learner.algorithm={algorithm}")
     if portable:
         settings = (*settings, "learner.portable=true")
+    if not resume:
+        refuse_keys_of_scenes(settings, source[0])
     with contextlib.ExitStack() as stack:
         if any(map(is_live, source)):
             if resume or loop or salvage or follow or dry_run:
