@@ -297,8 +297,8 @@ def identity_of(
     slowest, fastest = RECORDED_FPS
     if not slowest <= spec.fps <= fastest:
         raise UsageError(
-            f"a recording of {spec.fps} frames a second cannot be read: give it an fps in "
-            f"[{slowest:g}, {fastest:g}]"
+            f"a recording has {slowest:g} to {fastest:.0f} frames a second, not {spec.fps:g}: give "
+            "its source such an fps; logs are read at another rate with --align time --rate"
         )
     if scene is None:
         stated = description(source)

@@ -355,3 +355,16 @@ def test_what_is_missing_is_said_alike(cdmisfa: Cdmisfa, tmp_path: Path, form: s
     missing = tmp_path / "missing"
     refused = cdmisfa("export", missing, "--to", form, "-o", tmp_path / "out")
     assert (refused.code, refused.err) == (2, f"cdmisfa: {missing}: no such file or folder\n")
+
+
+def test_what_is_too_slow_to_convert_is_converted_as_is_said(
+    cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    rows = [f"{1800 * row},{row % 7}" for row in range(50)]
+    (tmp_path / "slow.csv").write_text("\n".join(["time,x", *rows]))
+    convert = ("convert", tmp_path / "slow.csv", "--time", "time:s", "-o", tmp_path / "out")
+    refused = cdmisfa(*convert)
+    assert refused.code == 2
+    assert "0.001 to 1000000 frames a second, not 0.000555556" in refused.err
+    assert "logs are read at another rate with --align time --rate" in refused.err
+    assert cdmisfa(*convert, "--align", "time", "--rate", 0.001).code == 0
