@@ -111,7 +111,8 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "K = 32, J = 5. The chunks of the log are compressed in a thread of their own (10 us of "
         "LZ4 an iteration, and 9 us of checksums, indexes and writing). The view is built after "
         "the run, in one pass over its log; what other threads do is nearly all Rerun's, which "
-        "compress the pictures and the times of all rows again. From runs of "
+        "compress the pictures and the times of all rows again: 50 us an iteration of the preset "
+        "icub in a program that sends the same chunks and does nothing else. From runs of "
         f"{short} iterations in the same round: what a further iteration takes, and what a run "
         "takes however short it is. Importing Rerun, once a process, is not in it.",
         tables,

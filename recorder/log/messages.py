@@ -253,19 +253,9 @@ def _message(name: str, fields: Sequence[Any]) -> Any:
 def _timestamp(time_ns: int) -> bytes:
     """A time as field 1 of a message, a `google.protobuf.Timestamp`."""
     seconds, nanos = divmod(time_ns, 1_000_000_000)
-    if nanos >> 28:  # mostly: five bytes of seven bits each, which are made at once
-        rest = nanos & 0x7F | (nanos & 0x3F80) << 1 | (nanos & 0x1FC000) << 2
-        rest |= (nanos & 0xFE00000) << 3 | nanos >> 28 << 32 | 0x80808080
-        return _since(seconds, 5) + rest.to_bytes(5, "little")
-    return _since(seconds, len(varint(nanos)) if nanos else 0) + (varint(nanos) if nanos else b"")
-
-
-@lru_cache(1024)
-def _since(seconds: int, more: int) -> bytes:
-    """A time up to its nanoseconds, which take so many bytes; none where there are none."""
     since = b"\x08" + varint(seconds) if seconds else b""
-    tag = b"\x10" if more else b""
-    return b"\x0a" + varint(len(since) + len(tag) + more) + since + tag
+    rest = b"\x10" + varint(nanos) if nanos else b""
+    return b"\x0a" + varint(len(since) + len(rest)) + since + rest
 
 
 @lru_cache(1024)
