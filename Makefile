@@ -10,8 +10,9 @@ demo: $(INSTALLED)
 
 test: lint suite
 
+# Of three processes one waits as a rule: for cameras, viewers and what it has killed.
 suite: $(INSTALLED)
-	$(BIN)/pytest -n 2 --dist loadgroup
+	$(BIN)/pytest -n 3 --dist loadgroup
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
