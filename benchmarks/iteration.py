@@ -117,11 +117,11 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "learning thread, which holds the interpreter, and added a fifth to that of all "
         "threads. Projecting converts pixels to doubles; the digest is the getting of 42 "
         "signals (SHA-256 itself takes 0.7 us), which takes 8 us in a loop of its own and "
-        "twice that here, because frames and vectors have driven all else out of the CPU's "
-        "cache; a log's part takes 17 us in a loop, 40 to 55 here, and what comes after it is "
-        "10 us dearer. Digests and messages of 8 or 24 iterations at once take no less: their "
-        "records have left the cache by then. To copy the pictures takes 3 us. Of a log, LZ4 "
-        "takes 10 us an iteration in the other thread, all else there 9.",
+        "two or three times that here, because frames and vectors have driven all else out of "
+        "the CPU's cache; a log's part takes 17 us in a loop, 40 to 55 here, and what comes after "
+        "it is 10 us dearer. Digests and messages of 8 or 24 iterations at once take no less: "
+        "their records have left the cache by then. To copy the pictures takes 3 us. Of a log, "
+        "LZ4 takes 10 us an iteration in the other thread, all else there 9.",
         [
             (["part", "of it"], table(times, "all", list(PARTS))),
             (
