@@ -185,7 +185,7 @@ def test_what_no_recording_can_hold_is_refused(tmp_path: Path) -> None:
     source = Webcams()
     for spec, words in (
         (SourceSpec(("a", "b"), (4, 6, 3), "uint8"), r"\(4, 6, 3\) uint8"),
-        (SourceSpec(("a", "b"), SHAPE, "uint8", fps=1e7), "give it an fps in"),
+        (SourceSpec(("a", "b"), SHAPE, "uint8", fps=1e7), "give its source such an fps"),
     ):
         source.spec = spec
         with pytest.raises(UsageError, match=words):
