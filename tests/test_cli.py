@@ -399,14 +399,19 @@ class TestErrors:
 
 class TestInterrupts:
     @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-    def test_learn_stops_cleanly(self, tmp_path: Path, number: int, code: int) -> None:
+    def test_learn_stops_cleanly(
+        self, cdmisfa: Cdmisfa, tmp_path: Path, number: int, code: int
+    ) -> None:
         run = tmp_path / "run"
+        # compiles, where a signal ends a command at once
+        assert cdmisfa("learn", "oscillatory", *SHORT).code == 0
         words = ["learn", "oscillatory", "-o", str(run), "--no-rerun", "--json"]
         with start(*words, "--set", "learner.delta=1e-12") as process:
             wait_for_bytes(run / "run.mcap.partial", process)
             process.send_signal(number)
             out, err = process.communicate(timeout=60)
         assert process.returncode == code, err
+        assert err.endswith(f"go on with cdmisfa learn --resume -o {run}\n")
         assert "Traceback" not in err
         assert Outcome(code, out, err).json["ended"] == "interrupted"
         assert sorted(f.name for f in run.iterdir() if "partial" in f.name) == []

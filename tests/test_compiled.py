@@ -15,7 +15,7 @@ import pytest
 
 from cdmisfa.cli.progress import Bar, compiling_said
 from cdmisfa.core.arithmetic.compiled import compiled, told_of_compiling
-from cdmisfa.core.arithmetic.kept import MARKS, NUMBA, runs_alone
+from cdmisfa.core.arithmetic.kept import MARKS, NUMBA, keep, recalled, runs_alone
 
 
 def test_without_a_folder_for_results_it_compiles_all_the_same(
@@ -298,6 +298,17 @@ def test_the_wait_for_compiling_is_said_without_a_terminal(
     assert capsys.readouterr().err.startswith("compiling for this machine")
 
 
+def test_what_cannot_be_kept_is_said_to_be_compiled_each_time(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cdmisfa.core.arithmetic.kept.folder_of", lambda source: None)
+    with compiling_said(Bar()):
+        numba.njit(lambda x: x + 1)(1)
+    said = capsys.readouterr().err
+    assert "again each time" in said
+    assert "set NUMBA_CACHE_DIR to a folder" in said
+
+
 def test_another_version_of_the_compiler_keeps_what_it_compiles_itself(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -305,3 +316,36 @@ def test_another_version_of_the_compiler_keeps_what_it_compiles_itself(
     other = ("3.11", "0.69.0", "0.51.0", "2.4.6")
     monkeypatch.setattr("cdmisfa.core.arithmetic.kept._versions", lambda: other)
     assert not runs_alone.__wrapped__()
+
+
+FULL = """
+import resource, signal
+from cdmisfa.agents.reward import expert_reward
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+print(expert_reward(0.5, 0.5, 1.0))
+"""
+
+
+def test_on_a_full_disk_it_runs_on_with_what_it_compiled(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    words = [sys.executable, "-c", FULL]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not list(tmp_path.rglob("*.kept"))
+
+
+def test_what_a_power_cut_left_of_kept_code_is_compiled_anew(tmp_path: Path) -> None:
+    source = tmp_path / "source.py"
+    source.write_text("a source")
+    keep("name", source, list(range(1000)))
+    assert recalled("name", source) == list(range(1000))
+    (kept,) = tmp_path.rglob("*.kept")
+    whole = kept.read_bytes()
+    for start, stop in ((0, 8), (40, 80), (len(whole) // 2, len(whole))):
+        kept.write_bytes(whole[:start] + bytes(stop - start) + whole[stop:])
+        with pytest.raises(LookupError):
+            recalled("name", source)
+    kept.write_bytes(whole)
+    assert recalled("name", source) == list(range(1000))

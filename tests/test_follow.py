@@ -282,7 +282,9 @@ def test_a_stopped_run_goes_on_following(cdmisfa: Cdmisfa, tmp_path: Path) -> No
     assert resumed.json["signals_sha256"] == live.json["signals_sha256"]
 
 
-def test_a_signal_ends_the_waiting(tmp_path: Path) -> None:
+def test_a_signal_ends_the_waiting(cdmisfa: Cdmisfa, tmp_path: Path, finished: Path) -> None:
+    # compiles, where a signal ends a command at once
+    assert cdmisfa("learn", str(finished), "--max-iterations", "1").code == 0
     with recorder(tmp_path / "rec", wait=0.5):
         words = ["learn", str(tmp_path / "rec"), "--follow", "-o", str(tmp_path / "run")]
         learner = subprocess.Popen(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pkgutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +16,7 @@ from conftest import Cdmisfa, Outcome
 
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
+from cdmisfa.core.arithmetic.compiled import compiled
 from replay.playing.pace import Played, paced
 
 
@@ -50,6 +53,51 @@ def test_the_second_signal_interrupts_although_a_destructor_drops_it(capfd: Any)
             wait()
     assert outer.exit_code == 130
     assert capfd.readouterr().err == "finishing what is begun; again to stop at once\n"
+
+
+def test_the_first_signal_interrupts_where_code_is_compiled(
+    capfd: Any, monkeypatch: Any, tmp_path: Path
+) -> None:
+    def compiling(*arguments: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+        wait()
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("cdmisfa.core.arithmetic.compiled._ForPython._compiled", compiling)
+    with interruptible() as outer, stoppable(), pytest.raises(KeyboardInterrupt):
+        compiled(halved)(1.0)
+    assert outer.exit_code == 143
+    assert capfd.readouterr().err == ""
+    with interruptible(), stoppable() as stop:
+        signal.raise_signal(signal.SIGTERM)
+    assert stop()
+
+
+def halved(x: float) -> float:
+    """Half of a number."""
+    return x / 2.0
+
+
+AT_THE_END = """
+import os, sys
+from cdmisfa.cli.app import main
+
+class Last:
+    def __del__(self, kill=os.kill, own=os.getpid(), number=int(sys.argv.pop())):
+        kill(own, number)
+
+sys.argv.append("--version")
+sys.last = Last()
+main()
+"""
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_while_python_ends_leaves_the_exit_code(number: signal.Signals) -> None:
+    words = [sys.executable, "-c", AT_THE_END, str(int(number))]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("cdmisfa ")
 
 
 def test_what_else_a_destructor_raises_is_told(capsys: Any, monkeypatch: Any) -> None:

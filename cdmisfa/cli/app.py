@@ -19,7 +19,7 @@ from typing import NoReturn
 
 import click
 
-from cdmisfa.cli.interrupts import end_at_once, interruptible
+from cdmisfa.cli.interrupts import end_at_once, ignore_at_the_end, interruptible
 from cdmisfa.cli.on_demand import names_on_demand
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import did_you_mean
@@ -119,6 +119,7 @@ def main() -> NoReturn:
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may not know Greek letters
         sys.stdout.reconfigure(errors="replace")
     end_at_once()
+    ignore_at_the_end()
     names_on_demand("rerun")  # of 550 modules a view needs 200
     code = run(sys.argv[1:])
     end_at_once(code)

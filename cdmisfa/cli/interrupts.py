@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -67,11 +68,14 @@ def end_at_once(code: int | None = None) -> None:
 def stoppable(
     notice: str = "finishing what is begun; again to stop at once\n",
 ) -> Iterator[Stop]:
-    """Let the body end its step at the first signal, and say so; the second one interrupts it."""
+    """Let the body end its step at the first signal, and say so; the second one interrupts it.
+
+    So does the first one while the body waits for code to be compiled.
+    """
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if stop():
+        if stop() or _compiling():
             if callable(handle := outer[number]):  # which knows the exit code
                 handle(number, frame)
             raise KeyboardInterrupt
@@ -81,6 +85,17 @@ def stoppable(
 
     with _handled_by(ask):
         yield stop
+
+
+def _compiling() -> bool:
+    compiled = sys.modules.get("cdmisfa.core.arithmetic.compiled")
+    return compiled is not None and compiled.waits_for_compiling()
+
+
+def ignore_at_the_end() -> None:
+    """Let no signal change the exit code once Python ends, where it handles none any more."""
+    for number in SIGNALS:
+        atexit.register(signal.signal, number, signal.SIG_IGN)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import click
 
@@ -26,6 +27,7 @@ class Bar:
 @contextmanager
 def compiling_said(shown: Bar) -> Iterator[None]:
     """Say so where the body waits for code to be compiled, also where there is no terminal."""
+    from cdmisfa.core.arithmetic import kept
     from cdmisfa.core.arithmetic.compiled import told_of_compiling
 
     said = counted = False
@@ -34,7 +36,13 @@ def compiling_said(shown: Bar) -> Iterator[None]:
         nonlocal said, counted
         if not said:
             said = True
-            shown.say("compiling for this machine, which is kept: once, up to half a minute")
+            if kept.folder_of(Path(kept.__file__)) is not None:
+                shown.say("compiling for this machine, which is kept: once, half a minute or so")
+            else:
+                shown.say(
+                    "compiling for this machine, half a minute or so, and again each time: it "
+                    "cannot be kept, set NUMBA_CACHE_DIR to a folder that can be written to"
+                )
         if of and not counted:
             shown.turn_to("compiling", "functions")
         if of:
@@ -77,8 +85,9 @@ def bar(title: str, unit: str) -> Iterator[Bar]:
         TextColumn("{task.completed:,.0f}"),
         Rate(),
         TimeElapsedColumn(),
-        TextColumn("left"),
+        TextColumn("passed,"),
         TimeRemainingColumn(),
+        TextColumn("left"),
         TextColumn("{task.fields[note]}", table_column=Column(no_wrap=True)),
         console=Console(stderr=True),
         transient=True,

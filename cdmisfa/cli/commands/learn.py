@@ -222,6 +222,9 @@ def learn_command(
         click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)
     if result.ended == INTERRUPTED:
+        if result.run is not None and not any(map(is_live, source)):
+            again = f"cdmisfa learn --resume -o {options.quoted(result.run)}"
+            click.echo(f"go on with {again}", err=True)
         ctx.exit(stop.exit_code)
 
 

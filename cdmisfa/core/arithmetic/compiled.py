@@ -6,7 +6,7 @@ import contextlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from types import FunctionType
@@ -146,9 +146,10 @@ class _ForPython:
             name = self._name(args)
             if runs_alone():
                 code = self._from_disk(name)
-                if code is None and _others_compiled():
-                    code = self._from_disk(name)
-                code = code or self._compiled(name, args)
+                with nullcontext() if code else _compiling():
+                    if code is None and _others_compiled():
+                        code = self._from_disk(name)
+                    code = code or self._compiled(name, args)
         if code is None:
             return cast(Callable[..., Any], self._dispatcher)
         with contextlib.suppress(Exception):
@@ -225,6 +226,7 @@ def _named_apart(function: Callable[..., Any], form: str) -> Callable[..., Any]:
 _PREPARATIONS: list[Callable[[], None]] = []
 _TOLD: list[Callable[[int, int], None]] = []
 _OTHERS: list[Callable[[], None]] = []
+_WAITS: list[bool] = []
 
 
 @cache
@@ -289,6 +291,20 @@ def tell_compiling(done: int, of: int) -> None:
     """Tell all who are to be told; see `told_of_compiling`."""
     for tell in tuple(_TOLD):
         tell(done, of)
+
+
+@contextmanager
+def _compiling() -> Iterator[None]:
+    _WAITS.append(True)
+    try:
+        yield
+    finally:
+        _WAITS.pop()
+
+
+def waits_for_compiling() -> bool:
+    """Whether a function was called and is compiled at the moment: nothing is half done by it."""
+    return bool(_WAITS)
 
 
 @contextmanager

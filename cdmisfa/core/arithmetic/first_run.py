@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from cdmisfa.core.arithmetic.choice import portable_bits
 from cdmisfa.core.arithmetic.compiled import before_one_is_compiled, tell_compiling
-from cdmisfa.core.arithmetic.kept import example_of
+from cdmisfa.core.arithmetic.kept import example_of, folder_of
 
 LISTED = Path(__file__).with_name("first_run.json")
 
@@ -51,21 +51,26 @@ def _compile_all(parts: Mapping[str, bool]) -> None:
         for function, types in listed.get(part, ())
         if not _ready(call := _Call(function, types, portably), look=True)
     ]
-    if len(calls) < 2 or len(os.sched_getaffinity(0)) < 2:
+    if len(calls) < 2 or len(os.sched_getaffinity(0)) < 2 or folder_of(LISTED) is None:
         return
     from cdmisfa.core.processes import Workers  # of no use to later runs
 
     second = Workers(1)
     try:
         futures = [second.submit(_ready, call) for call in calls[1:]]
+
+        def tell(_: object = None) -> None:
+            tell_compiling(sum(one.done() for one in futures), len(calls))
+
+        tell()
+        for one in futures:
+            one.add_done_callback(tell)
         for call, future in zip(calls, [None, *futures], strict=True):
-            tell_compiling(sum(future.done() for future in futures), len(calls))
             if future is None or future.cancel():  # the other has not begun it
                 _ready(call)
-        for future in futures:
-            tell_compiling(sum(future.done() for future in futures), len(calls))
-            if not future.cancelled():
-                future.exception()
+        for one in futures:
+            if not one.cancelled():
+                one.exception()
         tell_compiling(len(calls), len(calls))
     except Exception:  # no process can be started here
         return

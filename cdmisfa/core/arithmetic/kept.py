@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import os
@@ -40,11 +41,20 @@ def kept_while_sources_last(dispatcher: Any) -> Any:
     A compiled function holds what it calls in other files; numba by itself compiles it again
     only when its own file has changed.
     """
-    kept: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    cache: Any = getattr(dispatcher, "_cache", None)
+    if hasattr(cache, "save_overload"):
+        cache.save_overload = partial(_saved_if_it_can_be, cache.save_overload)
+    kept: Any = getattr(cache, "_cache_file", None)
     if hasattr(kept, "_source_stamp"):
         kept._source_stamp = (kept._source_stamp, _sources())
         kept._load_index = partial(_index_or_none, kept._load_index)
     return dispatcher
+
+
+def _saved_if_it_can_be(save: Callable[..., None], *compiled: Any) -> None:
+    """Run on with what was compiled where the disk is full."""
+    with contextlib.suppress(OSError):
+        save(*compiled)
 
 
 def _index_or_none(load: Callable[[], Any]) -> Any:
@@ -95,7 +105,8 @@ def keep(name: str, source: Path, value: Any) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    whole = pickle.dumps((_made_by(source), value))
+    pickled = pickle.dumps((_made_by(source), value))
+    whole = hashlib.sha256(pickled).digest() + pickled
     folder = folder_of(source)
     if folder is not None:
         file = folder / _file(name, source)
@@ -117,8 +128,11 @@ def recalled(name: str, source: Path) -> Any:
     folder = folder_of(source)
     if folder is None:
         raise LookupError(name)
-    with (folder / _file(name, source)).open("rb") as file:
-        made_by, value = pickle.load(file)
+    whole = (folder / _file(name, source)).read_bytes()
+    checksum, pickled = whole[:32], memoryview(whole)[32:]
+    if hashlib.sha256(pickled).digest() != checksum:  # as a power cut can leave it
+        raise LookupError(name)
+    made_by, value = pickle.loads(pickled)
     if made_by != _made_by(source):
         raise LookupError(name)
     return value
