@@ -139,14 +139,14 @@ def test_results_are_kept_only_of_code_that_a_commit_holds(results: Path, tmp_pa
     git("init", "-q")
     git("add", "cdmisfa")
     git("commit", "-qm", "Begin")
-    report.save("modules", "Modules", "", [(["modules", "of none"], [[10, "1.38x"]])])
+    report.save("modules", "Modules", "", [(["modules", "vs a matrix product"], [[10, "1.38x"]])])
     path = history.keep("modules", tmp_path)
     assert path is not None
     told = json.loads(path.read_text())
     assert told["commit"].startswith(path.stem)
     page = report.write_page().read_text(encoding="utf-8")
     assert f"Measured at {told['commit'][:7]} on: " in page
-    assert told["ratios"] == {"Iteration with modules, times that without: 10 modules": 1.38}
+    assert told["ratios"] == {"Projecting on modules, times faster: 10, vs a matrix product": 1.38}
     (tmp_path / "cdmisfa" / "code.py").write_text("2\n")
     assert history.keep("modules", tmp_path) is None
 
