@@ -324,8 +324,11 @@ def before_one_is_compiled(compile_others: Callable[[], None]) -> Iterator[None]
 
 def _others_compiled() -> bool:
     """Whether functions were compiled that had waited for the first one."""
-    waiting = list(_OTHERS)
-    for compile_others in waiting:
-        _OTHERS.remove(compile_others)
+    called = False
+    while True:
+        try:
+            compile_others = _OTHERS.pop()
+        except IndexError:  # another thread may have taken the last one
+            return called
+        called = True
         compile_others()
-    return bool(waiting)
