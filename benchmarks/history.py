@@ -168,9 +168,8 @@ def draw(picture: Path) -> bool:
         axes.tick_params(labelsize=7)
         axes.set_xticks(*_days([told["date"][:10] for told in commits]))
         if axes.lines:
-            axes.legend(
-                fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0)
-            )  # inside it hides points
+            # inside it would hide points
+            axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(picture, dpi=100, metadata={"Software": None})
     return True
 

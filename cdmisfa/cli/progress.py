@@ -43,13 +43,13 @@ def compiling_said(shown: Bar) -> Iterator[None]:
                     "compiling for this machine, half a minute or so, and again each time: it "
                     "cannot be kept, set NUMBA_CACHE_DIR to a folder that can be written to"
                 )
-        if of and not counted:
-            shown.turn_to("compiling", "functions")
         if of:
+            if not counted:
+                shown.turn_to("compiling", "functions")
             shown.update(done, of)
-            if done == of:
-                shown.turn_to("learning", "blocks")
             counted = done < of
+            if not counted:
+                shown.turn_to("learning", "blocks")
 
     with told_of_compiling(tell):
         yield

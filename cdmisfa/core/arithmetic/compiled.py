@@ -227,6 +227,7 @@ _PREPARATIONS: list[Callable[[], None]] = []
 _TOLD: list[Callable[[int, int], None]] = []
 _OTHERS: list[Callable[[], None]] = []
 _WAITS: list[bool] = []
+"""One entry for each call that waits for its function to be compiled."""
 
 
 @cache

@@ -110,12 +110,12 @@ def keep(name: str, source: Path, value: Any) -> None:
     folder = folder_of(source)
     if folder is not None:
         file = folder / _file(name, source)
-        partial = file.with_name(f"{file.name}.{uuid.uuid4().hex[:16]}")
+        unfinished = file.with_name(f"{file.name}.{uuid.uuid4().hex[:16]}")
         try:
-            partial.write_bytes(whole)
-            partial.replace(file)
+            unfinished.write_bytes(whole)
+            unfinished.replace(file)
         finally:
-            partial.unlink(missing_ok=True)
+            unfinished.unlink(missing_ok=True)
 
 
 def recalled(name: str, source: Path) -> Any:

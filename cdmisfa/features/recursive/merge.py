@@ -73,6 +73,16 @@ def transposed(a: Float) -> Float:
 
 
 @compiled
+def columns(a: Float, start: int, stop: int, rows: int) -> Float:
+    """Columns [start, stop) of the first rows of A, for themselves in memory."""
+    out = np.empty((rows, stop - start))
+    for i in range(rows):
+        for j in range(start, stop):
+            out[i, j - start] = a[i, j]
+    return out
+
+
+@compiled
 def gram_of_rows(variance: Float, seen: float, e: Float, g: Float, m: int) -> Float:
     """A A' of the weighted old basis and the block's frames.
 
@@ -242,11 +252,8 @@ def merge(
         for s in range(n):
             parts[p, rank + s] += g[t, s] / m
     seen_by = multiply(weights, parts)
-    turn, frames, new = np.empty((k, rank)), np.empty((k, n)), np.empty(k)
+    turn, frames = columns(seen_by, 0, rank, k), columns(seen_by, rank, rank + n, k)
+    new = np.empty(k)
     for i in range(k):
         new[i] = values[i] / (seen + m)
-        for j in range(rank):
-            turn[i, j] = seen_by[i, j]
-        for s in range(n):
-            frames[i, s] = seen_by[i, rank + s]
     return Merge(old, chosen, weights, new, turn, frames)

@@ -23,7 +23,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.features.inner_products import ROWS
 from cdmisfa.features.projection import outputs
 from cdmisfa.features.recursive.eigen import eigen
-from cdmisfa.features.recursive.merge import merge, multiply, transposed
+from cdmisfa.features.recursive.merge import columns, merge, multiply, transposed
 from cdmisfa.features.recursive.passes import measure, rebuild
 
 Float = NDArray[np.float64]
@@ -105,15 +105,12 @@ def advance(state: State, frames: NDArray[Any], scale: float, gap: bool, window:
     k = len(done.variance)
     first = 1 if gap or seen == 0 else 0
     count = m - first
-    steps, differences = np.empty((k, count)), np.empty((rank, rank))
+    steps = np.empty((k, count))
     for i in range(k):
         for t in range(count):
             steps[i, t] = done.frames[i, first + t + 1] - done.frames[i, first + t]
-    for i in range(rank):
-        for j in range(rank):
-            differences[i, j] = state.differences[i, j]
     back = transposed(done.turn)
-    turned = multiply(multiply(done.turn, differences), back)
+    turned = multiply(multiply(done.turn, columns(state.differences, 0, rank, rank)), back)
     new = multiply(steps, transposed(steps))
     share = 1.0 / max(pairs + count, 1)
     for i in range(size):
@@ -127,11 +124,7 @@ def advance(state: State, frames: NDArray[Any], scale: float, gap: bool, window:
     state.counts[0] = k
     state.counts[1] = min(seen + m, window)
     state.counts[2] = min(pairs + count, window)
-    weights = np.empty((len(state.weights), rank))
-    for o in range(len(weights)):
-        for j in range(rank):
-            weights[o, j] = state.weights[o, j]
-    before = multiply(weights, back)
+    before = multiply(columns(state.weights, 0, rank, len(state.weights)), back)
     _slowest(state)
     return _align(state, before)
 
