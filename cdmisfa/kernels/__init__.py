@@ -1,0 +1,187 @@
+"""The kernels: what is computed in C, ahead of time, behind one boundary.
+
+Every function checks the type, shape and order of what it is given and hands pointers on; C trusts
+them. The same arguments give the same bits with every compiler and on every x86-64 and 64-bit Arm
+processor: see `lanes.h`. What each computes is said where it is used, and in the C file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.blocks import UINT8, as_frames
+from cdmisfa.core.errors import UsageError
+from cdmisfa.kernels import _plain
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+FLOAT64, INT64 = np.dtype(np.float64), np.dtype(np.int64)
+
+ARITHMETIC = 3
+"""Version of the order in which the kernels compute, to be raised with every change of their bits.
+
+1 and 2 were of one processor and compiler; since 3 the bits are the same on all of them.
+"""
+
+
+def _chosen() -> Any:
+    """The module for the instruction set of this processor; the bits are the same."""
+    if _plain.lib.has_wide_lanes():
+        from cdmisfa.kernels import _wide
+
+        return _wide
+    return _plain
+
+
+_module = _chosen()
+lib: Any = _module.lib
+ffi: Any = _module.ffi
+_buffer = ffi.from_buffer
+
+WIDE: bool = _module is not _plain
+"""Whether the kernels for AVX2 and FMA run here."""
+
+
+def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
+    """Where an array lies, for C to read and write; it keeps the array alive.
+
+    Raises:
+        UsageError: it is of another type or shape, or does not lie in C order, or is read-only.
+    """
+    if type(array) is not np.ndarray or array.dtype != dtype or array.shape != shape:
+        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array)
+        raise UsageError(f"{name} is {found}: give an array of {dtype} {shape}")
+    flags = array.flags
+    if not (flags.c_contiguous and flags.aligned and flags.writeable):
+        raise UsageError(f"{name} does not lie in C order, aligned and writable: give a copy")
+    return _buffer("double[]" if dtype is FLOAT64 else "int64_t[]", array, True)
+
+
+def readable(name: str, array: Any, shape: tuple[int, ...]) -> Any:
+    """Where the numbers of an array lie, or a copy of them in C order, for C to read.
+
+    Raises:
+        UsageError: it is of another shape, or holds no numbers.
+    """
+    if type(array) is not np.ndarray or array.dtype != FLOAT64:
+        try:
+            array = np.asarray(array, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{name} holds no numbers: give an array of {shape}") from error
+    if array.shape != shape:
+        raise UsageError(f"{name} has the shape {array.shape}: give an array of {shape}")
+    flags = array.flags
+    if not (flags.c_contiguous and flags.aligned):
+        array = array.copy(order="C")
+    return _buffer("double[]", array)
+
+
+class Struct:
+    """A record of C whose arrays live as long as it does.
+
+    Attributes:
+        pointer: to the record.
+    """
+
+    __slots__ = ("_kept", "pointer")
+
+    def __init__(
+        self, kind: str, numbers: Mapping[str, float], arrays: Mapping[str, Any]
+    ) -> None:
+        self._kept = arrays
+        self.pointer = ffi.new(f"{kind} *", {**numbers, **arrays})
+
+
+def frames_of(frames: Any, size: int | None = None) -> Struct:
+    """Frames as C takes them; see `as_frames`."""
+    rows = as_frames(frames, size)
+    held = "pixels" if rows.dtype == UINT8 else "values"
+    data = _buffer("uint8_t[]" if held == "pixels" else "double[]", rows)
+    return Struct("frames", {"n": rows.shape[0], "size": rows.shape[1]}, {held: data})
+
+
+def check(code: int, what: str) -> None:
+    """Raise what a kernel's return code says.
+
+    Raises:
+        MemoryError: there was not enough.
+        UsageError: `what` is no state that a kernel left.
+    """
+    if code == lib.NO_MEMORY:
+        raise MemoryError
+    if code == lib.NOT_A_STATE:
+        raise UsageError(f"{what} holds an index that points nowhere: it is not a state of one")
+
+
+def exp(x: float) -> float:
+    """Exp of a number."""
+    return float(lib.exp_of(x))
+
+
+def log(x: float) -> float:
+    """Natural logarithm of a number."""
+    return float(lib.log_of(x))
+
+
+def sin(x: Any) -> Float:
+    """Sines of an array of numbers up to a million."""
+    return _of_each(lib.sines, x)
+
+
+def cos(x: Any) -> Float:
+    """Cosines of the same."""
+    return _of_each(lib.cosines, x)
+
+
+def _of_each(function: Any, x: Any) -> Float:
+    shape = np.shape(x)
+    out = np.empty(shape)
+    function(readable("x", x, shape), out.size, pointer("out", out, shape))
+    return out
+
+
+def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[Float]:
+    """Standard normal draws of a generator, which is of no use afterwards, as arrays of shapes.
+
+    They are what `rng.standard_normal` gives one after the other, but for its rounding, which
+    depends on the C library.
+    """
+    sizes = [math.prod(shape) for shape in shapes]
+    out = np.empty(sum(sizes))
+    words = rng.bit_generator.random_raw(out.size + out.size // 16 + 64)
+    while lib.normals(_buffer("uint64_t[]", words), words.size, _buffer("double[]", out), out.size) < 0:
+        words = np.concatenate([words, rng.bit_generator.random_raw(words.size)])
+    ends = np.cumsum(sizes)[:-1]
+    return [part.reshape(s) for part, s in zip(np.split(out, ends), shapes, strict=True)]
+
+
+def outputs(phi: Float, offset: Float, frames: Any) -> Float:
+    """Output y = phi x - offset of every row of phi on every frame; see `projection.project`."""
+    rows = len(phi)
+    x = frames_of(frames, phi.shape[1])
+    y = np.empty((x.pointer.n, rows))
+    code = lib.outputs(
+        rows,
+        readable("phi", phi, (rows, x.pointer.size)),
+        readable("offset", offset, (rows,)),
+        x.pointer,
+        _buffer("double[]", y),
+    )
+    check(code, "phi")
+    return y
+
+
+def mean_output(phi: Float, mean: Float) -> Float:
+    """What phi (J, I) gives out on the mean input (I,), as (J,)."""
+    rows, size = phi.shape
+    out = np.empty(rows)
+    lib.mean_output(
+        rows, size, readable("phi", phi, phi.shape), readable("mean", mean, (size,)), _buffer("double[]", out)
+    )
+    return out

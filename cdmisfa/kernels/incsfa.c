@@ -1,0 +1,1 @@
+int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi) { return 0; }

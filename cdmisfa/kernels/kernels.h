@@ -1,0 +1,44 @@
+/* Everything that Python calls, and the records that it fills in; `build.py` reads this file, too.
+ *
+ * Arrays are of doubles, in C order, and do not overlap; (n, I) says n rows of I numbers. Their
+ * sizes and types are checked in `__init__.py`, and nowhere else. A function that returns an int
+ * returns 0, or one of these:
+ */
+enum {
+  NO_MEMORY = -1, /* there is not enough memory for what is in between */
+  NOT_A_STATE = -2 /* a number in the state, which is an index, lies outside of what it points to */
+};
+
+/* Frames as rows: pixels, which count 1/255 each, or values; the other pointer is null. */
+typedef struct {
+  int64_t n, size;
+  const uint8_t *pixels;
+  const double *values;
+} frames;
+
+/* Whether this processor has AVX2 and FMA, which one of the two modules is compiled for. */
+int has_wide_lanes(void);
+
+/* elementary.c */
+double exp_of(double x);
+double log_of(double x);
+void sines(const double *x, int64_t n, double *out);
+void cosines(const double *x, int64_t n, double *out);
+int64_t normals(const uint64_t *words, int64_t n_words, double *out, int64_t n);
+
+/* projection.c: phi (rows, I), offset (rows,), y (n, rows) */
+int outputs(int64_t rows, const double *phi, const double *offset, const frames *x, double *y);
+void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean, double *offset);
+
+/* incsfa.c: I inputs, K components, J outputs */
+typedef struct {
+  int64_t inputs, components, outputs;
+  double nu, window;  /* learning rate of MCA, frames of the running mean */
+  double *mean;       /* (I,) */
+  double *v, *d;      /* (K, I) CCIPCA vectors, (K,) their lengths */
+  double *gram;       /* (K, K) inner products of v; kept for many inputs only */
+  double *w, *z_prev; /* (J, K) MCA rows, (K,) whitened frame before */
+  double *phi;        /* (J, I) slow features */
+  int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
+} incsfa;
+int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);

@@ -1,0 +1,51 @@
+/* Outputs of slow features on whole blocks of frames, equation (1): y = phi (x - mean). */
+
+enum {
+  CHUNK = 256,   /* columns scaled at a time */
+  TOGETHER = 64, /* frames scaled at a time: so many chunks stay in L2 while all rows pass */
+  PANEL = 12     /* rows whose chunks stay in L1 while all frames pass */
+};
+
+static const double PIXEL = 1.0 / 255;
+
+/* Values of a frame in columns [start, start + width). */
+INLINE void read_columns(const frames *x, int64_t t, int64_t start, int64_t width, double *out) {
+  int64_t at = t * x->size + start;
+  if (x->pixels)
+    for (int64_t i = 0; i < width; i++) out[i] = (double)x->pixels[at + i] * PIXEL;
+  else
+    memcpy(out, x->values + at, (size_t)width * sizeof *out);
+}
+
+/* y = phi x - offset.
+ *
+ * A row's output does not depend on which rows it is stacked with, nor a frame's on its block.
+ */
+int outputs(int64_t rows, const double *phi, const double *offset, const frames *x, double *y) {
+  int64_t size = x->size, together = smaller(TOGETHER, x->n);
+  double *u = malloc((size_t)(together * (CHUNK + rows) + 1) * sizeof *u);
+  if (!u) return NO_MEMORY;
+  double *e = u + together * CHUNK;
+  for (int64_t first = 0; first < x->n; first += together) {
+    int64_t count = smaller(together, x->n - first);
+    memset(e, 0, (size_t)(rows * together) * sizeof *e);
+    for (int64_t start = 0; start < size; start += CHUNK) {
+      int64_t width = smaller(CHUNK, size - start);
+      for (int64_t t = 0; t < count; t++)
+        read_columns(x, first + t, start, width, u + t * CHUNK);
+      for (int64_t r = 0; r < rows; r += PANEL)
+        add_products(smaller(PANEL, rows - r), count, phi + r * size + start, size, u, CHUNK,
+                     width, e + r * together, together);
+    }
+    for (int64_t t = 0; t < count; t++)
+      for (int64_t r = 0; r < rows; r++)
+        y[(first + t) * rows + r] = e[r * together + t] - offset[r];
+  }
+  free(u);
+  return 0;
+}
+
+/* What phi gives out on the mean input: the offset of a centred projection. */
+void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean, double *offset) {
+  for (int64_t r = 0; r < rows; r++) offset[r] = dot(phi + r * size, mean, size);
+}
