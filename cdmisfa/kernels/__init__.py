@@ -185,3 +185,27 @@ def mean_output(phi: Float, mean: Float) -> Float:
         rows, size, readable("phi", phi, phi.shape), readable("mean", mean, (size,)), _buffer("double[]", out)
     )
     return out
+
+
+def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
+    """An abstraction as the kernels take it: the arrays of its `State`, and its constants."""
+    (K, size), J = state.v.shape, len(state.w)
+    shapes = {
+        "mean": (size,), "v": (K, size), "d": (K,), "gram": (K, K), "w": (J, K), "z_prev": (K,),
+        "phi": (J, size), "counts": (3,),
+    }
+    arrays = {
+        name: pointer(name, getattr(state, name), shape, INT64 if name == "counts" else FLOAT64)
+        for name, shape in shapes.items()
+    }
+    numbers = {"inputs": size, "components": K, "outputs": J, "nu": nu, "window": mean_window}
+    return Struct("incsfa", numbers, arrays)
+
+
+def incsfa_update(abstraction: Struct, frames: Any, gap: bool) -> Float:
+    """Learn from consecutive frames; see `IncSFA.update`."""
+    x = frames_of(frames, abstraction.pointer.inputs)
+    xi = np.empty(x.pointer.n)
+    code = lib.incsfa_update(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
+    check(code, "the abstraction")
+    return xi

@@ -55,8 +55,8 @@ int has_wide_lanes(void) {
 #endif
 }
 
-/* x . y over n numbers: sixteen lanes, then four, then what is left in order. */
-static double dot(const double *x, const double *y, int64_t n) {
+/* x . y over many numbers: sixteen lanes, then four, then what is left in order. */
+static double long_dot(const double *x, const double *y, int64_t n) {
   lanes a = spread(0), b = a, c = a, d = a;
   int64_t i = 0;
   for (; i + 4 * LANES <= n; i += 4 * LANES) {
@@ -71,6 +71,17 @@ static double dot(const double *x, const double *y, int64_t n) {
   return total;
 }
 
+/* x . y; of a few numbers in order, where adding lanes up would take longer. */
+INLINE double dot(const double *x, const double *y, int64_t n) {
+  if (n >= 2 * LANES) return long_dot(x, y, n);
+  double even = 0, odd = 0;
+  for (int64_t i = 0; i < n - 1; i += 2) {
+    even = fma(x[i], y[i], even);
+    odd = fma(x[i + 1], y[i + 1], odd);
+  }
+  return (n % 2 ? fma(x[n - 1], y[n - 1], even) : even) + odd;
+}
+
 /* y += a x. */
 INLINE void add_multiple(double a, const double *x, double *y, int64_t n) {
   int64_t i = 0;
@@ -78,9 +89,58 @@ INLINE void add_multiple(double a, const double *x, double *y, int64_t n) {
   for (; i < n; i++) y[i] = fma(a, x[i], y[i]);
 }
 
-/* Some rows of v times some rows of u; both counts are constants where this is called. */
+/* |x - y|^2, see `dot`. */
+static double square_distance(const double *x, const double *y, int64_t n) {
+  lanes a = spread(0), b = a;
+  int64_t i = 0;
+  for (; i + 2 * LANES <= n; i += 2 * LANES) {
+    lanes c = load(x + i) - load(y + i), d = load(x + i + LANES) - load(y + i + LANES);
+    a = add_product(c, c, a);
+    b = add_product(d, d, b);
+  }
+  double total = sum(a + b);
+  for (; i < n; i++) total = fma(x[i] - y[i], x[i] - y[i], total);
+  return total;
+}
+
+static const double PIXEL = 1.0 / 255;
+
+/* Four pixels as values. */
+INLINE lanes read_pixels(const uint8_t *p) {
+#if defined(__AVX2__) && defined(__FMA__)
+  int32_t four;
+  memcpy(&four, p, sizeof four);
+  return (lanes)_mm256_cvtepi32_pd(_mm_cvtepu8_epi32(_mm_cvtsi32_si128(four))) * spread(PIXEL);
+#else
+  return (lanes){p[0], p[1], p[2], p[3]} * spread(PIXEL);
+#endif
+}
+
+/* Four values of frames, or one, from the `at`-th on; `pixels` is a constant where it is called. */
+INLINE lanes read_lanes(const frames *x, int pixels, int64_t at) {
+  return pixels ? read_pixels(x->pixels + at) : load(x->values + at);
+}
+
+INLINE double read_value(const frames *x, int64_t at) {
+  return x->pixels ? x->pixels[at] * PIXEL : x->values[at];
+}
+
+/* Values of a frame in columns [start, start + width). */
+static void read_columns(const frames *x, int64_t t, int64_t start, int64_t width, double *out) {
+  int64_t at = t * x->size + start, i = 0;
+  if (x->values) {
+    memcpy(out, x->values + at, (size_t)width * sizeof *out);
+    return;
+  }
+  for (; i + LANES <= width; i += LANES) store(out + i, read_pixels(x->pixels + at + i));
+  for (; i < width; i++) out[i] = x->pixels[at + i] * PIXEL;
+}
+
+/* Some rows of v times some rows of u, or of pixels; both counts are constants where it is called,
+ * and one of the two pointers is null. */
 INLINE void add_products_of(int rows, int frames, const double *v, int64_t v_row, const double *u,
-                            int64_t u_row, int64_t width, double *e, int64_t e_row) {
+                            const uint8_t *pixels, int64_t u_row, int64_t width, double *e,
+                            int64_t e_row) {
   lanes s[3][8];
   int64_t whole = width - width % LANES;
 #pragma GCC unroll 3
@@ -90,7 +150,7 @@ INLINE void add_products_of(int rows, int frames, const double *v, int64_t v_row
   for (int64_t i = 0; i < whole; i += LANES) {
 #pragma GCC unroll 8
     for (int t = 0; t < frames; t++) {
-      lanes x = load(u + t * u_row + i);
+      lanes x = pixels ? read_pixels(pixels + t * u_row + i) : load(u + t * u_row + i);
 #pragma GCC unroll 3
       for (int r = 0; r < rows; r++) s[r][t] = add_product(load(v + r * v_row + i), x, s[r][t]);
     }
@@ -100,8 +160,10 @@ INLINE void add_products_of(int rows, int frames, const double *v, int64_t v_row
 #pragma GCC unroll 8
     for (int t = 0; t < frames; t++) {
       double total = sum(s[r][t]);
-      for (int64_t i = whole; i < width; i++)
-        total = fma(v[r * v_row + i], u[t * u_row + i], total);
+      for (int64_t i = whole; i < width; i++) {
+        double x = pixels ? pixels[t * u_row + i] * PIXEL : u[t * u_row + i];
+        total = fma(v[r * v_row + i], x, total);
+      }
       e[r * e_row + t] += total;
     }
 }
@@ -117,29 +179,75 @@ static void add_products(int64_t rows, int64_t frames, const double *v, int64_t 
   if (rows < 3)
     for (; t + 8 <= frames; t += 8)
       for (int64_t r = 0; r < rows; r++)
-        add_products_of(1, 8, v + r * v_row, v_row, u + t * u_row, u_row, width,
+        add_products_of(1, 8, v + r * v_row, v_row, u + t * u_row, NULL, u_row, width,
                         e + r * e_row + t, e_row);
   for (; t + 4 <= frames; t += 4) {
     int64_t r = 0;
     for (; r + 3 <= rows; r += 3)
-      add_products_of(3, 4, v + r * v_row, v_row, u + t * u_row, u_row, width,
+      add_products_of(3, 4, v + r * v_row, v_row, u + t * u_row, NULL, u_row, width,
                       e + r * e_row + t, e_row);
     if (r + 2 == rows)
-      add_products_of(2, 4, v + r * v_row, v_row, u + t * u_row, u_row, width,
+      add_products_of(2, 4, v + r * v_row, v_row, u + t * u_row, NULL, u_row, width,
                       e + r * e_row + t, e_row);
     if (r + 1 == rows)
-      add_products_of(1, 4, v + r * v_row, v_row, u + t * u_row, u_row, width,
+      add_products_of(1, 4, v + r * v_row, v_row, u + t * u_row, NULL, u_row, width,
                       e + r * e_row + t, e_row);
   }
   for (; t < frames; t++) {
     int64_t r = 0;
     for (; r + 3 <= rows; r += 3)
-      add_products_of(3, 1, v + r * v_row, v_row, u + t * u_row, u_row, width,
+      add_products_of(3, 1, v + r * v_row, v_row, u + t * u_row, NULL, u_row, width,
                       e + r * e_row + t, e_row);
     for (; r < rows; r++)
-      add_products_of(1, 1, v + r * v_row, v_row, u + t * u_row, u_row, width,
+      add_products_of(1, 1, v + r * v_row, v_row, u + t * u_row, NULL, u_row, width,
                       e + r * e_row + t, e_row);
   }
+}
+
+/* Some rows of `combine`, over `blocks` times four columns at once; both are constants. */
+INLINE void combine_of(int rows, int blocks, int64_t terms, const double *c, int64_t c_row,
+                       const double *x, int64_t x_row, int64_t width, double *out,
+                       int64_t out_row) {
+  int64_t i = 0;
+  for (; i + blocks * LANES <= width; i += blocks * LANES) {
+    lanes a[4][4];
+#pragma GCC unroll 4
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 4
+      for (int b = 0; b < blocks; b++) a[r][b] = spread(0);
+    for (int64_t k = 0; k < terms; k++)
+#pragma GCC unroll 4
+      for (int b = 0; b < blocks; b++) {
+        lanes y = load(x + k * x_row + i + b * LANES);
+#pragma GCC unroll 4
+        for (int r = 0; r < rows; r++)
+          a[r][b] = add_product(spread(c[r * c_row + k]), y, a[r][b]);
+      }
+#pragma GCC unroll 4
+    for (int r = 0; r < rows; r++)
+#pragma GCC unroll 4
+      for (int b = 0; b < blocks; b++) store(out + r * out_row + i + b * LANES, a[r][b]);
+  }
+  for (; i < width; i++)
+    for (int r = 0; r < rows; r++) {
+      double total = 0;
+      for (int64_t k = 0; k < terms; k++) total = fma(c[r * c_row + k], x[k * x_row + i], total);
+      out[r * out_row + i] = total;
+    }
+}
+
+/* out[r] = sum of c[r][k] x[k] over k in order, for rows of `width` columns. */
+static void combine(int64_t rows, int64_t terms, const double *c, int64_t c_row, const double *x,
+                    int64_t x_row, int64_t width, double *out, int64_t out_row) {
+  int64_t r = 0;
+  for (; r + 4 <= rows; r += 4)
+    combine_of(4, 2, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
+  if (r + 3 == rows)
+    combine_of(3, 2, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
+  if (r + 2 == rows)
+    combine_of(2, 4, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
+  if (r + 1 == rows)
+    combine_of(1, 4, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
 }
 
 #endif

@@ -6,15 +6,18 @@ enum {
   PANEL = 12     /* rows whose chunks stay in L1 while all frames pass */
 };
 
-static const double PIXEL = 1.0 / 255;
-
-/* Values of a frame in columns [start, start + width). */
-INLINE void read_columns(const frames *x, int64_t t, int64_t start, int64_t width, double *out) {
-  int64_t at = t * x->size + start;
-  if (x->pixels)
-    for (int64_t i = 0; i < width; i++) out[i] = (double)x->pixels[at + i] * PIXEL;
-  else
-    memcpy(out, x->values + at, (size_t)width * sizeof *out);
+/* `add_products` of a single row, for which frames need no copy. */
+static void add_products_once(const frames *x, int64_t first, int64_t count, const double *phi,
+                              int64_t start, int64_t width, double *e) {
+  int64_t t = 0, size = x->size, at = first * size + start;
+  if (x->values) {
+    add_products(1, count, phi + start, size, x->values + at, size, width, e, 0);
+    return;
+  }
+  for (; t + 8 <= count; t += 8)
+    add_products_of(1, 8, phi + start, size, NULL, x->pixels + at + t * size, size, width, e + t, 0);
+  for (; t < count; t++)
+    add_products_of(1, 1, phi + start, size, NULL, x->pixels + at + t * size, size, width, e + t, 0);
 }
 
 /* y = phi x - offset.
@@ -31,6 +34,10 @@ int outputs(int64_t rows, const double *phi, const double *offset, const frames 
     memset(e, 0, (size_t)(rows * together) * sizeof *e);
     for (int64_t start = 0; start < size; start += CHUNK) {
       int64_t width = smaller(CHUNK, size - start);
+      if (rows == 1) {
+        add_products_once(x, first, count, phi, start, width, e);
+        continue;
+      }
       for (int64_t t = 0; t < count; t++)
         read_columns(x, first + t, start, width, u + t * CHUNK);
       for (int64_t r = 0; r < rows; r += PANEL)
