@@ -202,10 +202,13 @@ def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
     return Struct("incsfa", numbers, arrays)
 
 
-def incsfa_update(abstraction: Struct, frames: Any, gap: bool) -> Float:
-    """Learn from consecutive frames; see `IncSFA.update`."""
+def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update") -> Float:
+    """Learn from consecutive frames; see `IncSFA.update`.
+
+    What is faster is chosen by the number of inputs; `by` is "by_frame" or "by_gram" to say which.
+    """
     x = frames_of(frames, abstraction.pointer.inputs)
     xi = np.empty(x.pointer.n)
-    code = lib.incsfa_update(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
+    code = getattr(lib, f"incsfa_{by}")(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
     check(code, "the abstraction")
     return xi

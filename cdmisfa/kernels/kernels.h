@@ -42,3 +42,5 @@ typedef struct {
   int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
+int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
+int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
