@@ -48,6 +48,7 @@ FORBIDDEN = {
     "cdmisfa.features.recursive": ("cdmisfa.agents.learner", "recorder.config", "mcap"),
     "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),
     "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
+    "cdmisfa.kernels": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.presets": ("cdmisfa.core.config",),
     "cdmisfa.testing": ("cdmisfa.paper.panels", "cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),
