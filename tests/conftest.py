@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _signalled_children() -> None:
     """What tests begin and end with signals ends, though the tests were begun under nohup."""
     let_children_be_signalled()
+
+
+@pytest.fixture(scope="module", params=["_plain", "_wide"])
+def both_modules(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Tests of kernels run with each of the two modules that were compiled."""
+    from cdmisfa import kernels
+
+    if request.param == "_wide" and not kernels._plain.lib.has_wide_lanes():
+        pytest.skip("this processor has no AVX2")
+    module = importlib.import_module(f"cdmisfa.kernels.{request.param}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "lib", module.lib)
+        patch.setattr(kernels, "ffi", module.ffi)
+        patch.setattr(kernels, "_buffer", module.ffi.from_buffer)
+        yield
 
 
 @pytest.fixture

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from PIL import Image
+from reference import frames as reference
 
-from recorder.images import areas
+from cdmisfa import kernels
+from cdmisfa.core.errors import UsageError
+from recorder.images import areas, pixels
 from recorder.images.areas import averaged
 from recorder.images.framing import Fit, Framing
 from recorder.images.pixels import Bytes
-from replay.camera_logs.source import MANY, ForeignSource
+
+pytestmark = pytest.mark.usefixtures("both_modules", "untried")
 
 
-@pytest.fixture
-def untried() -> Iterator[None]:
-    """No sizes are known from before, and none of the test afterwards."""
+@pytest.fixture(scope="module")
+def untried(both_modules: None) -> Iterator[None]:
+    """No sizes are known from the other module."""
     areas._as_pillow.cache_clear()
     yield
     areas._as_pillow.cache_clear()
@@ -38,12 +37,13 @@ def noise(rows: int, columns: int, seed: int = 0, least: int = 0) -> Bytes:
     return np.random.default_rng(seed).integers(least, 256, (rows, columns), np.uint8)
 
 
-sizes = st.integers(2, 120).flatmap(lambda n: st.tuples(st.just(n), st.integers(1, n)))
-widths = st.integers(24, 700).flatmap(lambda n: st.tuples(st.just(n), st.integers(-(-n // 256), n)))
+sizes = st.integers(1, 120).flatmap(lambda n: st.tuples(st.just(n), st.integers(1, n)))
+widths = st.integers(1, 700).flatmap(lambda n: st.tuples(st.just(n), st.integers(-(-n // 256), n)))
 
 
 @settings(max_examples=60, deadline=None)
 @given(sizes, widths, st.integers(0, 9), st.sampled_from([0, 250, 255]))
+@example((1, 1), (1, 1), 0, 0)
 @example((2, 2), (24, 24), 0, 0)
 @example((8, 3), (24, 22), 0, 0)
 @example((2, 1), (24, 1), 0, 255)
@@ -87,8 +87,6 @@ def test_they_have_the_bits_of_pillow_for_images_of_cameras(
 @pytest.mark.parametrize(
     ("image", "frame"),
     [
-        ((1, 40), (1, 5)),
-        ((40, 23), (5, 5)),
         ((40, 40), (41, 5)),
         ((40, 40), (5, 41)),
         ((40, 40), (0, 5)),
@@ -97,49 +95,54 @@ def test_they_have_the_bits_of_pillow_for_images_of_cameras(
         ((600, 40), (2, 5)),
     ],
 )
-def test_what_is_narrow_or_enlarged_or_has_large_areas_is_left_to_pillow(
+def test_what_is_enlarged_or_has_large_areas_is_left_to_pillow(
     image: tuple[int, int], frame: tuple[int, int]
 ) -> None:
     assert averaged(noise(*image), *frame) is None
 
 
-@pytest.mark.usefixtures("untried")
 def test_a_pillow_with_other_bits_is_left_to_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    image, resize = noise(48, 64), Image.Image.resize
+    image, resize = noise(48, 65), Image.Image.resize  # of a size that was not tried
     monkeypatch.setattr(
         Image.Image, "resize", lambda self, size, _: resize(self, size, Image.Resampling.BILINEAR)
     )
     assert averaged(image, 6, 8) is None
 
 
+@given(st.data())
+def test_areas_lie_within_the_pixels(data: st.DataObject) -> None:
+    pixels = data.draw(st.tuples(st.integers(1, 40), st.integers(1, 300)))
+    areas = []
+    for size in reversed(pixels):
+        start = st.integers(0, size - 1)
+        one = start.flatmap(
+            lambda at, n=size: st.tuples(st.just(at), st.integers(1, min(n - at, 256)))
+        )
+        areas.append(data.draw(st.lists(one, min_size=1, max_size=9)))
+    image = noise(*pixels, seed=pixels[1])
+    across, down = (
+        kernels.areas(size, *zip(*of, strict=True))
+        for size, of in zip(reversed(pixels), areas, strict=True)
+    )
+    np.testing.assert_array_equal(
+        kernels.average(image, across, down), reference.average(image, *areas)
+    )
+    with pytest.raises(UsageError, match="image has the shape"):
+        kernels.average(image[:, 1:], across, down)
+
+
+@pytest.mark.parametrize("area", [(-1, 2), (0, 0), (0, 257), (299, 2), (2**63 - 1, 2), (0, -1)])
+def test_an_area_outside_of_the_pixels_is_refused(area: tuple[int, int]) -> None:
+    with pytest.raises(UsageError, match="empty, too large, or outside"):
+        kernels.areas(300, [0, area[0]], [1, area[1]])
+
+
 @pytest.mark.parametrize("fit", ["crop", "pad", "stretch"])
 @pytest.mark.parametrize("color", [False, True])
-def test_of_many_images_frames_are_those_of_few(fit: Fit, color: bool) -> None:
+def test_frames_are_those_of_pillow(fit: Fit, color: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     image = noise(90, 160, seed=5)
     shown = np.dstack([image, 255 - image, image // 3]) if color else image
-    few = Framing((90, 160), (17, 40), fit, color)
-    np.testing.assert_array_equal(replace(few, many=True).frame(shown), few.frame(shown))
-
-
-def test_what_is_compiled_is_loaded_for_logs_of_many_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-    monkeypatch.setattr(areas, "averaged", lambda *args: asked.append(args) or averaged(*args))
-    for images, loaded in ((MANY - 1, False), (MANY, True)):
-        path = tmp_path / f"{images}.mcap"
-        shown = noise(24, 320)
-        message = RawImage(width=320, height=24, step=320, encoding="mono8", data=shown.tobytes())
-        with path.open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            schema = writer.register_schema("foxglove.RawImage", "protobuf", b"")
-            channel = writer.register_channel("/camera", "protobuf", schema)
-            for i in range(images):
-                image = message.SerializeToString()
-                writer.add_message(channel, i * 40_000_000, image, i * 40_000_000)
-            writer.finish()
-        with contextlib.closing(ForeignSource(path, size=(3, 40))) as source:
-            frames = source.take(0, 8).frames.reshape(8, 3, 40)
-            np.testing.assert_array_equal(frames[7], by_pillow(shown, 3, 40))
-        assert bool(asked) == loaded
+    framing = Framing((90, 160), (17, 40), fit, color)
+    ours = framing.frame(shown)
+    monkeypatch.setattr(pixels, "averaged", lambda *_: None)
+    np.testing.assert_array_equal(ours, framing.frame(shown))

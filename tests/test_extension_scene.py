@@ -68,7 +68,7 @@ class Pendulums(ClockedSource):
 def pendulum(tmp_path: Path) -> Iterator[None]:
     preset = tmp_path / "pendulum.toml"
     preset.write_text(LEARNER)
-    SCENES.add("pendulum", Scene(PendulumConfig, Pendulums, str(preset), packages=("numba",)))
+    SCENES.add("pendulum", Scene(PendulumConfig, Pendulums, str(preset), packages=("pillow",)))
     yield
     SCENES.remove("pendulum")
 
@@ -86,7 +86,7 @@ def test_it_is_recorded_and_learned_from_with_the_same_signals(
     done = cdmisfa("record", "pendulum", "-o", folder, "--frames", 900, *words, "--json")
     assert done.code == 0, done.err
     assert [view["name"] for view in done.json["views"]] == ["swing", "slow_swing"]
-    assert b"version_numba" in (folder / "swing.mcap").read_bytes()
+    assert b"version_pillow" in (folder / "swing.mcap").read_bytes()
     learn = ("--max-iterations", 20, "--no-rerun", "--json")
     live = cdmisfa("learn", "pendulum", *words, *learn, "-o", tmp_path / "live")
     recorded = cdmisfa("learn", folder, "--seed", 5, *learn, "-o", tmp_path / "recorded")

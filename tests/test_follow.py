@@ -72,7 +72,7 @@ class TestFollowed(SourceContract):
 
 def test_frames_are_waited_for_until_the_recorder_is_done(tmp_path: Path) -> None:
     live, unfinished = OscillatorySource(), 0
-    with recorder(tmp_path / "rec", wait=0.1):  # loading what is compiled takes a while, too
+    with recorder(tmp_path / "rec", wait=0.1):
         source = FollowedSource(tmp_path / "rec", timeout=30)
         unfinished += not source.finished
         assert source.spec.length is None
@@ -283,8 +283,6 @@ def test_a_stopped_run_goes_on_following(cdmisfa: Cdmisfa, tmp_path: Path) -> No
 
 
 def test_a_signal_ends_the_waiting(cdmisfa: Cdmisfa, tmp_path: Path, finished: Path) -> None:
-    # compiles, where a signal ends a command at once
-    assert cdmisfa("learn", str(finished), "--max-iterations", "1").code == 0
     with recorder(tmp_path / "rec", wait=0.5):
         words = ["learn", str(tmp_path / "rec"), "--follow", "-o", str(tmp_path / "run")]
         learner = subprocess.Popen(

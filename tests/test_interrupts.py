@@ -16,7 +16,6 @@ from conftest import Cdmisfa, Outcome
 
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
-from cdmisfa.core.arithmetic.compiled import compiled
 from replay.playing.pace import Played, paced
 
 
@@ -53,29 +52,6 @@ def test_the_second_signal_interrupts_although_a_destructor_drops_it(capfd: Any)
             wait()
     assert outer.exit_code == 130
     assert capfd.readouterr().err == "finishing what is begun; again to stop at once\n"
-
-
-def test_the_first_signal_interrupts_where_code_is_compiled(
-    capfd: Any, monkeypatch: Any, tmp_path: Path
-) -> None:
-    def compiling(*arguments: Any) -> None:
-        signal.raise_signal(signal.SIGTERM)
-        wait()
-
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("cdmisfa.core.arithmetic.compiled._ForPython._compiled", compiling)
-    with interruptible() as outer, stoppable(), pytest.raises(KeyboardInterrupt):
-        compiled(halved)(1.0)
-    assert outer.exit_code == 143
-    assert capfd.readouterr().err == ""
-    with interruptible(), stoppable() as stop:
-        signal.raise_signal(signal.SIGTERM)
-    assert stop()
-
-
-def halved(x: float) -> float:
-    """Half of a number."""
-    return x / 2.0
 
 
 AT_THE_END = """

@@ -126,7 +126,7 @@ def test_what_a_file_states_is_read_as_it_was_written(
 ) -> None:
     dtype = "uint8" if len(shape) == 2 else "float64"
     spec = SourceSpec(("left", "right"), shape, dtype, tuple(truth), fps, 10**18)
-    facts = Identity("icub", 3, spec, {"scene": {}}, ("numba",)).facts("right", first)
+    facts = Identity("icub", 3, spec, {"scene": {}}, ("pillow",)).facts("right", first)
     values = facts.as_metadata()
     assert list(values)[:4] == ["schema", "scene", "view", "stream_index"]
     assert ViewFacts.from_metadata("x.mcap", values) == facts

@@ -182,7 +182,7 @@ def test_the_manifest_tells_how_to_do_it_again(tmp_path: Path) -> None:
     assert document["source"]["kind"] == "oscillatory"
     assert document["config"]["scene"] == {"kind": "oscillatory"}
     assert build(LearnerConfig, "learner", document["config"]["learner"]) == CONFIG
-    assert {"python", "numpy", "numba"} <= set(document["versions"])
+    assert {"python", "numpy"} <= set(document["versions"])
 
 
 @pytest.mark.parametrize("leftover", ["run.mcap", "run.mcap.partial", "notes.txt"])

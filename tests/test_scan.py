@@ -1,11 +1,9 @@
-"""The compiled reading of a chunk against the tables, on sound and on broken chunks."""
+"""The kernels that read a chunk against the tables, on sound and on broken chunks."""
 
 from __future__ import annotations
 
 import contextlib
 import struct
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -14,9 +12,11 @@ import pytest
 from fuzz_oracle import tabled_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference import frames as reference
 
+from cdmisfa import kernels
 from cdmisfa.core.blocks import Block, SourceSpec
-from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
@@ -25,9 +25,10 @@ from replay.mcap.reader import LogReader
 from replay.mcap.records import INDEX_HEADER
 from replay.mcap.segments import Segment
 from replay.mcap.tables import indexed_table
-from replay.recordings.kernels import scan
 from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
+
+pytestmark = pytest.mark.usefixtures("both_modules")
 
 FRAMES = 200
 BUFFER = np.empty(1 << 20, np.uint8)
@@ -83,7 +84,7 @@ def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
         view.close()
 
 
-def test_the_compiled_way_is_the_one_taken(pictures: dict[str, Path]) -> None:
+def test_the_way_by_kernels_is_the_one_taken(pictures: dict[str, Path]) -> None:
     view = ViewFile(pictures["zstd"])
     scanner = ChunkScanner(view.reader, view._layouts)
     taken = [scanner.scanned(s, BUFFER) is not None for s in view.reader.segments]
@@ -102,27 +103,30 @@ def chunk(pictures: dict[str, Path]) -> tuple[ViewFile, bytes, bytes]:
 
 
 def scanned(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
-    """The places that `scan` finds, or None where it refuses."""
-    scanner = ChunkScanner(view.reader, view._layouts)
+    """The places that `scan` finds, or None where it refuses; the plain code does the same."""
     segment = view.reader.segments[1]
     counts = segment.channel_counts()
     assert counts is not None
-    wanted = np.array([counts[int(c)] for c in scanner._channels], np.int64)
-    ends = np.zeros((2, int(wanted.max())), np.int64)
-    sound = scan(
-        np.frombuffer(data, np.uint8).copy(),
-        np.frombuffer(index, np.uint8),
-        segment.start,
-        segment.end,
-        scanner._channels,
-        scanner._least,
-        scanner._places,
-        scanner._marks,
-        ends,
-        np.zeros(ends.shape, np.uint64),
-        wanted,
+    wanted = [counts[layout.channel.id] for layout in view._layouts]
+    scanner = ChunkScanner(view.reader, view._layouts)
+    found = kernels.scan(data, index, segment.start, segment.end, scanner._wanted, wanted)
+    plain = reference.scan(data, index, segment.start, segment.end, *laid_out(view), wanted)
+    assert (found is None) == (plain is None)
+    if found is None or plain is None:
+        return None
+    for ours, theirs in zip(found, plain, strict=True):
+        np.testing.assert_array_equal(ours, np.array(theirs, ours.dtype))
+    return found[0]
+
+
+def laid_out(view: ViewFile) -> tuple[list[int], list[int], list[np.ndarray], list[np.ndarray]]:
+    own = view._layouts
+    return (
+        [x.channel.id for x in own],
+        [x.least for x in own],
+        [x.places for x in own],
+        [x.marks for x in own],
     )
-    return ends if sound else None
 
 
 def tabled(view: ViewFile, data: bytes, index: bytes) -> np.ndarray | None:
@@ -250,9 +254,37 @@ def test_a_time_that_is_not_its_frames_is_refused_where_its_chunk_is_read(
                 fast(view, 99, 2)
 
 
-def test_looking_at_a_log_compiles_nothing(pictures: dict[str, Path]) -> None:
-    code = (
-        "import sys; from pathlib import Path; from replay.integrity.info import describe; "
-        f"describe(Path({str(pictures['zstd'])!r})); sys.exit('numba' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+@settings(deadline=None)
+@given(st.data())
+def test_values_are_copied_from_within_the_data_only(data: st.DataObject) -> None:
+    raw = data.draw(st.binary(max_size=60))
+    edge = st.sampled_from([-1, 0, 1, 2**62, -(2**63), 2**63 - 1])
+    place = st.integers(0, len(raw)) | edge | edge.map(lambda n: min(n + len(raw), 2**63 - 1))
+    ends = data.draw(st.lists(place, max_size=3))
+    distances, width = data.draw(st.lists(place, max_size=3)), data.draw(st.integers(0, 20))
+    out = np.zeros((len(ends), len(distances) * width), np.uint8)
+    lows = [end - distance for end in ends for distance in distances]
+    try:
+        kernels.gather(raw, np.array(ends, np.int64), np.array(distances, np.int64), width, out)
+    except UsageError:
+        assert not out.any()
+        assert any(d < width for d in distances) or any(
+            not max(distances, default=0) <= end <= len(raw) for end in ends
+        )
+    else:
+        assert all(0 <= low <= len(raw) - width for low in lows)
+        assert out.tobytes() == reference.gather(raw, ends, distances, width)
+
+
+def test_layouts_that_promise_too_little_are_refused(chunk: tuple[ViewFile, bytes, bytes]) -> None:
+    view, data, index = chunk
+    segment = view.reader.segments[1]
+    counts = [50, 50]
+    channels = [layout.channel.id for layout in view._layouts]
+    for place in (-1, -(2**63), 2**63 - 1, len(data)):
+        wanted = kernels.layouts(channels, [0, 0], [[place], [0]], [[0], [0]])
+        assert kernels.scan(data, index, segment.start, segment.end, wanted, counts) is None
+    for wrong in ([50, 49], [-1, 50], [50, 51]):
+        wanted = kernels.layouts(channels, [0, 0], [[0], [0]], [[0], [0]])
+        assert kernels.scan(data, index, segment.start, segment.end, wanted, wrong) is None
+    assert kernels.scan(data, index, segment.start, segment.end, wanted, counts) is not None

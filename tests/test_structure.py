@@ -23,7 +23,7 @@ def inits(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("__init__.py"))
 
 
-HEAVY = ("numpy", "numba", "rerun", "pybullet", "matplotlib", "pyarrow", "mcap", "rich")
+HEAVY = ("numpy", "_cffi_backend", "rerun", "pybullet", "matplotlib", "pyarrow", "mcap", "rich")
 
 
 def python(*args: str) -> subprocess.CompletedProcess[str]:
@@ -36,8 +36,8 @@ FORBIDDEN = {
     "cdmisfa": ("cdmisfa.cli.app",),
     "cdmisfa.agents": ("cdmisfa.experiments.runs", "replay.palette", "recorder.config", "mcap"),
     "cdmisfa.arena": ("cdmisfa.paper.panels", "cdmisfa.cli.app"),
-    "cdmisfa.cli": ("numba", "rerun", "mcap", "pybullet"),
-    "cdmisfa.cli.commands": ("numba", "rerun", "mcap", "pybullet"),
+    "cdmisfa.cli": ("rerun", "mcap", "pybullet"),
+    "cdmisfa.cli.commands": ("rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
     "cdmisfa.core.arithmetic": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.core.untrusted": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
@@ -48,6 +48,7 @@ FORBIDDEN = {
     "cdmisfa.features.recursive": ("cdmisfa.agents.learner", "recorder.config", "mcap"),
     "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),
     "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
+    "cdmisfa.kernels": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.presets": ("cdmisfa.core.config",),
     "cdmisfa.testing": ("cdmisfa.paper.panels", "cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "recorder": ("replay.palette", "cdmisfa.agents.learner", "cdmisfa.features.sfa", "rerun"),

@@ -1,7 +1,7 @@
 """The group of commands, and how every way out of them becomes an exit code.
 
 A command's module is imported only when that command runs, so that `--help` and
-completion never wait for numpy, numba, PyBullet or Rerun.
+completion never wait for numpy, PyBullet or Rerun.
 """
 
 from __future__ import annotations

@@ -70,12 +70,11 @@ def stoppable(
 ) -> Iterator[Stop]:
     """Let the body end its step at the first signal, and say so; the second one interrupts it.
 
-    So does the first one while the body waits for code to be compiled.
     """
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if stop() or _compiling():
+        if stop():
             if callable(handle := outer[number]):  # which knows the exit code
                 handle(number, frame)
             raise KeyboardInterrupt
@@ -85,11 +84,6 @@ def stoppable(
 
     with _handled_by(ask):
         yield stop
-
-
-def _compiling() -> bool:
-    compiled = sys.modules.get("cdmisfa.core.arithmetic.compiled")
-    return compiled is not None and compiled.waits_for_compiling()
 
 
 def ignore_at_the_end() -> None:

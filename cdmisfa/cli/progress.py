@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import click
 
@@ -22,37 +21,6 @@ class Bar:
     def say(self, line: str) -> None:
         """A line that stays, above the bar."""
         click.echo(line, err=True)
-
-
-@contextmanager
-def compiling_said(shown: Bar) -> Iterator[None]:
-    """Say so where the body waits for code to be compiled, also where there is no terminal."""
-    from cdmisfa.core.arithmetic import kept
-    from cdmisfa.core.arithmetic.compiled import told_of_compiling
-
-    said = counted = False
-
-    def tell(done: int, of: int) -> None:
-        nonlocal said, counted
-        if not said:
-            said = True
-            if kept.folder_of(Path(kept.__file__)) is not None:
-                shown.say("compiling for this machine, which is kept: once, half a minute or so")
-            else:
-                shown.say(
-                    "compiling for this machine, half a minute or so, and again each time: it "
-                    "cannot be kept, set NUMBA_CACHE_DIR to a folder that can be written to"
-                )
-        if of:
-            if not counted:
-                shown.turn_to("compiling", "functions")
-            shown.update(done, of)
-            counted = done < of
-            if not counted:
-                shown.turn_to("learning", "blocks")
-
-    with told_of_compiling(tell):
-        yield
 
 
 @contextmanager

@@ -375,7 +375,7 @@ def as_frames(frames: Any, size: int | None = None) -> NDArray[Any]:
         array = array.view()
     else:
         return array
-    array.setflags(write=False)  # arrays that can be written would be compiled for once more
+    array.setflags(write=False)
     return array
 
 

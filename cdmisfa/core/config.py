@@ -48,6 +48,9 @@ _SHORT.maxlevel = 3
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 8
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = SHOWN
 
+FORMER = ("learner.portable",)
+"""Keys that had an effect once: runs and scripts that state them stay readable."""
+
 MAX_TAU = 100_000
 """A block of more frames than this does not fit into memory beside its images."""
 
@@ -87,7 +90,6 @@ class LearnerConfig:
     roc_radius: float = 0.3
     roc_memory: int = 40
     roc_error: float = 0.1
-    portable: bool = False
 
     def __post_init__(self) -> None:
         from cdmisfa.core.expansion import EXPANSIONS  # the keys alone are told without numpy
@@ -280,6 +282,8 @@ def build(
     for layer in layers:
         for key, value in layer.items():
             name, dot, rest = key.partition(".")
+            if f"{prefix}.{name}" in FORMER:
+                continue
             if name not in fields:
                 hint = did_you_mean(name, fields, f"{prefix}.")
                 raise UsageError(f"unknown key {prefix}.{shown(key)}: {hint}")

@@ -63,7 +63,7 @@ def expanded_size(kind: str, n_inputs: int) -> int:
 
 
 def expand(kind: str, frames: Any) -> NDArray[Any]:
-    """Expanded frames, ready for compiled code.
+    """Expanded frames.
 
     Args:
         kind: a name in `EXPANSIONS`.

@@ -14,7 +14,7 @@ from typing import Any
 
 from recorder.log.whole import whole
 
-PACKAGES = ("cdmisfa", "numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
+PACKAGES = ("cdmisfa", "numpy", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
 
 
 def plain(value: Any) -> Any:
@@ -53,26 +53,15 @@ def versions() -> Mapping[str, str]:
 
 @functools.cache
 def machine() -> dict[str, str]:
-    """The system and the processor, and what the libraries that compute use of it.
+    """The system and the processor.
 
-    Where arithmetic is not portable, the last bits of a result may depend on each.
+    No signal depends on them; renderings of the simulator, batch SFA and times may.
     """
-    import numpy as np
-
-    from cdmisfa.core.arithmetic.compiled import compiled_for
-
-    processor, features = compiled_for()
-    numpy_built: Any = np.show_config(mode="dicts")
-    blas = numpy_built.get("Build Dependencies", {}).get("blas", {})
     return {
         "system": platform.system(),
         "machine": platform.machine(),
         "libc": " ".join(platform.libc_ver()).strip(),
         "cpu": _cpu(),
-        "compiled_for": processor,
-        "cpu_features": " ".join(f[1:] for f in features.split(",") if f.startswith("+")),
-        "numpy_features": " ".join(numpy_built.get("SIMD Extensions", {}).get("found", ())),
-        "blas": f"{blas.get('name', 'unknown')} {blas.get('version', '')}".strip(),
     }
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from cdmisfa.core.arithmetic.choice import portable_wanted
-from cdmisfa.core.arithmetic.first_run import compiled_by_two
 from cdmisfa.core.blocks import Block, FrameSource, LongSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
@@ -53,35 +51,28 @@ def learn(
     """
     exhausted: LogExhaustedError | None = None
     modules = learner.max_modules if max_modules is None else max_modules
-    with compiled_by_two(parts_of(source, learner)):
-        while True:
-            ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")
-            if ended:
-                break
-            try:
-                block = source.take(learner.stream, learner.tau)
-            except LogExhaustedError as error:
-                if stop():  # while it waited for frames to be recorded
-                    continue
-                ended, exhausted = "log_exhausted", error
-                break
-            signals = learner.step(block)
-            for sink in sinks:
-                sink.block(block, signals, learner)
-                for text in learner.events:
-                    sink.event(block.t, signals.iteration, text)
+    while True:
+        ended = ending(learner, modules, max_iterations) or (INTERRUPTED if stop() else "")
+        if ended:
+            break
+        try:
+            block = source.take(learner.stream, learner.tau)
+        except LogExhaustedError as error:
+            if stop():  # while it waited for frames to be recorded
+                continue
+            ended, exhausted = "log_exhausted", error
+            break
+        signals = learner.step(block)
+        for sink in sinks:
+            sink.block(block, signals, learner)
+            for text in learner.events:
+                sink.event(block.t, signals.iteration, text)
     for sink in sinks:
         sink.event(source.t, max(learner.iteration - 1, 0), f"ended: {ENDINGS[ended]}")
         sink.finish()
     if exhausted is not None:
         raise exhausted
     return ended
-
-
-def parts_of(source: FrameSource, learner: Learner) -> dict[str, bool]:
-    """The parts of a run that call compiled functions, see `compiled_by_two`."""
-    learning = f"{type(learner).__name__} of {source.spec.dtype}"
-    return {learning: portable_wanted(learner), type(source).__name__: False}
 
 
 def ending(learner: Learner, max_modules: int | None, max_iterations: int | None) -> str:

@@ -45,7 +45,6 @@ OPTIONS = (
     "preset",
     "settings",
     "algorithm",
-    "portable",
     "loop",
     "salvage",
     "follow",
@@ -378,8 +377,8 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
     }
     streams = manifest["config"].get("scene", {}).get("kind")
     for key, old, new in differences(_json(before), _json(now)):
-        if (key, old, new) == ("config.learner.portable", None, False):
-            continue  # begun when there was no choice
+        if key == "config.learner.portable":
+            continue  # begun when it had an effect
         if key.startswith("config.scene.") and streams is not None and streams not in SCENES:
             continue  # begun when every source was called a scene
         if key.removeprefix("config.record.") in CLOCK and _clock(header.spec) == _clock(spec):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.core.arithmetic.choice import portable_bits
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
 from cdmisfa.core.errors import UsageError, are_for
@@ -53,11 +52,10 @@ class Configuration:
     clock: tuple[float, int] | None = None
 
     def open_scene(self) -> SeekableSource:
-        """The live scene; what it computes in the arithmetic that the learner is told to use."""
+        """The live scene."""
         from recorder.world.scenes import open_scene
 
-        with portable_bits(getattr(self.learner, "portable", False)):
-            return open_scene(self.scene.kind, self.scene, self.record)
+        return open_scene(self.scene.kind, self.scene, self.record)
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""

@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = face(
     __name__,
     {
         "cdmisfa.features.feature": "Feature",
-        "cdmisfa.features.incsfa.abstraction": "IncSFA",
+        "cdmisfa.features.incsfa": "IncSFA",
         "cdmisfa.features.projection": "project",
         "cdmisfa.features.recursive.recursive": "RecursiveSFA",
         "cdmisfa.features.sfa": "batch_sfa",

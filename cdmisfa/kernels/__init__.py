@@ -8,20 +8,21 @@ processor: see `lanes.h`. What each computes is said where it is used, and in th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import cdmisfa.kernels._plain as _plain
 from cdmisfa.core.blocks import UINT8, as_frames
 from cdmisfa.core.errors import UsageError
-from cdmisfa.kernels import _plain
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 FLOAT64, INT64 = np.dtype(np.float64), np.dtype(np.int64)
+_POINTERS = {FLOAT64: "double[]", INT64: "int64_t[]", UINT8: "uint8_t[]"}
 
 ARITHMETIC = 3
 """Version of the order in which the kernels compute, to be raised with every change of their bits.
@@ -33,7 +34,7 @@ ARITHMETIC = 3
 def _chosen() -> Any:
     """The module for the instruction set of this processor; the bits are the same."""
     if _plain.lib.has_wide_lanes():
-        from cdmisfa.kernels import _wide
+        import cdmisfa.kernels._wide as _wide
 
         return _wide
     return _plain
@@ -60,7 +61,7 @@ def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] 
     flags = array.flags
     if not (flags.c_contiguous and flags.aligned and flags.writeable):
         raise UsageError(f"{name} does not lie in C order, aligned and writable: give a copy")
-    return _buffer("double[]" if dtype is FLOAT64 else "int64_t[]", array, True)
+    return _buffer(_POINTERS[dtype], array, True)
 
 
 def records(kind: str, array: NDArray[np.void]) -> Any:
@@ -68,15 +69,15 @@ def records(kind: str, array: NDArray[np.void]) -> Any:
     return _buffer(f"{kind}[]", array, True)
 
 
-def readable(name: str, array: Any, shape: tuple[int, ...]) -> Any:
+def readable(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
     """Where the numbers of an array lie, or a copy of them in C order, for C to read.
 
     Raises:
         UsageError: it is of another shape, or holds no numbers.
     """
-    if type(array) is not np.ndarray or array.dtype != FLOAT64:
+    if type(array) is not np.ndarray or array.dtype != dtype:
         try:
-            array = np.asarray(array, dtype=np.float64)
+            array = np.asarray(array, dtype=dtype)
         except (TypeError, ValueError) as error:
             raise UsageError(f"{name} holds no numbers: give an array of {shape}") from error
     if array.shape != shape:
@@ -84,7 +85,7 @@ def readable(name: str, array: Any, shape: tuple[int, ...]) -> Any:
     flags = array.flags
     if not (flags.c_contiguous and flags.aligned):
         array = array.copy(order="C")
-    return _buffer("double[]", array)
+    return _buffer(_POINTERS[dtype], array)
 
 
 class Struct:
@@ -96,9 +97,7 @@ class Struct:
 
     __slots__ = ("_kept", "pointer")
 
-    def __init__(
-        self, kind: str, numbers: Mapping[str, float], arrays: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, kind: str, numbers: Mapping[str, float], arrays: Mapping[str, Any]) -> None:
         self._kept = arrays
         self.pointer = ffi.new(f"{kind} *", {**numbers, **arrays})
 
@@ -160,7 +159,10 @@ def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[Float]:
     sizes = [math.prod(shape) for shape in shapes]
     out = np.empty(sum(sizes))
     words = rng.bit_generator.random_raw(out.size + out.size // 16 + 64)
-    while lib.normals(_buffer("uint64_t[]", words), words.size, _buffer("double[]", out), out.size) < 0:
+    while (
+        lib.normals(_buffer("uint64_t[]", words), words.size, _buffer("double[]", out), out.size)
+        < 0
+    ):
         words = np.concatenate([words, rng.bit_generator.random_raw(words.size)])
     ends = np.cumsum(sizes)[:-1]
     return [part.reshape(s) for part, s in zip(np.split(out, ends), shapes, strict=True)]
@@ -187,7 +189,11 @@ def mean_output(phi: Float, mean: Float) -> Float:
     rows, size = phi.shape
     out = np.empty(rows)
     lib.mean_output(
-        rows, size, readable("phi", phi, phi.shape), readable("mean", mean, (size,)), _buffer("double[]", out)
+        rows,
+        size,
+        readable("phi", phi, phi.shape),
+        readable("mean", mean, (size,)),
+        _buffer("double[]", out),
     )
     return out
 
@@ -207,11 +213,14 @@ def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
     return Struct("incsfa", numbers, arrays)
 
 
-def incsfa_update(abstraction: Struct, frames: Any, gap: bool) -> Float:
-    """Learn from consecutive frames; see `IncSFA.update`."""
+def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update") -> Float:
+    """Learn from consecutive frames; see `IncSFA.update`.
+
+    What is faster is chosen by the number of inputs; `by` is "by_frame" or "by_gram" to say which.
+    """
     x = frames_of(frames, abstraction.pointer.inputs)
     xi = np.empty(x.pointer.n)
-    code = lib.incsfa_update(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
+    code = getattr(lib, f"incsfa_{by}")(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
     check(code, "the abstraction")
     return xi
 
@@ -313,3 +322,115 @@ def _block(agent: Struct, shown: Struct, x: Struct) -> tuple[int, int]:
 def _told(agent: Struct, frozen: Struct) -> tuple[Float, Float, Float]:
     M, n, J = frozen.pointer.modules, agent.pointer.tau, agent.pointer.outputs
     return np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
+
+
+def layouts(channels: Any, least: Any, places: Any, marks: Any) -> Struct:
+    """How the messages of some channels are laid out, for `scan`.
+
+    Args:
+        channels: (C,) the channels.
+        least: (C,) fewest bytes of a payload.
+        places: (C, M) distance from the payload's end of bytes that are the same in every message;
+            0 none.
+        marks: (C, M) those bytes.
+    """
+    n, m = shape = np.shape(places)
+    arrays = {
+        "ids": readable("channels", np.array(channels, np.int64), (n,), INT64),
+        "least": readable("least", np.array(least, np.int64), (n,), INT64),
+        "places": readable("places", np.array(places, np.int64), shape, INT64),
+        "bytes": readable("marks", np.array(marks, np.uint8), shape, UINT8),
+    }
+    return Struct("layouts", {"channels": n, "marks": m}, arrays)
+
+
+def scan(
+    data: Any, index: Any, start: int, stop: int, wanted: Struct, counts: Sequence[int]
+) -> tuple[Int, NDArray[np.uint64]] | None:
+    """Check a chunk of messages and find those of some channels.
+
+    Args:
+        data: the decompressed records, bytes.
+        index: its message index records, bytes.
+        start: earliest log time, in nanoseconds.
+        stop: latest log time.
+        wanted: the layouts of the channels.
+        counts: (C,) how many messages of each there are.
+
+    Returns:
+        (C, n) place after each message's payload and (C, n) its log time; None where the chunk is
+        not in order.
+    """
+    n, most = wanted.pointer.channels, max(counts)
+    ends, times = np.empty((n, most), np.int64), np.empty((n, most), np.uint64)
+    code = lib.scan(
+        _buffer("uint8_t[]", data),
+        len(data),
+        _buffer("uint8_t[]", index),
+        len(index),
+        start,
+        stop,
+        wanted.pointer,
+        readable("counts", counts, (n,), INT64),
+        _buffer("int64_t[]", np.zeros(n, np.int64)),
+        most,
+        _buffer("int64_t[]", ends),
+        _buffer("uint64_t[]", times),
+    )
+    return None if code else (ends, times)
+
+
+def gather(data: Any, ends: Int, distances: Int, width: int, out: NDArray[np.uint8]) -> None:
+    """Copy the values out of messages.
+
+    Args:
+        data: the decompressed records, bytes.
+        ends: (n,) place after each message's payload.
+        distances: (R,) distance of each value from there.
+        width: bytes of a value.
+        out: (n, R * width) written.
+
+    Raises:
+        UsageError: a value does not lie within the data.
+    """
+    n, values = len(ends), len(distances)
+    code = lib.gather(
+        _buffer("uint8_t[]", data),
+        len(data),
+        readable("ends", ends, (n,), INT64),
+        n,
+        readable("distances", distances, (values,), INT64),
+        values,
+        width,
+        pointer("out", out, (n, values * width), UINT8),
+    )
+    if code:
+        raise UsageError("a value lies outside of the data that it is to be copied from")
+
+
+MOST_AVERAGED = 256
+"""Most pixels of an area in a row or column: their sum fits 16 bits."""
+
+
+def areas(pixels: int, starts: Any, counts: Any) -> Struct:
+    """The areas (n,) that the pixels of a row or a column are averaged over, for `average`.
+
+    Raises:
+        UsageError: one lies outside of the pixels, or is empty or too large.
+    """
+    starts, counts = np.array(starts, np.int64), np.array(counts, np.int64)
+    sound = (starts >= 0) & (counts > 0) & (counts <= MOST_AVERAGED) & (starts <= pixels - counts)
+    if not sound.all():
+        raise UsageError(f"an area of {pixels} pixels is empty, too large, or outside of them")
+    arrays = {"starts": starts, "counts": counts}
+    pointers = {k: pointer(k, array, (len(starts),), INT64) for k, array in arrays.items()}
+    sizes = {"n": len(starts), "pixels": pixels, "most": counts.max(initial=0)}
+    return Struct("areas", sizes, pointers)
+
+
+def average(image: NDArray[np.uint8], across: Struct, down: Struct) -> NDArray[np.uint8]:
+    """Average the areas of an image (rows, columns), along its rows and then down its columns."""
+    out = np.empty((down.pointer.n, across.pointer.n), np.uint8)
+    pixels = readable("image", image, (down.pointer.pixels, across.pointer.pixels), UINT8)
+    check(lib.average(pixels, across.pointer, down.pointer, _buffer("uint8_t[]", out)), "image")
+    return out

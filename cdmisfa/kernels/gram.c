@@ -469,8 +469,10 @@ static double *part(double **memory, int64_t n) {
   return here;
 }
 
-static int update_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
+int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
   int64_t size = s->inputs, K = s->components, J = s->outputs, every = size / CELL;
+  if (s->counts[0] < 0 || s->counts[2] < 0) return NOT_A_STATE;
+  if (x->n == 0) return 0;
   int pending = s->counts[1] == 1;
   gap = gap || s->counts[0] == 0;
   int64_t tiles = (size + TILE - 1) / TILE;

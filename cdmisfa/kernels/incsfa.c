@@ -154,7 +154,15 @@ INLINE int update_by_frame(const incsfa *s, const frames *x, int gap, double *xi
   return 0;
 }
 
-static int update_by_gram(const incsfa *s, const frames *x, int gap, double *xi);
+int incsfa_by_frame(const incsfa *s, const frames *x, int gap, double *xi) {
+  if (s->counts[0] < 0) return NOT_A_STATE;
+  if (s->inputs == 5 && s->components == 5 && s->outputs == 1) {
+    incsfa paper = *s; /* its loops are unrolled where the compiler knows how long they are */
+    paper.inputs = paper.components = 5, paper.outputs = 1;
+    return update_by_frame(&paper, x, gap, xi);
+  }
+  return update_by_frame(s, x, gap, xi);
+}
 
 /* Learn from consecutive frames (n, I).
  *
@@ -162,13 +170,5 @@ static int update_by_gram(const incsfa *s, const frames *x, int gap, double *xi)
  * receives the change of phi at each frame, NaN at such ones.
  */
 int incsfa_update(const incsfa *s, const frames *x, int gap, double *xi) {
-  if (s->counts[0] < 0 || s->counts[2] < 0) return NOT_A_STATE;
-  if (x->n == 0) return 0;
-  if (s->inputs >= MANY_INPUTS) return update_by_gram(s, x, gap, xi);
-  if (s->inputs == 5 && s->components == 5 && s->outputs == 1) {
-    incsfa paper = *s; /* its loops are unrolled where the compiler knows how long they are */
-    paper.inputs = paper.components = 5, paper.outputs = 1;
-    return update_by_frame(&paper, x, gap, xi);
-  }
-  return update_by_frame(s, x, gap, xi);
+  return s->inputs < MANY_INPUTS ? incsfa_by_frame(s, x, gap, xi) : incsfa_by_gram(s, x, gap, xi);
 }

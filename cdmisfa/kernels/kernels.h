@@ -6,7 +6,8 @@
  */
 enum {
   NO_MEMORY = -1, /* there is not enough memory for what is in between */
-  NOT_A_STATE = -2 /* a number in the state, which is an index, lies outside of what it points to */
+  NOT_A_STATE = -2, /* a number in the state, which is an index, lies outside of what it points to */
+  OUT_OF_ORDER = -3 /* a chunk is not as its index says, or as its messages are laid out */
 };
 
 /* Frames as rows: pixels, which count 1/255 each, or values; the other pointer is null. */
@@ -118,3 +119,26 @@ int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const
                    const curves *kept);
 void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
               const double *y_frozen, double *told);
+int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
+int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
+
+/* frames.c: C channels of a log, with M marks in each of their messages */
+typedef struct {
+  int64_t channels, marks;
+  const int64_t *ids, *least; /* (C,) channels, and the fewest bytes of a payload */
+  const int64_t *places;      /* (C, M) from the payload's end to bytes that are always the same */
+  const uint8_t *bytes;       /* (C, M) those bytes; a place 0 is none */
+} layouts;
+/* In counts (C,) messages of each, n at most, seen (C,) of zeros; out ends and times (C, n). */
+int scan(const uint8_t *data, int64_t size, const uint8_t *index, int64_t index_size,
+         uint64_t start, uint64_t stop, const layouts *wanted, const int64_t *counts,
+         int64_t *seen, int64_t n, int64_t *ends, uint64_t *times);
+int gather(const uint8_t *data, int64_t size, const int64_t *ends, int64_t n,
+           const int64_t *distances, int64_t values, int64_t width, uint8_t *out);
+
+/* The areas that the pixels of a row or a column are averaged over, n of up to 256 each. */
+typedef struct {
+  int64_t n, pixels, most;        /* the most pixels of an area */
+  const int64_t *starts, *counts; /* (n,) its first pixel, and how many; within the pixels */
+} areas;
+int average(const uint8_t *image, const areas *across, const areas *down, uint8_t *out);

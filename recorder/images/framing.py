@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -30,14 +30,12 @@ class Framing:
         size: of a frame.
         fit: see `fitted`.
         color: whether a frame shows red, green and blue beside one another.
-        many: whether there are many images; see `shrink`.
     """
 
     first: Size
     size: Size
     fit: Fit
     color: bool = False
-    many: bool = False
 
     def frame(self, image: Bytes) -> Bytes:
         """Make an image a frame; one of another size than the first may be smaller than a frame.
@@ -48,16 +46,12 @@ class Framing:
         Raises:
             UsageError: the image is smaller, as the first is.
         """
-        enlarge, many = size_of(image) != self.first, self.many
+        enlarge = size_of(image) != self.first
         if not self.color:
-            return fitted(image, self.size, self.fit, enlarge=enlarge, many=many)
+            return fitted(image, self.size, self.fit, enlarge=enlarge)
         planes = [image] if image.ndim == 2 else [image[:, :, c].copy() for c in range(3)]
-        shown = [fitted(p, self.size, self.fit, enlarge=enlarge, many=many) for p in planes]
+        shown = [fitted(p, self.size, self.fit, enlarge=enlarge) for p in planes]
         return np.hstack(shown if len(shown) == 3 else shown * 3)
-
-    def of_many(self) -> Framing:
-        """The same for many images."""
-        return replace(self, many=True)
 
     def change(self, image: tuple[int, ...]) -> str:
         """What the user should know of an image of another shape; "" of one like the first."""
@@ -107,10 +101,6 @@ class Vector:
                 f"part of the field, as --field position[0:{least}]"
             )
         return numbers
-
-    def of_many(self) -> Vector:
-        """The same, for numbers are taken as they are."""
-        return self
 
     def change(self, numbers: tuple[int, ...]) -> str:
         """Nothing: see `frame`."""
@@ -170,9 +160,7 @@ def default_size(image: Size) -> Size:
     return max(height // divisor, 1), max(width // divisor, 1)
 
 
-def fitted(
-    image: Bytes, size: Size, fit: Fit, *, enlarge: bool = False, many: bool = False
-) -> Bytes:
+def fitted(image: Bytes, size: Size, fit: Fit, *, enlarge: bool = False) -> Bytes:
     """Make an image a frame.
 
     Args:
@@ -181,7 +169,6 @@ def fitted(
         fit: where the ratio of the sides is another: "crop" cuts two sides, as much of each,
             "pad" puts black at them, "stretch" changes the ratio.
         enlarge: take a smaller image, too.
-        many: see `shrink`.
 
     Raises:
         UsageError: the image is smaller.
@@ -191,10 +178,10 @@ def fitted(
     if fit == "crop":
         image = _middle(image, _largest_within(size_of(image), size))
     if fit != "pad":
-        return shrink(image, *size, enlarge=enlarge, many=many)
+        return shrink(image, *size, enlarge=enlarge)
     inner = _largest_within(size, size_of(image))
     frame = np.zeros(size, np.uint8)
-    _middle(frame, inner)[:] = shrink(image, *inner, enlarge=enlarge, many=many)
+    _middle(frame, inner)[:] = shrink(image, *inner, enlarge=enlarge)
     return frame
 
 

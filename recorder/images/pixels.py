@@ -14,6 +14,7 @@ from PIL import Image
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
+from recorder.images.areas import averaged
 
 Bytes = NDArray[np.uint8]
 
@@ -220,9 +221,7 @@ def _high_bytes(pixels: NDArray[Any]) -> Bytes:
     return found
 
 
-def shrink(
-    image: Bytes, height: int, width: int, *, enlarge: bool = False, many: bool = False
-) -> Bytes:
+def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> Bytes:
     """Average the areas of a gray image into fewer pixels.
 
     Args:
@@ -230,7 +229,6 @@ def shrink(
         height: rows of the result.
         width: columns of the result.
         enlarge: repeat the pixels of a smaller image instead of refusing it.
-        many: load what does the same in less time, which takes as long as some hundred images.
 
     Raises:
         UsageError: the image is smaller.
@@ -242,11 +240,8 @@ def shrink(
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
             "choose a smaller --size"
         )
-    if many:
-        from recorder.images.areas import averaged
-
-        if (found := averaged(image, height, width)) is not None:
-            return found
+    if (found := averaged(image, height, width)) is not None:
+        return found
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arithmetic.elementary import cos, sin
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.kernels import cos, sin
 from recorder.config import SceneConfig, check_view_names
 
 PERIOD = 500

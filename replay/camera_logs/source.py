@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -43,9 +43,6 @@ from replay.camera_logs.stream import ImageStream
 from replay.storage.hashing import Hashed, LoggedSource
 from replay.storage.location import Location, Url
 from replay.stored import Span, outside
-
-MANY: Final = 300
-"""Frames of which what makes them small is loaded first, which takes as long as 200."""
 
 
 class UnequalError(UsageError):
@@ -167,8 +164,6 @@ class ForeignSource(LoggedSource):
             shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
-            if sum(map(len, self._rows)) >= MANY:
-                self._framings = [f.of_many() for f in self._framings]
         except BaseException:
             self.close()
             raise

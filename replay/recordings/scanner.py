@@ -1,7 +1,7 @@
 """Where the messages of a view hold their values, and copying these out of chunks.
 
-Chunks that are in order and written as our recorder does it are looked through by compiled
-code, in memory that is used again; all others by their tables, which say what is wrong with them.
+Chunks that are in order and written as our recorder does it are looked through by a
+kernel, in memory that is used again; all others by their tables, which say what is wrong with them.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa import kernels
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord
@@ -81,20 +82,16 @@ class ChunkScanner:
     """Decodes the chunks of one file for the channels of a view, laid out as they are."""
 
     def __init__(self, reader: LogReader, layouts: Sequence[RowLayout]) -> None:
-        # Imported with the first block that is read, so that looking at a log compiles nothing.
-        from replay.recordings import kernels
-
-        self._kernels = kernels
         self._reader = reader
         self._layouts = layouts
         longest = max(len(layout.marks) for layout in layouts)
-        self._channels = np.array([layout.channel.id for layout in layouts], np.int64)
-        self._least = np.array([layout.least for layout in layouts], np.int64)
-        self._places = np.zeros((len(layouts), longest), np.int64)
-        self._marks = np.zeros((len(layouts), longest), np.uint8)
+        places = np.zeros((len(layouts), longest), np.int64)
+        marks = np.zeros((len(layouts), longest), np.uint8)
         for c, layout in enumerate(layouts):
-            self._places[c, : len(layout.marks)] = layout.places
-            self._marks[c, : len(layout.marks)] = layout.marks
+            places[c, : len(layout.marks)] = layout.places
+            marks[c, : len(layout.marks)] = layout.marks
+        channels, least = [x.channel.id for x in layouts], [x.least for x in layouts]
+        self._wanted = kernels.layouts(channels, least, places, marks)
         self._kept: tuple[int, ScannedChunk] | None = None
         self._tabled: set[int] = set()
 
@@ -130,10 +127,10 @@ class ChunkScanner:
         """
         layout = self._layouts[which]
         ends = chunk.ends[which, low : low + len(out)]
-        self._kernels.gather(chunk.buffer, ends, layout.distances, layout.width, out)
+        kernels.gather(chunk.buffer, ends, layout.distances, layout.width, out)
 
     def scanned(self, segment: Segment, buffer: Bytes) -> ScannedChunk | None:
-        """Decode a chunk by compiled code, into a buffer where it is large enough.
+        """Decode a chunk by a kernel, into a buffer where it is large enough.
 
         Returns:
             None where the chunk is not in order, or not written as our recorder does it.
@@ -148,23 +145,8 @@ class ChunkScanner:
         except MalformedRecord:
             return None
         wanted = [counts.get(layout.channel.id, 0) for layout in self._layouts]
-        ends = np.empty((len(wanted), max(wanted)), np.int64)
-        times = np.empty(ends.shape, np.uint64)
-        if max(segment.start, segment.end) >= 2**63 or not self._kernels.scan(
-            data,
-            np.frombuffer(index, np.uint8),
-            segment.start,
-            segment.end,
-            self._channels,
-            self._least,
-            self._places,
-            self._marks,
-            ends,
-            times,
-            np.array(wanted, np.int64),
-        ):
-            return None
-        return ScannedChunk(buffer, ends, times)
+        found = kernels.scan(data, index, segment.start, segment.end, self._wanted, wanted)
+        return None if found is None else ScannedChunk(buffer, *found)
 
     def tabled(self, segment: Segment, buffer: Bytes) -> ScannedChunk:
         """Decode a chunk by its tables, into a buffer where it is large enough."""

@@ -89,13 +89,20 @@ def first_difference(first: Path, second: Path) -> Difference | None:
 
 
 def first_of(
-    first: Iterator[SignalColumns], second: Iterator[SignalColumns], version: int, at: int = 0
+    first: Iterator[SignalColumns],
+    second: Iterator[SignalColumns],
+    version: int,
+    at: int = 0,
+    rounding: float = 0.0,
 ) -> Difference | None:
-    """The first difference among the signals of a version of the record, from an iteration on."""
+    """The first difference among the signals of a version of the record, from an iteration on.
+
+    Numbers count as the same that differ by less than `rounding` times the largest beside them.
+    """
     a, b = next(first, None), next(second, None)
     while a is not None and b is not None:
         n = min(len(a), len(b))
-        found = _difference(at, a.rows(0, n), b.rows(0, n), version)
+        found = _difference(at, a.rows(0, n), b.rows(0, n), version, rounding)
         if found is not None:
             return found
         at += n
@@ -108,10 +115,11 @@ def first_of(
 
 
 def _difference(
-    iteration: int, a: SignalColumns, b: SignalColumns, version: int
+    iteration: int, a: SignalColumns, b: SignalColumns, version: int, rounding: float
 ) -> Difference | None:
     """The first difference between as many records of each run, from an iteration on."""
-    rows = {s.name: _row(a[s.name], b[s.name]) for s in SIGNALS.values() if s.since <= version}
+    names = [s.name for s in SIGNALS.values() if s.since <= version]
+    rows = {name: _row(a[name], b[name], rounding) for name in names}
     name = min(rows, key=rows.__getitem__)
     if rows[name] == len(a):
         return None
@@ -119,61 +127,54 @@ def _difference(
     x, y = a[name][rows[name]], b[name][rows[name]]
     if x.shape != y.shape:
         return Difference(at, name, (), f"of shape {x.shape}", f"of shape {y.shape}")
-    place = tuple(int(i) for i in np.argwhere(_differ(x, y))[0])
+    differ = differing(a[name], b[name], rounding)[rows[name]]
+    place = tuple(int(i) for i in np.argwhere(differ)[0])
     return Difference(at, name, place, repr(x[place].item()), repr(y[place].item()))
 
 
-def _row(x: NDArray[Any], y: NDArray[Any]) -> int:
+def _row(x: NDArray[Any], y: NDArray[Any], rounding: float) -> int:
     """The first row in which two columns differ, their length where there is none."""
     if x.shape != y.shape:
         return 0
-    differ = _differ(x, y)
+    differ = differing(x, y, rounding)
     return int(np.argmax(differ.reshape(len(x), -1).any(axis=1))) if differ.any() else len(x)
 
 
-def _differ(x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where two arrays of one shape differ in a bit; one NaN is as good as another."""
+def differing(x: NDArray[Any], y: NDArray[Any], rounding: float = 0.0) -> NDArray[np.bool_]:
+    """Where two arrays of one shape differ in a bit; one NaN is as good as another.
+
+    Or where they differ by more than `rounding` times the largest number in both.
+    """
     width = np.dtype(f"u{x.dtype.itemsize}")
     first, second = (np.ascontiguousarray(value).view(width) for value in (x, y))
     differ: NDArray[np.bool_] = (first != second).reshape(x.shape)
-    return differ & ~(np.isnan(x) & np.isnan(y)) if differ.any() else differ
+    if not differ.any():
+        return differ
+    differ &= ~(np.isnan(x) & np.isnan(y))
+    if rounding and x.dtype.kind == "f" and differ.any():
+        least = rounding * max(np.abs(v[np.isfinite(v)]).max(initial=0.0) for v in (x, y))
+        with np.errstate(invalid="ignore"):  # of infinities
+            differ &= ~(np.abs(x - y) <= least)
+    return differ
 
 
 def computed_otherwise(first: Path, second: Path) -> tuple[str, ...]:
     """What may explain a difference of two runs beside what they were told.
 
-    The version of their arithmetic, of packages, and the processor; of the last two nothing where
-    a run.json does not say. Processors explain nothing between runs with
-    `learner.portable`.
+    The version of their arithmetic, of packages, and the machine, as far as both say it in
+    run.json: from one machine to another scenes may be rendered differently.
     """
     a, b = (read_run_json(run_log(run).parent) for run in (first, second))
-    tables = ["versions"] if _is_portable(a) else ["versions", "platform"]
     one, two = read_header(first).arithmetic, read_header(second).arithmetic
     found = [] if one == two else [f"{ARITHMETIC} {one} against {two}"]
-    for before, after in ((a.get(table), b.get(table)) for table in tables):
+    for before, after in ((a.get(table), b.get(table)) for table in ("versions", "platform")):
         if isinstance(before, Mapping) and isinstance(after, Mapping):
             found += [
-                _otherwise(key, str(before.get(key, "unknown")), str(after.get(key, "unknown")))
-                for key in sorted({*before, *after})
-                if before.get(key) != after.get(key)
+                f"{key} {before[key]} against {after[key]}"
+                for key in sorted(before.keys() & after.keys())
+                if before[key] != after[key]
             ]
     return tuple(found)
-
-
-def _is_portable(document: Mapping[str, Any]) -> bool:
-    learner: Any = document.get("config", {})
-    for key in ("learner", "portable"):
-        learner = learner.get(key) if isinstance(learner, Mapping) else None
-    return learner is True
-
-
-def _otherwise(key: str, first: str, second: str) -> str:
-    """How a fact of two runs differs; of features of processors, those that one of them has."""
-    if not key.endswith("_features") or "unknown" in (first, second):
-        return f"{key} {first} against {second}"
-    a, b = first.split(), second.split()
-    more = (f"{sign}{f}" for sign, x, y in (("-", a, b), ("+", b, a)) for f in x if f not in y)
-    return f"{key} {' '.join(more)}"
 
 
 def told_otherwise(first: Path, second: Path) -> tuple[tuple[str, Any, Any], ...]:
@@ -200,7 +201,7 @@ def both_signals(
     rows = []
     for name in first.keys() & second.keys():
         x, y = (np.asarray(signals[name])[None] for signals in (first, second))
-        differ = "" if x.shape == y.shape and not _differ(x, y).any() else "differs"
+        differ = "" if x.shape == y.shape and not differing(x, y).any() else "differs"
         rows.append((name, _words(x[0]), _words(y[0]), differ))
     order = list(SIGNALS)
     return tuple(sorted(rows, key=lambda row: order.index(row[0])))

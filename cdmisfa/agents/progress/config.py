@@ -41,7 +41,6 @@ class ProgressConfig:
     even: float = 0.85
     looks: int = 2
     watch: int = 0
-    portable: bool = False
 
     def __post_init__(self) -> None:
         convert_fields(self, "learner")

@@ -19,7 +19,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.plugins import GROUPS, find, plugins
 from cdmisfa.core.registry import Registry
 
-PACKAGES = ("numpy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
+PACKAGES = ("numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
 """Packages that no command can do without for long."""
 
 EXTRAS = {
@@ -125,23 +125,14 @@ def _simulator() -> Iterator[Check]:
             yield Check(name, False, remedy, "the icub scene")
 
 
-def _kernel_cache() -> Iterator[Check]:
+def _kernels() -> Iterator[Check]:
     try:
-        from cdmisfa.core.arithmetic.kept import folder_of
-    except ImportError:  # `_packages` says which package is missing
+        from cdmisfa import kernels
+    except ImportError as error:
+        yield Check("kernels", False, f"{error}: install cdmisfa anew", "learning")
         return
-    root = Path(__file__).parents[3]
-    rooms = "cdmisfa/agents", "cdmisfa/features/incsfa", "recorder/images", "replay/recordings"
-    folders = [folder_of(root / room / "__init__.py") for room in rooms]
-    found = sorted({str(folder) for folder in folders if folder is not None})
-    kept = None not in folders
-    if not kept:
-        detail = "no folder can be written: set NUMBA_CACHE_DIR to one"
-    elif len(found) == 1:
-        detail = found[0]
-    else:
-        detail = f"{len(found)} folders below {os.path.commonpath(found)}"
-    yield Check("kernel cache", kept, detail, "a quick start the second time")
+    detail = "for AVX2 and FMA" if kernels.WIDE else "for any processor: the same bits, slower"
+    yield Check("kernels", True, detail, "learning")
 
 
 def _vulkan() -> Iterator[Check]:
@@ -165,7 +156,7 @@ LOOKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _extras,
     _plugins,
     _simulator,
-    _kernel_cache,
+    _kernels,
     _vulkan,
     _screen,
 )

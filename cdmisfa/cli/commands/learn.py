@@ -22,7 +22,7 @@ from cdmisfa.cli.cameras import (
     say_changes,
 )
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.progress import Bar, bar, compiling_said
+from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 
@@ -51,11 +51,7 @@ TICK = 0.1
     help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
 )
-@click.option(
-    "--portable",
-    is_flag=True,
-    help="The same bits on every x86-64 processor, short for --set learner.portable=true; slower.",
-)
+@click.option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
 @click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
 @click.option(
     "--max-modules",
@@ -94,7 +90,6 @@ def learn_command(
     preset: str | None,
     settings: tuple[str, ...],
     algorithm: str | None,
-    portable: bool,
     max_iterations: int | None,
     max_modules: int | None,
     loop: bool,
@@ -146,8 +141,6 @@ def learn_command(
     frames: FrameSource
     if algorithm is not None:
         settings = (*settings, f"learner.algorithm={algorithm}")
-    if portable:
-        settings = (*settings, "learner.portable=true")
     if not resume:
         refuse_keys_of_scenes(settings, source[0])
     with contextlib.ExitStack() as stack:
@@ -191,7 +184,7 @@ def learn_command(
             say_about(frames)
             stack.callback(say_changes, frames)
         try:
-            with bar("learning", "blocks") as shown, compiling_said(shown), stoppable() as stop:
+            with bar("learning", "blocks") as shown, stoppable() as stop:
                 if hasattr(frames, "stop"):
                     frames.stop = stop  # waiting for frames ends with a signal, too
                 reporter = Reporter(shown, max_iterations)

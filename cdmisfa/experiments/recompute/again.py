@@ -22,9 +22,6 @@ from replay.runs.final import other_files, stated_source
 from replay.runs.folders import run_log
 from replay.runs.log import RunHeader, read_header, read_keyframe
 
-LEARNERS_OWN = ("algorithm", "portable")
-"""Options of a command that are short for a key of the learner."""
-
 SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
 """What a source must have in common with the one that a run learned from."""
 
@@ -184,7 +181,8 @@ def source_of(run: Path, words: Sequence[str] = ()) -> SeekableSource:
             raise
     as_begun = not words or words[0] in SCENES
     settings = list(begun.get("settings", ()))
-    settings += [f"learner.{key}={begun[key]}" for key in LEARNERS_OWN if begun.get(key)]
+    if begun.get("algorithm"):
+        settings.append(f"learner.algorithm={begun['algorithm']}")
     words = tuple(words) or named
     if is_live(words[0]):
         raise UsageError(f"{words[0]} was live: name what learn --record wrote of it")

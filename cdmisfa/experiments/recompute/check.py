@@ -1,4 +1,7 @@
-"""Whether a run is what it says: learned again from its source, and compared bit for bit."""
+"""Whether a run is what it says: learned again from its source, and compared bit for bit.
+
+A run of a version that computed with another arithmetic is compared up to rounding.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,13 @@ from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.recompute.again import Again
 from replay.runs.columns import SignalColumns, columns_of_records
-from replay.runs.compare import Difference, first_of
+from replay.runs.compare import Difference, differing, first_of
 from replay.runs.log import read_keyframes
 from replay.runs.messages import arrays_of
 from replay.runs.stretches import read_columns
+
+ROUNDING = 1e-6
+"""Share of a signal's largest number up to which another arithmetic explains a difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +34,8 @@ class Checked:
 
     Attributes:
         difference: the first one, of the log from what was learned again.
-        arithmetic: version of the log's, and of what was learned again; other versions give other
-            last bits.
+        arithmetic: version of the log's, and of what was learned again; where they differ, all is
+            compared up to rounding.
         other_files: names of files that are not those the run learned from.
     """
 
@@ -38,6 +44,12 @@ class Checked:
     difference: Difference | None
     arithmetic: tuple[int, int] = (1, 1)
     other_files: tuple[str, ...] = ()
+
+    @property
+    def same_arithmetic(self) -> bool:
+        """Whether bits can be compared."""
+        then, now = self.arithmetic
+        return then == now
 
     @property
     def holds(self) -> bool:
@@ -50,7 +62,8 @@ class Checked:
         return {
             "from": self.start,
             "to": self.stop,
-            "identical": found is None,
+            "identical": found is None and self.same_arithmetic,
+            "same_up_to_rounding": found is None,
             "first_difference": None if found is None else found.as_json(),
             "arithmetic": list(self.arithmetic),
             "other_files": list(self.other_files),
@@ -62,10 +75,12 @@ class Checked:
         other = f"{files}: no longer what the run learned from" if files else ""
         if self.difference is None:
             what = f"iterations {self.start} to {self.stop - 1}"
-            same = f"{what}: learned again, they are identical, bit for bit"
+            how = "identical, bit for bit" if self.same_arithmetic else "the same up to rounding"
+            same = f"{what}: learned again, they are {how}"
+            if not self.same_arithmetic:
+                same += f" ({_otherwise(*self.arithmetic)})"
             return f"{same}; but {other}" if other else same
-        then, now = self.arithmetic
-        why = other or (_otherwise(then, now) if then != now else "")
+        why = other or ("" if self.same_arithmetic else _otherwise(*self.arithmetic))
         return f"{self.difference} when learned again{why and f': {why}'}"
 
 
@@ -95,7 +110,8 @@ def check_run(
     with Again(Path(run), start, source) as again:
         first = again.learner.iteration
         versions = again.header.arithmetic, arithmetic_of(again.learner)
-        at, found = _learned_again(again, stop, read_keyframes(again.log, first))
+        rounding = 0.0 if versions[0] == versions[1] else ROUNDING
+        at, found = _learned_again(again, stop, read_keyframes(again.log, first), rounding)
         others = tuple(again.other_files())
     if found is not None:
         return Checked(first, at, found, versions, others)
@@ -131,7 +147,10 @@ def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tup
 
 
 def _learned_again(
-    again: Again, stop: int | None, keyframes: Iterable[Keyframe] = ()
+    again: Again,
+    stop: int | None,
+    keyframes: Iterable[Keyframe] = (),
+    rounding: float = 0.0,
 ) -> tuple[int, Difference | None]:
     """Learn up to an iteration, or to the log's end: how far, and the log's first difference.
 
@@ -139,6 +158,7 @@ def _learned_again(
         again: learns.
         stop: the iteration.
         keyframes: that are compared, too.
+        rounding: see `first_of`.
     """
     left = iter(keyframes)
     at, kept = again.learner.iteration, next(left, None)
@@ -149,10 +169,10 @@ def _learned_again(
             for signals in again.steps(len(logged)):
                 records.append(signals)
                 if kept is not None and kept.iteration == again.learner.iteration:
-                    other = other or _moved(kept, again)
+                    other = other or _moved(kept, again, rounding)
                     kept = next(left, None)
         learned = columns_of_records(records)
-        found = first_of(iter([logged]), learned, again.header.schema, at)
+        found = first_of(iter([logged]), learned, again.header.schema, at, rounding)
         at += len(logged)
         both = [one for one in (found, other) if one is not None]
         if both:
@@ -160,14 +180,14 @@ def _learned_again(
     return at, None
 
 
-def _moved(keyframe: Keyframe, again: Again) -> Difference | None:
-    """Where a keyframe differs from the learner that stands there, in a bit."""
+def _moved(keyframe: Keyframe, again: Again, rounding: float) -> Difference | None:
+    """Where a keyframe differs from the learner that stands there."""
     last, state = keyframe.iteration - 1, again.learner.state
     kept, own = arrays_of(keyframe.state), arrays_of(state)
     if kept.keys() != own.keys():
         return Difference(last, "keyframe", (), ", ".join(kept), ", ".join(own))
     for name, array in kept.items():
-        if (found := _first(array, own[name])) is not None:
+        if (found := _first(array, own[name], rounding)) is not None:
             return Difference(last, f"keyframe {name}", *found)
     plain = {
         "t": (keyframe.t, again.t),
@@ -179,14 +199,25 @@ def _moved(keyframe: Keyframe, again: Again) -> Difference | None:
     return None
 
 
-def _first(a: NDArray[Any], b: NDArray[Any]) -> tuple[tuple[int, ...], str, str] | None:
-    """Place and values of the first element in which two arrays differ, in a bit."""
+def _first(
+    a: NDArray[Any], b: NDArray[Any], rounding: float
+) -> tuple[tuple[int, ...], str, str] | None:
+    """Place and values of the first element in which two arrays differ."""
     if (a.dtype, a.shape) != (b.dtype, b.shape):
         return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
     if a.tobytes() == b.tobytes():
         return None
-    pairs = zip(a.reshape(-1), b.reshape(-1), strict=True)
-    i = next(i for i, (x, y) in enumerate(pairs) if x.tobytes() != y.tobytes())
+    if rounding and a.dtype.names:
+        fields = (_first(a[name], b[name], rounding) for name in a.dtype.names)
+        return next((found for found in fields if found is not None), None)
+    if rounding and a.dtype.kind == "f":
+        differ = differing(a, b, rounding).reshape(-1).tolist()
+    else:
+        pairs = zip(a.reshape(-1), b.reshape(-1), strict=True)
+        differ = [x.tobytes() != y.tobytes() for x, y in pairs]
+    if True not in differ:
+        return None
+    i = differ.index(True)
     place = tuple(int(n) for n in np.unravel_index(i, a.shape))
     return place, repr(a.reshape(-1)[i].item()), repr(b.reshape(-1)[i].item())
 

@@ -21,7 +21,7 @@ from recorder.log.folder import folder_here
 from replay.runs.folders import run_log
 from replay.runs.log import read_header
 
-KEPT = ("algorithm", "expansion", "tau", "portable")
+KEPT = ("algorithm", "expansion", "tau")
 """Keys of a learner on which what it learned depends, whatever the shapes of its memory."""
 
 

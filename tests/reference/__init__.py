@@ -1,0 +1,1 @@
+"""What the kernels compute, once more, in plain Python and numpy."""

@@ -1,0 +1,86 @@
+"""The same seed gives the same signals on every machine: whole runs, where others can be had.
+
+The kernels alone, of more compilers and processors, are in `test_bits.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.sources import configure, open_source
+
+ROOT = Path(__file__).parents[1]
+
+SIGNALS: Mapping[str, str] = {}
+"""Of 40 iterations on the oscillatory streams, and of 4 on images, with seed 3."""
+
+PROGRAM = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+from test_same_bits import learned
+from cdmisfa import kernels
+print(json.dumps([kernels.WIDE, learned()]))
+"""
+
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+NO_FMA = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX,-AVX512F"}
+"""Holds the C library to what any x86-64 processor has."""
+
+
+def learned() -> dict[str, str]:
+    """The `signals_sha256` of each learner, of vectors and of images."""
+    found = {}
+    for algorithm in ("2.0", "1.0", "progress"):
+        told = configure("oscillatory", settings=[f"learner.algorithm={algorithm}"])
+        source = told.open_scene()
+        result = run(source, told.learner, seed=3, max_iterations=40)
+        found[algorithm] = result.signals_sha256
+        images, told = open_source(
+            [ROOT / "sample_logs" / "icub"],
+            settings=[f"learner.algorithm={algorithm}"],
+            seed=3,
+            loop=True,
+        )
+        with images:
+            result = run(images, told.learner, seed=3, max_iterations=4)
+        found[f"{algorithm} of images"] = result.signals_sha256
+    return found
+
+
+def elsewhere(*emulator: str, **environment: str) -> tuple[bool, dict[str, str]]:
+    done = subprocess.run(
+        [*emulator, sys.executable, "-c", PROGRAM, str(ROOT / "tests")],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    wide, found = json.loads(done.stdout)
+    return wide, found
+
+
+def test_the_signals_are_those_of_every_machine() -> None:
+    assert learned() == SIGNALS
+
+
+@pytest.mark.parametrize("threads", ["1", "5"])
+def test_the_number_of_threads_does_not_show(threads: str) -> None:
+    assert elsewhere(**dict.fromkeys(THREADS, threads))[1] == SIGNALS
+
+
+@pytest.mark.skipif(shutil.which("qemu-x86_64") is None, reason="qemu-x86_64 is not installed")
+def test_a_processor_without_avx_gives_the_same_signals() -> None:
+    assert elsewhere("qemu-x86_64", "-cpu", "Nehalem", **NO_FMA) == (False, SIGNALS)
