@@ -63,7 +63,7 @@ def learned(algorithm: str, portable: bool = True) -> str:
 def of_images() -> dict[str, str]:
     """What both kinds of slow feature analysis come to on images too wide for lanes alone."""
     from cdmisfa.features.incsfa.abstraction import IncSFA
-    from cdmisfa.features.recursive.recursive import RecursiveSFA
+    from cdmisfa.features.recursive import RecursiveSFA
 
     frames = np.random.default_rng(0).integers(0, 256, (3, 40, 301), dtype=np.uint8)
     with portable_bits():

@@ -42,3 +42,24 @@ typedef struct {
   int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
+
+/* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
+void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);
+
+/* recursive.c: I inputs, L directions, K whitened components, J outputs */
+enum { PIECE = 64 }; /* frames taken in at once; longer blocks are cut into pieces of so many */
+typedef struct {
+  int64_t inputs, size, components, outputs; /* I, L, K, J */
+  int64_t window;      /* frames of the exponential window */
+  double *mean;        /* (I,) */
+  double *basis;       /* (L, I) orthonormal directions, those of the largest variance first */
+  double *variance;    /* (L,) along them */
+  double *differences; /* (L, L) mean square of the differences of consecutive frames along them */
+  double *weights;     /* (J, L) slow features as weights of the directions */
+  double *spectrum;    /* (K,) slowness of all slow features */
+  double *last;        /* (I,) the last frame */
+  int64_t *counts;     /* (3,) directions in use, frames seen, differences seen */
+} recursive;
+int recursive_update(const recursive *sfa, const frames *x, int gap, double *change);
+void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
+              const double *b, int64_t b_row, double *c, int64_t c_row);
