@@ -9,7 +9,15 @@ from cffi import FFI
 
 HERE = Path("cdmisfa/kernels")
 
-FILES = ("elementary.c", "projection.c", "incsfa.c", "gram.c", "frames.c")
+FILES = (
+    "elementary.c",
+    "projection.c",
+    "incsfa.c",
+    "gram.c",
+    "eigen.c",
+    "recursive.c",
+    "frames.c",
+)
 """All are one translation unit, so that nothing of them is visible outside."""
 
 FLAGS = ["-O3", "-std=gnu11", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-Wno-psabi"]

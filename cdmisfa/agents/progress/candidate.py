@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arithmetic.elementary import log
 from cdmisfa.core.learning import overwrite
 from cdmisfa.features.projection import mean_output, project
-from cdmisfa.features.recursive.recursive import RecursiveSFA, State
+from cdmisfa.features.recursive import RecursiveSFA, State
 from cdmisfa.features.slowness import slowness, window_rate
 
 Float = NDArray[np.float64]
