@@ -16,6 +16,8 @@ FILES = (
     "gram.c",
     "eigen.c",
     "recursive.c",
+    "gate.c",
+    "agent.c",
     "frames.c",
 )
 """All are one translation unit, so that nothing of them is visible outside."""

@@ -47,6 +47,82 @@ typedef struct {
   int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
+
+/* The agent: S streams, J outputs, M frozen modules; what each field is, agents/agent.py tells. */
+enum { NOVEL = 0, CONSTANT = -1 }; /* what knows a block that no module does */
+
+typedef struct {
+  int64_t iteration, module, stream, last_stream, last_action, fed_stream, fed_until;
+  int64_t novel_blocks, rewards;
+  double scale, roc_error, xi, share, epsilon;
+  int64_t idle;
+} memory;
+
+typedef struct {
+  int64_t stream, module;
+  bool novel;
+  int64_t known_by;
+  bool saved;
+  double share;
+  int64_t novel_blocks;
+  double roc_error, roc_error_inst, xi, xi_dot, curiosity, expert, reward, epsilon;
+  bool explored;
+  int64_t action, next_stream;
+} outcome;
+
+typedef struct {
+  double sigma, beta, delta, gamma, epsilon_start, epsilon_decay, epsilon_knee, epsilon_tail_decay;
+  double slowness_window, eta_dot_window, gate_window, warm_up, min_variance, novel_share;
+  double alpha, roc_radius, roc_memory, roc_error, patience;
+  int64_t tabular;
+} rules;
+
+typedef struct {
+  int64_t streams, outputs, tau; /* S, J, frames of a block */
+  int64_t tensor, places;        /* whether `dense` is kept; centres of each stream, or 0 */
+  const rules *rules;
+  outcome *out;
+  memory *memory;
+  double *eta, *eta_dot, *eta_inst, *gate_mean, *gate_variance, *derivative; /* (J,) */
+  double *y_sum, *square_sum;                                                /* (J,) */
+  int64_t *y_frames;                                                         /* (1,) */
+  double *recent_mean, *recent_square;                                       /* (J,) */
+  double *stay_sum, *switch_sum, *dense;                                     /* (S,), (S, 2, S) */
+  int64_t *policy;                                                           /* (S,) */
+  double *centres, *counts; /* (S, places, tau, J), (S, places) */
+} agent;
+
+typedef struct {
+  int64_t modules;
+  double *phi, *offset;        /* (M J, I), (M J,) */
+  double *band_mean, *band_sd; /* (M, J) */
+  double *centres, *counts;    /* (M, S, places, tau, J), (M, S, places) */
+} frozen;
+
+/* What is kept of each iteration of a trial. */
+typedef struct {
+  outcome *outcome;                 /* (N,) */
+  double *eta_dot, *R, *Q;          /* (N, J), (N, S) of the stay entries, (N, S, 2) */
+  int64_t *policy;                  /* (N, S) */
+} curves;
+
+/* gate.c */
+double slowness(double derivative, double variance);
+void instantaneous_slowness(int64_t n, int64_t J, const double *y, double *eta);
+int recognise(const agent *a, const frozen *f, const frames *shown, const frames *x,
+              double *y_frozen, double *eta_inst, double *roc_error);
+
+/* agent.c */
+void action_values(const agent *a, double *Q);
+int think(const agent *a, const double *xi, const double *y, int64_t t, const double *uniforms);
+int iterate(const agent *a, const frozen *f, const incsfa *feature, const frames *shown,
+            const frames *x, int64_t t, const double *uniforms, double *y, double *y_frozen,
+            double *eta_inst, double *roc_error);
+int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const frames *shown,
+                   const frames *x, const double *uniforms, int64_t n, double swap_below,
+                   const curves *kept);
+void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
+              const double *y_frozen, double *told);
 int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
 int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
 
