@@ -434,3 +434,41 @@ def average(image: NDArray[np.uint8], across: Struct, down: Struct) -> NDArray[n
     pixels = readable("image", image, (down.pointer.pixels, across.pointer.pixels), UINT8)
     check(lib.average(pixels, across.pointer, down.pointer, _buffer("uint8_t[]", out)), "image")
     return out
+
+
+def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
+    """A state of recursive SFA as C takes it, to be written to; see `recursive.State`."""
+    (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
+    components = len(arrays["spectrum"])
+    shapes = {
+        "mean": (inputs,),
+        "basis": (size, inputs),
+        "variance": (size,),
+        "differences": (size, size),
+        "weights": (outputs, size),
+        "spectrum": (components,),
+        "last": (inputs,),
+    }
+    held = {name: pointer(name, arrays[name], shape) for name, shape in shapes.items()}
+    held["counts"] = pointer("counts", arrays["counts"], (3,), INT64)
+    sizes = {"inputs": inputs, "size": size, "components": components, "outputs": outputs}
+    return Struct("recursive", {**sizes, "window": window}, held)
+
+
+def recursive_update(state: Struct, frames: Any, gap: bool) -> Float:
+    """Learn from consecutive frames; see `RecursiveSFA.update`."""
+    x = frames_of(frames, state.pointer.inputs)
+    change = np.empty(x.pointer.n)
+    code = lib.recursive_update(state.pointer, x.pointer, bool(gap), _buffer("double[]", change))
+    check(code, "the SFA")
+    return change
+
+
+def multiply(a: Float, b: Float) -> Float:
+    """A (n, k) times B (k, m)."""
+    (rows, parts), width = a.shape, b.shape[1]
+    first, second = readable("a", a, (rows, parts)), readable("b", b, (parts, width))
+    out = np.empty((rows, width))
+    c = _buffer("double[]", out)
+    lib.multiply(rows, parts, width, first, parts, second, width, c, width)
+    return out

@@ -20,6 +20,10 @@ typedef struct {
 /* Whether this processor has AVX2 and FMA, which one of the two modules is compiled for. */
 int has_wide_lanes(void);
 
+/* lanes.h */
+void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
+              const double *b, int64_t b_row, double *c, int64_t c_row);
+
 /* elementary.c */
 double exp_of(double x);
 double log_of(double x);
@@ -142,3 +146,22 @@ typedef struct {
   const int64_t *starts, *counts; /* (n,) its first pixel, and how many; within the pixels */
 } areas;
 int average(const uint8_t *image, const areas *across, const areas *down, uint8_t *out);
+
+/* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
+void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);
+
+/* recursive.c: I inputs, L directions, K whitened components, J outputs */
+enum { PIECE = 64 }; /* frames taken in at once; longer blocks are cut into pieces of so many */
+typedef struct {
+  int64_t inputs, size, components, outputs; /* I, L, K, J */
+  int64_t window;      /* frames of the exponential window */
+  double *mean;        /* (I,) */
+  double *basis;       /* (L, I) orthonormal directions, those of the largest variance first */
+  double *variance;    /* (L,) along them */
+  double *differences; /* (L, L) mean square of the differences of consecutive frames along them */
+  double *weights;     /* (J, L) slow features as weights of the directions */
+  double *spectrum;    /* (K,) slowness of all slow features */
+  double *last;        /* (I,) the last frame */
+  int64_t *counts;     /* (3,) directions in use, frames seen, differences seen */
+} recursive;
+int recursive_update(const recursive *sfa, const frames *x, int gap, double *change);
