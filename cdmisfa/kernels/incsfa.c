@@ -13,9 +13,6 @@ static const double RANK_TOLERANCE = 1e-10;
 /* Variance below which a component is rounding noise whatever the others are. */
 static const double LEAST_VARIANCE = 1e-30;
 
-/* From so many inputs on the Gram kernel is faster, hence taken; nothing else decides. */
-static const int64_t MANY_INPUTS = 200;
-
 /* Rate of the running mean at the n-th frame (from 1): 1/n, then 2/(window + 1). */
 INLINE double mean_rate(int64_t n, double window) {
   return larger(2.0 / (window + 1.0), 1.0 / (double)n);

@@ -36,6 +36,7 @@ int outputs(int64_t rows, const double *phi, const double *offset, const frames 
 void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean, double *offset);
 
 /* incsfa.c: I inputs, K components, J outputs */
+enum { MANY_INPUTS = 200 }; /* from so many on the Gram matrix is faster; nothing else decides */
 typedef struct {
   int64_t inputs, components, outputs;
   double nu, window;  /* learning rate of MCA, frames of the running mean */
