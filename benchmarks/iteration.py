@@ -12,7 +12,7 @@ from typing import Any
 from unittest.mock import patch
 
 from benchmarks.report import SAMPLE, ratio, save
-from cdmisfa.agents import iteration
+from cdmisfa import kernels
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig, load_preset
 from cdmisfa.core.signals import SignalsHash
@@ -26,10 +26,7 @@ CONFIG = LearnerConfig(**load_preset("icub")["learner"])
 
 PARTS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "reading": (RecordedSource, ("take",)),
-    "kernel": (iteration, ("feed",)),
-    "projecting": (iteration, ("outputs", "mean_output")),
-    "gate": (iteration, ("recognise",)),
-    "policy": (iteration, ("think",)),
+    "kernel": (kernels, ("iterate",)),
     "signals": (CuriousLearner, ("_signals",)),
     "digest": (SignalsHash, ("add",)),
 }

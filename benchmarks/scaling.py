@@ -8,14 +8,12 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.report import interleaved, middle, ratio, save
-from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules
+from cdmisfa import kernels
+from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
 from cdmisfa.agents.gate import NOVEL
-from cdmisfa.agents.iteration import think
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Workers
 from cdmisfa.experiments.sources import configure
@@ -25,29 +23,18 @@ from recorder.world.oscillatory import OscillatorySource
 STREAMS = (10, 100, 1000, 10_000)
 
 
-@compiled
-def _steps(
-    agent: Agent,
-    rules: Rules,
-    out: NDArray[np.void],
-    y: NDArray[np.float64],
-    uniforms: NDArray[np.float64],
-    blocks: int,
-) -> None:
-    for b in range(blocks):
-        draws = uniforms[b % len(uniforms)]
-        think(agent, rules, out, NOVEL, 1e-3 * (1.0 + draws[3]), y, 2 * b, draws[:3])
-
-
 def agent_steps(n: int, blocks: int) -> Callable[[], int]:
     """A call of some iterations of an agent of n streams whose every block is novel."""
-    config = LearnerConfig(outputs=1)
-    agent, constants = new_agent(config, n, 0), rules(config, n)
-    rng = np.random.default_rng(0)
-    y, uniforms, out = rng.standard_normal((2, 1)), rng.random((997, 4)), np.zeros(1, OUTCOME)
+    config = LearnerConfig(outputs=1, tau=3)
+    rng, out = np.random.default_rng(0), np.zeros(1, OUTCOME)
+    agent = new_agent(config, n, 0)
+    known = as_struct(agent, rules(config, n), out)
+    y, uniforms, xi = rng.standard_normal((3, 1)), rng.random((997, 3)), rng.random((997, 3))
+    out["known_by"] = NOVEL
 
     def call() -> int:
-        _steps(agent, constants, out, y, uniforms, blocks)
+        for b in range(blocks):
+            kernels.think(known, xi[b % 997], y, 3 * b, uniforms[b % 997])
         return blocks
 
     return call
