@@ -57,17 +57,13 @@ def recognised(
     """What knows a block on which modules give (M, n, J), and their slowness (M, J)."""
     M, n, J = y_frozen.shape
     x = y_frozen.transpose(1, 0, 2).reshape(n, M * J)
-    frozen = Frozen(np.eye(M * J), np.zeros(M * J), band_mean, band_sd, *_no_clusters(M, n, J))
+    clusters = np.zeros((M, 0, 0, n, J)), np.zeros((M, 0, 0))
+    frozen = Frozen(np.eye(M * J), np.zeros(M * J), band_mean, band_sd, *clusters)
     if frames is None:
         frames = np.arange(n, dtype=np.float64)[:, None]
-    x = x if M else np.zeros((n, 1))
     agent = KernelAgent(LearnerConfig(tau=n, outputs=J, components=J), 3)
     known_by, _, eta, _ = agent.recognise(frozen, frames, x)
     return known_by, eta
-
-
-def _no_clusters(M: int, n: int, J: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((M, 0, 0, n, J)), np.zeros((M, 0, 0))
 
 
 def is_constant(frames: np.ndarray) -> bool:
