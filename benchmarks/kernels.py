@@ -8,6 +8,8 @@ from typing import Any
 
 import numba
 import numpy as np
+from cdmisfa.features.incsfa.state import Params, State, new_state, parameters
+from cdmisfa.features.lanes import LANES, load, multiply_add, plus, store
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -15,8 +17,6 @@ from benchmarks.report import SAMPLE, interleaved, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import gram, strict
-from cdmisfa.features.incsfa.state import Params, State, new_state, parameters
-from cdmisfa.features.lanes import LANES, load, multiply_add, plus, store
 from recorder.world.oscillatory import one_period
 from replay.recordings.source import RecordedSource
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from reference import frames as reference
 
-from cdmisfa import kernels
 from cdmisfa.core.errors import UsageError
+from cdmisfa.kernels import frames as kernels
 from recorder.images import areas, pixels
 from recorder.images.areas import averaged
 from recorder.images.framing import Fit, Framing

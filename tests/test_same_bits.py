@@ -5,6 +5,7 @@ The kernels alone, of more compilers and processors, are in `test_bits.py`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -20,8 +21,14 @@ from cdmisfa.experiments.sources import configure, open_source
 
 ROOT = Path(__file__).parents[1]
 
-SIGNALS: Mapping[str, str] = {}
-"""Of 40 iterations on the oscillatory streams, and of 4 on images, with seed 3."""
+SIGNALS: Mapping[str, str] = {
+    "2.0": "4c7950b36d5160b6a19710d78431d7feb9b2788e1ffbdedac060e43b432090a1",
+    "2.0 of images": "3ffed8c9e884247400ba723b3703a716d6093dcd98fe918b4a70e84bea92518d",
+    "1.0": "a7a505b233e7585546ab580d7f3f84df9824a6c4d141a35d39f8b0d4d63360da",
+    "progress": "f4464d6f5988241234f01902752a3e6411e223eb20a4540a795b402b07792988",
+    "progress of images": "78ae2d0aac54eb8427092174a424f69e9012cba350f90f7da4a8ec6f37f77b17",
+}
+"""Of 20 iterations on the oscillatory streams, and of 2 on images, with seed 3."""
 
 PROGRAM = """
 import json, sys
@@ -43,16 +50,18 @@ def learned() -> dict[str, str]:
     for algorithm in ("2.0", "1.0", "progress"):
         told = configure("oscillatory", settings=[f"learner.algorithm={algorithm}"])
         source = told.open_scene()
-        result = run(source, told.learner, seed=3, max_iterations=40)
+        result = run(source, told.learner, seed=3, max_iterations=20)
         found[algorithm] = result.signals_sha256
+        if algorithm == "1.0":
+            continue
         images, told = open_source(
             [ROOT / "sample_logs" / "icub"],
             settings=[f"learner.algorithm={algorithm}"],
             seed=3,
             loop=True,
         )
-        with images:
-            result = run(images, told.learner, seed=3, max_iterations=4)
+        with contextlib.closing(images):
+            result = run(images, told.learner, seed=3, max_iterations=2)
         found[f"{algorithm} of images"] = result.signals_sha256
     return found
 

@@ -27,6 +27,8 @@ from cdmisfa.core.registry import did_you_mean
 
 Section = TypeVar("Section")
 
+LN_2 = 0.6931471805599453
+
 LARGEST = 2**63 - 1
 """Largest whole number a key takes."""
 
@@ -118,7 +120,7 @@ class LearnerConfig:
         """
         if self.beta is not None:
             return self.beta
-        return self.nu * math.log(2.0) / (2.0 * max(n_streams - 1, 1))
+        return self.nu * LN_2 / (2.0 * max(n_streams - 1, 1))
 
 
 def convert_fields(section: Any, prefix: str) -> None:

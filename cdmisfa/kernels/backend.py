@@ -24,24 +24,24 @@ def compiler() -> str | None:
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """What else must be installed to build a wheel."""
-    return build_meta.get_requires_for_build_wheel(config_settings) + _lacking()
+    return [*build_meta.get_requires_for_build_wheel(config_settings), *_lacking()]
 
 
 def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
     """What else must be installed to use the checkout itself."""
-    return build_meta.get_requires_for_build_editable(config_settings) + _lacking()
+    return [*build_meta.get_requires_for_build_editable(config_settings), *_lacking()]
 
 
 def build_wheel(*args: Any, **options: Any) -> str:
     """Build a wheel."""
     _choose_compiler()
-    return build_meta.build_wheel(*args, **options)
+    return str(build_meta.build_wheel(*args, **options))
 
 
 def build_editable(*args: Any, **options: Any) -> str:
     """Build the kernels in the checkout, and a wheel that points to it."""
     _choose_compiler()
-    return build_meta.build_editable(*args, **options)
+    return str(build_meta.build_editable(*args, **options))
 
 
 def _lacking() -> list[str]:

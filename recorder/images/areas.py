@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cdmisfa import kernels
+from cdmisfa.kernels import Struct
+from cdmisfa.kernels.frames import MOST_AVERAGED, areas, average
 
 Bytes = NDArray[np.uint8]
 
@@ -33,13 +34,11 @@ def averaged(image: Bytes, height: int, width: int) -> Bytes | None:
         (height, width) uint8 as Pillow gives it; None where that is left to Pillow.
     """
     found = _as_pillow(*image.shape, height, width)
-    return found and kernels.average(image, *found)
+    return found and average(image, *found)
 
 
 @lru_cache(64)
-def _as_pillow(
-    rows: int, columns: int, height: int, width: int
-) -> tuple[kernels.Struct, kernels.Struct] | None:
+def _as_pillow(rows: int, columns: int, height: int, width: int) -> tuple[Struct, Struct] | None:
     """The areas of rows and columns, if noise is averaged over them as Pillow does it."""
     # Where a column loses more than twice as many pixels as a row, some Pillows begin with columns.
     if rows - height > 2 * (columns - width):
@@ -51,12 +50,12 @@ def _as_pillow(
     for _ in range(min(1 + _TRIED // (height * width), 50)):
         noise = random.integers(0, 256, (rows, columns), np.uint8)
         small = Image.fromarray(noise).resize((width, height), Image.Resampling.BOX)
-        if not np.array_equal(np.asarray(small), kernels.average(noise, across, down)):
+        if not np.array_equal(np.asarray(small), average(noise, across, down)):
             return None
     return across, down
 
 
-def _areas(pixels: int, count: int) -> kernels.Struct | None:
+def _areas(pixels: int, count: int) -> Struct | None:
     """The areas over which Pillow averages a row or a column, by its arithmetic.
 
     Returns:
@@ -71,6 +70,6 @@ def _areas(pixels: int, count: int) -> kernels.Struct | None:
     low += (low - centers + 0.5) * each <= -0.5
     high -= (high - 1 - centers + 0.5) * each > 0.5
     counts = high - low
-    if not 0 < counts.min() <= counts.max() <= kernels.MOST_AVERAGED:
+    if not 0 < counts.min() <= counts.max() <= MOST_AVERAGED:
         return None
-    return kernels.areas(pixels, low, counts)
+    return areas(pixels, low, counts)

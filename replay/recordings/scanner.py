@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa import kernels
 from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.kernels import frames as kernels
 from replay.mcap.reader import LogReader
 from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord
 from replay.mcap.segments import Segment
