@@ -8,14 +8,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.report import interleaved, middle, ratio, save
-from cdmisfa.agents.agent import OUTCOME, Agent, Rules, new_agent, rules
-from cdmisfa.agents.gate import NOVEL
-from cdmisfa.agents.iteration import think
+from cdmisfa import kernels
+from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.core.arithmetic.compiled import compiled
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Workers
 from cdmisfa.experiments.sources import configure
@@ -25,29 +22,17 @@ from recorder.world.oscillatory import OscillatorySource
 STREAMS = (10, 100, 1000, 10_000)
 
 
-@compiled
-def _steps(
-    agent: Agent,
-    rules: Rules,
-    out: NDArray[np.void],
-    y: NDArray[np.float64],
-    uniforms: NDArray[np.float64],
-    blocks: int,
-) -> None:
-    for b in range(blocks):
-        draws = uniforms[b % len(uniforms)]
-        think(agent, rules, out, NOVEL, 1e-3 * (1.0 + draws[3]), y, 2 * b, draws[:3])
-
-
 def agent_steps(n: int, blocks: int) -> Callable[[], int]:
     """A call of some iterations of an agent of n streams whose every block is novel."""
-    config = LearnerConfig(outputs=1)
-    agent, constants = new_agent(config, n, 0), rules(config, n)
+    config = LearnerConfig(outputs=1, tau=3)
+    agent = as_struct(new_agent(config, n, 0), rules(config, n), np.zeros(1, OUTCOME))
     rng = np.random.default_rng(0)
-    y, uniforms, out = rng.standard_normal((2, 1)), rng.random((997, 4)), np.zeros(1, OUTCOME)
+    y, draws = rng.standard_normal((3, 1)), rng.random((997, 3))
+    xi = 1e-3 * (1 + rng.random((997, 3)))
 
     def call() -> int:
-        _steps(agent, constants, out, y, uniforms, blocks)
+        for b in range(blocks):
+            kernels.think(agent, xi[b % 997], y, 3 * b, draws[b % 997])
         return blocks
 
     return call
@@ -68,7 +53,7 @@ def learn_frames(frames: int) -> tuple[float, float]:
 def apart(frames: int) -> tuple[float, float]:
     """`learn_frames` in a process of its own, so that the peak is this one's."""
     with contextlib.closing(Workers(1)) as worker:
-        worker.submit(learn_frames, 1000).result()  # compiles
+        worker.submit(learn_frames, 1000).result()  # imports
         return worker.submit(learn_frames, frames).result()
 
 
@@ -133,8 +118,8 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     save(
         "scaling",
         "Scaling",
-        "One iteration of the agent for n streams (every block novel, policy iteration "
-        "included). CPU time a frame and peak memory of a process that learns from the "
+        "One iteration of the agent for n streams, called from Python (every block novel, policy "
+        "iteration included). CPU time a frame and peak memory of a process that learns from the "
         "oscillatory streams in blocks of 100. Trials in processes, by the wall's clock. What a "
         "sweep takes for a trial of the oscillatory streams, from start to end, beyond computing "
         "it: planning all trials reads the preset once.",
