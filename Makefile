@@ -2,6 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
 
 .PHONY: demo test suite lint bench pictures fuzz torture clean install
 
@@ -37,7 +38,7 @@ torture: $(INSTALLED)
 
 install: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml
+$(INSTALLED): pyproject.toml setup.py $(KERNELS)
 	@echo "installing cdmisfa and what it needs into .venv, once (a minute or two)"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'

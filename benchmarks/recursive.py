@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.kernels import image_frames
 from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa.agents.progress.config import ProgressConfig
-from cdmisfa.features.recursive.recursive import RecursiveSFA
+from cdmisfa.features.recursive import RecursiveSFA
 
 BLOCK = 40
 """Frames learned at once."""

@@ -45,7 +45,6 @@ FORBIDDEN = {
     "cdmisfa.experiments.recompute": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.runs", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
-    "cdmisfa.features.recursive": ("cdmisfa.agents.learner", "recorder.config", "mcap"),
     "cdmisfa.features.incsfa": ("cdmisfa.agents.learner", "replay.palette", "mcap"),
     "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "cdmisfa.kernels": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arithmetic.compiled import compiled
+from cdmisfa import kernels
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import DENSE_STREAMS
@@ -56,12 +56,14 @@ OUTCOME = np.dtype(
         ("explored", "?"),
         ("action", "i8"),
         ("next_stream", "i8"),
-    ]
+    ],
+    align=True,
 )
+"""Both as `kernels.h` has them."""
 
 
 class Agent(NamedTuple):
-    """The agent's memory, as arrays only (so it can be saved and compiled).
+    """The agent's memory, as arrays only: saving them saves everything.
 
     memory: (1,) of `MEMORY`. Per output (J,): eta, eta_dot, eta_inst, gate_mean, gate_variance,
     the running E(ydot^2) derivative, the sums y_sum and square_sum over y_frames (1,) frames, and
@@ -112,6 +114,7 @@ class Rules(NamedTuple):
     roc_radius: float
     roc_memory: float
     roc_error: float
+    patience: float
 
 
 def rules(config: LearnerConfig, n_streams: int) -> Rules:
@@ -161,35 +164,40 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
     return agent
 
 
-@compiled
 def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
     """Forget everything that belongs to the abstraction before; all statistics start anew."""
+    for array in agent[1:]:
+        array[...] = 0
+    for array in (agent.eta, agent.eta_dot, agent.eta_inst):
+        array[...] = math.nan
     m = agent.memory[0]
     m["module"] += 1
-    m["fed_stream"] = -1
-    m["fed_until"] = -1
-    m["novel_blocks"] = 0
-    m["rewards"] = 0
+    m["fed_stream"] = m["fed_until"] = -1
+    m["novel_blocks"] = m["rewards"] = m["idle"] = 0
     m["scale"] = 0.0
-    m["roc_error"] = math.nan
-    m["xi"] = math.nan
+    m["roc_error"] = m["xi"] = math.nan
     m["share"] = 1.0
     m["epsilon"] = epsilon_start
-    m["idle"] = 0
-    agent.eta[:] = math.nan
-    agent.eta_dot[:] = math.nan
-    agent.eta_inst[:] = math.nan
-    agent.gate_mean[:] = 0.0
-    agent.gate_variance[:] = 0.0
-    agent.derivative[:] = 0.0
-    agent.y_sum[:] = 0.0
-    agent.square_sum[:] = 0.0
-    agent.y_frames[:] = 0
-    agent.recent_mean[:] = 0.0
-    agent.recent_square[:] = 0.0
-    agent.stay_sum[:] = 0.0
-    agent.switch_sum[:] = 0.0
-    agent.dense[:] = 0.0
-    agent.policy[:] = 0
-    agent.centres[:] = 0.0
-    agent.counts[:] = 0.0
+
+
+def as_struct(agent: Agent, told: Rules, out: NDArray[np.void]) -> kernels.Struct:
+    """An agent as the kernels take it: its arrays, its rules, and where its outcome goes.
+
+    Args:
+        agent: changed in place.
+        told: its rules.
+        out: (1,) of `OUTCOME`, written.
+    """
+    sizes = {
+        "streams": len(agent.policy),
+        "outputs": len(agent.eta),
+        "tau": agent.centres.shape[2],
+        "tensor": len(agent.dense),
+        "places": agent.counts.shape[1],
+    }
+    rules = kernels.Struct("rules", told._asdict(), {})
+    arrays = {"rules": rules.pointer, "out": kernels.records("outcome", out)}
+    arrays["memory"] = kernels.records("memory", agent.memory)
+    for name, array in zip(agent._fields[1:], agent[1:], strict=True):
+        arrays[name] = kernels.pointer(name, array, array.shape, array.dtype)
+    return kernels.Struct("agent", sizes, arrays)

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.agent import OUTCOME, begin_abstraction, new_agent, rules
-from cdmisfa.agents.gate import Frozen
+from cdmisfa import kernels
+from cdmisfa.agents.agent import OUTCOME, as_struct, begin_abstraction, new_agent, rules
+from cdmisfa.agents.gate import NOVEL, stacked
 from cdmisfa.agents.inputs import count_inputs, rows_of
-from cdmisfa.agents.iteration import iterate
-from cdmisfa.agents.policy import action_values
-from cdmisfa.core.arithmetic.choice import in_own_arithmetic
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -27,8 +25,7 @@ from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import NO_STATE, BlockSignals
 from cdmisfa.features.feature import Feature, MakeFeature
-from cdmisfa.features.incsfa.abstraction import IncSFA
-from cdmisfa.features.projection import mean_output
+from cdmisfa.features.incsfa import IncSFA
 
 Float = NDArray[np.float64]
 
@@ -53,7 +50,7 @@ class CuriousLearner:
         events: what the last iteration brought, one line each.
         scale: factor from a frame's values to the learner's (1/255 for pixels).
         policy_rng: three draws an iteration, whatever is done with them.
-        rules: the configuration's numbers, for compiled code.
+        rules: the configuration's numbers, as the agent goes by them.
         agent: memory of the agent; changed in place.
         abstraction: the adaptive abstraction.
         frozen: the modules in one stack.
@@ -97,6 +94,7 @@ class CuriousLearner:
         self.rules = rules(config, n_streams)
         self.agent = new_agent(config, n_streams, first)
         self.out = np.zeros(1, OUTCOME)
+        self._agent = as_struct(self.agent, self.rules, self.out)
         self._no_interest = freeze(np.full(n_streams, np.nan))
         self._no_state = freeze(np.full(n_streams, NO_STATE))
         self._freeze()
@@ -133,14 +131,15 @@ class CuriousLearner:
         return self.abstraction.phi.copy()
 
     @property
-    def kernel(self) -> Any:
-        """The adaptive abstraction as compiled code takes it; None where it cannot."""
-        return getattr(self.abstraction, "kernel", None)
+    def kernel(self) -> kernels.Struct | None:
+        """The adaptive abstraction as the kernels take it; None where they cannot."""
+        kernel = getattr(self.abstraction, "kernel", None)
+        return kernel if isinstance(kernel, kernels.Struct) else None
 
     @property
     def arithmetic(self) -> int:
-        """Version of how the adaptive abstraction is computed; see `arithmetic_of`."""
-        return int(getattr(self.abstraction, "arithmetic", 1))
+        """Version of how it computes; see `arithmetic_of`."""
+        return kernels.ARITHMETIC
 
     @property
     def over(self) -> str:
@@ -176,7 +175,6 @@ class CuriousLearner:
         overwrite(self._arrays(), state.arrays)
         self.policy_rng.bit_generator.state = dict(state.policy_rng)
 
-    @in_own_arithmetic
     def step(self, block: Block) -> BlockSignals:
         """One iteration: look at tau frames, learn, and decide what to watch next.
 
@@ -189,26 +187,16 @@ class CuriousLearner:
             CdmisfaError: it holds a value that is no finite number.
         """
         frames = rows_of(block, self.spec, self.stream, self.tau)
-        outputs, count = self.config.outputs, len(self.modules)
-        y_frozen = np.empty((count, len(block), outputs))
-        eta_frozen, roc_error_frozen = np.empty((count, outputs)), np.empty(count)
-        y = iterate(
-            self.agent,
-            self.rules,
-            self.out,
-            self.frozen,
-            self.abstraction,
-            frames,
-            expand(self.config.expansion, frames),
-            self.scale,
-            block.t,
-            self.policy_rng.random(3),
-            y_frozen,
-            eta_frozen,
-            roc_error_frozen,
-            np.full((len(block), outputs), np.nan),
-        )
-        signals = self._signals(block, y, y_frozen, eta_frozen, roc_error_frozen)
+        shown = x = kernels.frames_of(frames)
+        expanded = expand(self.config.expansion, frames)
+        if expanded is not frames:
+            x = kernels.frames_of(expanded, self._n_inputs)
+        kernel, uniforms = self.kernel, self.policy_rng.random(3)
+        if kernel is not None:
+            told = kernels.iterate(self._agent, self._frozen, kernel, shown, x, block.t, uniforms)
+        else:
+            told = self._iterate(shown, x, expanded, block.t, uniforms)
+        signals = self._signals(block, *told)
         self.events = ()
         if self.out["saved"][0]:
             self.save_abstraction()
@@ -218,6 +206,48 @@ class CuriousLearner:
                 f"policy {module.policy.tolist()}",
             )
         return signals
+
+    def _iterate(
+        self, shown: kernels.Struct, x: kernels.Struct, expanded: Any, t: int, uniforms: Float
+    ) -> tuple[Float, Float, Float, Float]:
+        """`kernels.iterate` with a feature of somebody else, which learns in Python."""
+        told = kernels.recognise(self._agent, self._frozen, shown, x)
+        memory, xi = self.agent.memory[0], np.full(self.tau, np.nan)
+        y = np.full((self.tau, self.config.outputs), np.nan)
+        if self.out["known_by"][0] == NOVEL:
+            gap = memory["fed_stream"] != memory["stream"] or memory["fed_until"] != t
+            xi = self.abstraction.update(expanded, bool(gap))
+            phi = self.abstraction.phi
+            y = kernels.outputs(phi, kernels.mean_output(phi, self.abstraction.mean), expanded)
+        kernels.think(self._agent, xi, y, t, uniforms)
+        return y, *told
+
+    def repeat(
+        self,
+        shown: kernels.Struct,
+        x: kernels.Struct,
+        uniforms: Float,
+        swap_below: float = -1.0,
+        kept: kernels.Struct | None = None,
+    ) -> int:
+        """Iterate on streams that repeat, as `step` does, until something is to be done.
+
+        Args:
+            shown: of each stream a period of frames and the tau that follow, one after the other.
+            x: the same, expanded.
+            uniforms: (n, 3) draws of n iterations.
+            swap_below: return when epsilon is below this.
+            kept: what is kept of each iteration, if anything, `curves` of the kernels.
+
+        Returns:
+            Iterations done: until an abstraction is to be saved, swap or end is due, or n.
+        """
+        kernel = self.kernel
+        if kernel is None:
+            raise UsageError("it learns with a feature in Python: have it step")
+        return kernels.iterations(
+            self._agent, self._frozen, kernel, shown, x, uniforms, swap_below, kept
+        )
 
     def summary(self) -> dict[str, Any]:
         """Its part of a run's result, as JSON values."""
@@ -237,9 +267,7 @@ class CuriousLearner:
     ) -> BlockSignals:
         agent = self.agent
         out: dict[str, Any] = dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))
-        Q = np.empty((len(agent.policy), 2))
         scale = agent.memory["scale"][0]
-        action_values(agent.stay_sum, agent.switch_sum, scale, self.config.gamma, agent.policy, Q)
         return BlockSignals(
             iteration=self.iteration - 1,
             t=block.t,
@@ -248,7 +276,7 @@ class CuriousLearner:
             y_frozen=y_frozen,
             eta=agent.eta.copy(),
             eta_dot=agent.eta_dot.copy(),
-            variance=agent.recent_square - agent.recent_mean**2,
+            variance=agent.recent_square - agent.recent_mean * agent.recent_mean,
             eta_inst=agent.eta_inst.copy() if out["novel"] else np.full(len(agent.eta), np.nan),
             gate_mean=agent.gate_mean.copy(),
             gate_sd=np.sqrt(agent.gate_variance),
@@ -263,7 +291,7 @@ class CuriousLearner:
             interest=self._no_interest,
             state=self._no_state,
             R=agent.dense / (scale or 1.0),
-            Q=Q,
+            Q=kernels.action_values(self._agent),
             policy=agent.policy.copy(),
             **out,
         )
@@ -297,21 +325,15 @@ class CuriousLearner:
         self.abstraction = self._new_abstraction()
 
     def _freeze(self) -> None:
-        """Stack the frozen modules' rows, so that one pass over a block serves all of them."""
-        count, outputs, modules = len(self.modules), self.config.outputs, self.modules
-        agent = self.agent
-        self.frozen = Frozen(
-            phi=np.array([m.phi for m in modules]).reshape(-1, self._n_inputs),
-            offset=np.array([mean_output(m.phi, m.mean) for m in modules]).reshape(-1),
-            band_mean=np.array([m.band_mean for m in modules]).reshape(count, outputs),
-            band_sd=np.array([m.band_sd for m in modules]).reshape(count, outputs),
-            centres=np.array([m.centres for m in modules]).reshape(count, *agent.centres.shape),
-            counts=np.array([m.counts for m in modules]).reshape(count, *agent.counts.shape),
-        )
+        self.frozen = stacked(self.modules, self.agent, self._n_inputs)
+        self._frozen = self.frozen.struct
 
-    @in_own_arithmetic
     def _new_abstraction(self) -> Feature:
         key = (WEIGHTS_KEY, len(self.modules))
         seed = np.random.SeedSequence(self.seed, spawn_key=key)
         rng = np.random.Generator(np.random.PCG64(seed))
-        return self._feature(self.config, self._n_inputs, rng)
+        abstraction = self._feature(self.config, self._n_inputs, rng)
+        shape = (self.config.outputs, self._n_inputs)
+        if abstraction.phi.shape != shape:
+            raise UsageError(f"the feature has phi of {abstraction.phi.shape}: it must be {shape}")
+        return abstraction

@@ -1,4 +1,4 @@
-"""Whole trials in compiled code: `CuriousLearner`'s own functions, no Python per block.
+"""Whole trials in C: what `CuriousLearner.step` calls, no Python per block.
 
 A trial gives bit for bit what `CuriousLearner.step` gives on the same source. It is for
 sources that repeat, as the oscillatory streams do, so that one period in memory is all of it.
@@ -13,15 +13,10 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.agent import OUTCOME, Agent, Rules
-from cdmisfa.agents.gate import Frozen
-from cdmisfa.agents.iteration import iterate
+from cdmisfa import kernels
+from cdmisfa.agents.agent import OUTCOME
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.agents.policy import action_values
-from cdmisfa.core.arithmetic.choice import in_own_arithmetic
-from cdmisfa.core.arithmetic.compiled import compiled, spliced
-from cdmisfa.core.blocks import freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
@@ -31,7 +26,6 @@ from cdmisfa.experiments.loop import ending
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
 
 Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 CHUNK = 512
 """Iterations between two returns to Python."""
@@ -79,95 +73,8 @@ class TrialResult:
     curves: Mapping[str, NDArray[Any]] | None
 
 
-_iterate = spliced(iterate)
-
-
-@compiled
-def run_iterations(
-    agent: Agent,
-    rules: Rules,
-    out: NDArray[np.void],
-    frozen: Frozen,
-    feature: Any,
-    frames: Float,
-    x: Float,
-    tau: int,
-    clock: int,
-    uniforms: Float,
-    patience: int,
-    swap_below: float,
-    outcomes: NDArray[np.void],
-    eta_dot: Float,
-    R: Float,
-    Q: Float,
-    policy: Int,
-) -> int:
-    """Iterate until a module is to be saved, a swap is due, patience ends or the draws do.
-
-    Args:
-        agent: changed in place, as are out and feature.
-        rules: constants.
-        out: (1,) of `OUTCOME`.
-        frozen: the frozen modules.
-        feature: the adaptive abstraction's kernel.
-        frames: (S, PERIOD + tau, I) one period of every stream and the block that overlaps it.
-        x: the same, expanded.
-        tau: frames of a block.
-        clock: global counter of the next frame.
-        uniforms: (N, 3) draws of N iterations.
-        patience: iterations without epsilon after which nothing is left.
-        swap_below: return when epsilon is below this.
-        outcomes: (N,) of `OUTCOME`, written, as are the next; or all of length 0.
-        eta_dot: (N, J).
-        R: (N, S) stay entries.
-        Q: (N, S, 2).
-        policy: (N, S).
-
-    Returns:
-        Number of iterations done.
-    """
-    memory = agent.memory[0]
-    modules, outputs = frozen.band_mean.shape
-    y_frozen = np.empty((modules, tau, outputs))
-    eta_frozen, roc_error_frozen = np.empty((modules, outputs)), np.empty(modules)
-    no_output = np.full((tau, outputs), np.nan)
-    for k in range(len(uniforms)):
-        stream = memory["stream"]
-        t = clock + k * tau
-        start = t % PERIOD
-        _iterate(
-            agent,
-            rules,
-            out,
-            frozen,
-            feature,
-            frames[stream, start : start + tau],
-            x[stream, start : start + tau],
-            1.0,
-            t,
-            uniforms[k],
-            y_frozen,
-            eta_frozen,
-            roc_error_frozen,
-            no_output,
-        )
-        if len(outcomes) > 0:
-            outcomes[k] = out[0]
-            eta_dot[k] = agent.eta_dot
-            scale = memory["scale"] if memory["scale"] > 0.0 else 1.0
-            for s in range(len(agent.policy)):
-                R[k, s] = agent.stay_sum[s] / scale
-                policy[k, s] = agent.policy[s]
-            action_values(
-                agent.stay_sum, agent.switch_sum, memory["scale"], rules.gamma, agent.policy, Q[k]
-            )
-        if out[0]["saved"] or memory["idle"] > patience or memory["epsilon"] < swap_below:
-            return k + 1
-    return len(uniforms)
-
-
 def has_compiled_trials(config: Any) -> bool:
-    """Whether the learner of a configuration, and what it learns with, has compiled code."""
+    """Whether the learner of a configuration, and what it learns with, can learn in C alone."""
     return _compiles(open_learner(config, OscillatorySource().spec, 0))
 
 
@@ -175,7 +82,6 @@ def _compiles(learner: Learner) -> TypeGuard[CuriousLearner]:
     return isinstance(learner, CuriousLearner) and learner.kernel is not None
 
 
-@in_own_arithmetic
 def run_trial(
     config: LearnerConfig,
     streams: Sequence[str] = ("x1", "x2", "x3"),
@@ -217,22 +123,9 @@ def run_trial(
         left = CHUNK if max_iterations is None else max_iterations - learner.iteration
         drawn = uniforms[:left]
         pending = swap is not None and swapped < 0
-        record = _records(len(drawn) if curves else 0, config.outputs, len(streams))
-        done = run_iterations(
-            learner.agent,
-            learner.rules,
-            learner.out,
-            learner.frozen,
-            learner.kernel,
-            frames,
-            x,
-            config.tau,
-            learner.iteration * config.tau,
-            drawn,
-            config.patience,
-            swap.below if swap is not None and pending else -1.0,
-            *record.values(),
-        )
+        record = _records(len(drawn), config.outputs, len(streams)) if curves else {}
+        below = swap.below if swap is not None and pending else -1.0
+        done = learner.repeat(frames, x, drawn, below, _as_struct(record))
         uniforms = uniforms[done:]
         if curves:
             parts.append(_named(record, done))
@@ -254,14 +147,13 @@ def run_trial(
     )
 
 
-def _expand(config: LearnerConfig, tables: Sequence[Float]) -> tuple[Float, Float]:
-    """One period of every stream and the tau frames after it, as shown and as learned from.
-
-    Not to be written, as blocks are not: then what was compiled for learners serves trials, too.
-    """
+def _expand(
+    config: LearnerConfig, tables: Sequence[Float]
+) -> tuple[kernels.Struct, kernels.Struct]:
+    """One period of every stream and the tau frames after it, as shown and as learned from."""
     index = np.arange(PERIOD + config.tau) % PERIOD
-    frames = np.stack([table[index] for table in tables])
-    return freeze(frames), freeze(np.stack([expand(config.expansion, table) for table in frames]))
+    frames = np.concatenate([table[index] for table in tables])
+    return kernels.frames_of(frames), kernels.frames_of(expand(config.expansion, frames))
 
 
 def _records(n: int, outputs: int, streams: int) -> dict[str, NDArray[Any]]:
@@ -272,6 +164,16 @@ def _records(n: int, outputs: int, streams: int) -> dict[str, NDArray[Any]]:
         "Q": np.zeros((n, streams, 2)),
         "policy": np.zeros((n, streams), np.int64),
     }
+
+
+def _as_struct(record: Mapping[str, NDArray[Any]]) -> kernels.Struct | None:
+    arrays = {
+        name: kernels.records(name, array)
+        if name == "outcome"
+        else kernels.pointer(name, array, array.shape, array.dtype)
+        for name, array in record.items()
+    }
+    return kernels.Struct("curves", {}, arrays) if record else None
 
 
 def _named(record: Mapping[str, NDArray[Any]], done: int) -> dict[str, NDArray[Any]]:

@@ -8,7 +8,7 @@ __getattr__, __dir__, __all__ = face(
         "cdmisfa.features.feature": "Feature",
         "cdmisfa.features.incsfa": "IncSFA",
         "cdmisfa.features.projection": "project",
-        "cdmisfa.features.recursive.recursive": "RecursiveSFA",
+        "cdmisfa.features.recursive": "RecursiveSFA",
         "cdmisfa.features.sfa": "batch_sfa",
     },
 )

@@ -17,8 +17,7 @@ Float = NDArray[np.float64]
 class Feature(Protocol):
     """Slow features that are learned frame by frame: y = phi (x - mean).
 
-    One that also has `kernel`, a named tuple with `phi` and `mean` for which `feed` is taught to
-    compiled code, can run in compiled trials.
+    One that also has `kernel`, a record of its arrays as `IncSFA` has it, is learned with in C.
     """
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
@@ -47,8 +46,3 @@ class Feature(Protocol):
 
 MakeFeature = Callable[[LearnerConfig, int, np.random.Generator], Feature]
 """How a learner makes a feature: configuration, length of an expanded frame, where to draw."""
-
-
-def feed(feature: Feature, frames: NDArray[Any], gap: bool) -> Float:
-    """Have a feature learn: `feature.update`; in compiled code the update of its `kernel`."""
-    return feature.update(frames, gap)

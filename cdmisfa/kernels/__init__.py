@@ -64,6 +64,11 @@ def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] 
     return _buffer(_POINTERS[dtype], array, True)
 
 
+def records(kind: str, array: NDArray[np.void]) -> Any:
+    """Where an array of records lies, which are those of C by that name; it keeps it alive."""
+    return _buffer(f"{kind}[]", array, True)
+
+
 def readable(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] = FLOAT64) -> Any:
     """Where the numbers of an array lie, or a copy of them in C order, for C to read.
 
@@ -220,6 +225,105 @@ def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update
     return xi
 
 
+def instantaneous_slowness(y: Any) -> Float:
+    """Slowness of each output within a block, (J,), from its values (n, J)."""
+    n, J = np.shape(y)
+    eta = np.empty(J)
+    lib.instantaneous_slowness(n, J, readable("y", y, (n, J)), _buffer("double[]", eta))
+    return eta
+
+
+def iterate(
+    agent: Struct, frozen: Struct, feature: Struct, shown: Struct, x: Struct, t: int, uniforms: Float
+) -> tuple[Float, Float, Float, Float]:
+    """One iteration of a curious agent whose abstraction is `feature`; see `CuriousLearner.step`.
+
+    Args:
+        agent: changed in place, as is what it writes its outcome to.
+        frozen: the frozen modules.
+        feature: learns from the block where it is novel.
+        shown: the block as it came.
+        x: the same, expanded.
+        t: frame at which it begins.
+        uniforms: (3,) draws from [0, 1): whether to explore, which action, which stream.
+
+    Returns:
+        Outputs (n, J), NaN where the block is not novel; those of the frozen modules (M, n, J),
+        their slowness (M, J) and clustering error (M,).
+    """
+    n, J = _block(agent, shown, x)
+    y, told = np.empty((n, J)), _told(agent, frozen)
+    into = [_buffer("double[]", array) for array in (y, *told)]
+    draws = readable("uniforms", uniforms, (3,))
+    code = lib.iterate(
+        agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer, t, draws, *into
+    )
+    check(code, "the learner")
+    return y, *told
+
+
+def recognise(
+    agent: Struct, frozen: Struct, shown: Struct, x: Struct
+) -> tuple[Float, Float, Float]:
+    """The first part of `iterate`: the agent's outcome says what knows the block."""
+    _block(agent, shown, x)
+    told = _told(agent, frozen)
+    into = [_buffer("double[]", array) for array in told]
+    code = lib.recognise(agent.pointer, frozen.pointer, shown.pointer, x.pointer, *into)
+    check(code, "the learner")
+    return told
+
+
+def think(agent: Struct, xi: Any, y: Float, t: int, uniforms: Float) -> None:
+    """The last part of it, after `recognise` and an update whose weight changes were xi (n,)."""
+    n, J = agent.pointer.tau, agent.pointer.outputs
+    arrays = readable("xi", xi, (n,)), readable("y", y, (n, J))
+    code = lib.think(agent.pointer, *arrays, t, readable("uniforms", uniforms, (3,)))
+    check(code, "the learner")
+
+
+def iterations(
+    agent: Struct,
+    frozen: Struct,
+    feature: Struct,
+    shown: Struct,
+    x: Struct,
+    uniforms: Float,
+    swap_below: float,
+    kept: Struct | None,
+) -> int:
+    """Iterate on streams that repeat until something is to be done; see `CuriousLearner.repeat`."""
+    n, rows = len(uniforms), shown.pointer.n
+    if x.pointer.n != rows or rows % agent.pointer.streams:
+        raise UsageError(f"{rows} frames shown and {x.pointer.n} expanded: give as many a stream")
+    draws, curves = readable("uniforms", uniforms, (n, 3)), kept.pointer if kept else ffi.NULL
+    done: int = lib.iterations(
+        *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
+        *(draws, n, swap_below, curves),
+    )
+    check(done, "the learner")
+    return done
+
+
+def action_values(agent: Struct) -> Float:
+    """Values of both actions in every stream under the agent's policy, (S, 2)."""
+    Q = np.empty((agent.pointer.streams, 2))
+    lib.action_values(agent.pointer, _buffer("double[]", Q))
+    return Q
+
+
+def _block(agent: Struct, shown: Struct, x: Struct) -> tuple[int, int]:
+    n = agent.pointer.tau
+    if not n == shown.pointer.n == x.pointer.n:
+        raise UsageError(f"{x.pointer.n} frames after expansion of {shown.pointer.n}: give {n}")
+    return n, agent.pointer.outputs
+
+
+def _told(agent: Struct, frozen: Struct) -> tuple[Float, Float, Float]:
+    M, n, J = frozen.pointer.modules, agent.pointer.tau, agent.pointer.outputs
+    return np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
+
+
 def layouts(channels: Any, least: Any, places: Any, marks: Any) -> Struct:
     """How the messages of some channels are laid out, for `scan`.
 
@@ -329,4 +433,42 @@ def average(image: NDArray[np.uint8], across: Struct, down: Struct) -> NDArray[n
     out = np.empty((down.pointer.n, across.pointer.n), np.uint8)
     pixels = readable("image", image, (down.pointer.pixels, across.pointer.pixels), UINT8)
     check(lib.average(pixels, across.pointer, down.pointer, _buffer("uint8_t[]", out)), "image")
+    return out
+
+
+def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
+    """A state of recursive SFA as C takes it, to be written to; see `recursive.State`."""
+    (size, inputs), outputs = arrays["basis"].shape, len(arrays["weights"])
+    components = len(arrays["spectrum"])
+    shapes = {
+        "mean": (inputs,),
+        "basis": (size, inputs),
+        "variance": (size,),
+        "differences": (size, size),
+        "weights": (outputs, size),
+        "spectrum": (components,),
+        "last": (inputs,),
+    }
+    held = {name: pointer(name, arrays[name], shape) for name, shape in shapes.items()}
+    held["counts"] = pointer("counts", arrays["counts"], (3,), INT64)
+    sizes = {"inputs": inputs, "size": size, "components": components, "outputs": outputs}
+    return Struct("recursive", {**sizes, "window": window}, held)
+
+
+def recursive_update(state: Struct, frames: Any, gap: bool) -> Float:
+    """Learn from consecutive frames; see `RecursiveSFA.update`."""
+    x = frames_of(frames, state.pointer.inputs)
+    change = np.empty(x.pointer.n)
+    code = lib.recursive_update(state.pointer, x.pointer, bool(gap), _buffer("double[]", change))
+    check(code, "the SFA")
+    return change
+
+
+def multiply(a: Float, b: Float) -> Float:
+    """A (n, k) times B (k, m)."""
+    (rows, parts), width = a.shape, b.shape[1]
+    first, second = readable("a", a, (rows, parts)), readable("b", b, (parts, width))
+    out = np.empty((rows, width))
+    c = _buffer("double[]", out)
+    lib.multiply(rows, parts, width, first, parts, second, width, c, width)
     return out

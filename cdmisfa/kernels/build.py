@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from pathlib import Path
 
@@ -9,13 +10,30 @@ from cffi import FFI
 
 HERE = Path("cdmisfa/kernels")
 
-FILES = ("elementary.c", "projection.c", "incsfa.c", "gram.c", "frames.c")
+FILES = (
+    "elementary.c",
+    "projection.c",
+    "incsfa.c",
+    "gram.c",
+    "eigen.c",
+    "recursive.c",
+    "gate.c",
+    "agent.c",
+    "frames.c",
+)
 """All are one translation unit, so that nothing of them is visible outside."""
 
-FLAGS = ["-O3", "-std=gnu11", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-Wno-psabi"]
+FLAGS = ["-O3", "-g0", "-std=gnu11", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-Wno-psabi"]
 """No more multiply-adds than are written, and `sqrt` as an instruction."""
 
-X86 = platform.machine().lower() in ("x86_64", "amd64")
+MACHINE = platform.machine().lower().replace("amd64", "x86_64").replace("arm64", "aarch64")
+X86 = MACHINE == "x86_64"
+
+ANY = {"x86_64": ["-march=x86-64"], "aarch64": ["-march=armv8-a"]}.get(MACHINE, [])
+"""For every processor of this kind, though Python may have been built for that of one machine."""
+
+if "ziglang" in os.environ.get("CC", ""):
+    ANY = []  # said where it is called: it compiles what it links with, too
 
 
 def module(name: str, *flags: str) -> FFI:
@@ -27,10 +45,10 @@ def module(name: str, *flags: str) -> FFI:
         f"cdmisfa.kernels.{name}",
         "\n".join(['#include "lanes.h"', *(f'#include "{file}"' for file in FILES)]),
         py_limited_api=True,
-        define_macros=[("Py_LIMITED_API", "0x030b0000")],
         include_dirs=[str(HERE)],
         depends=[str(file) for file in sorted(HERE.glob("*.[ch]"))],
-        extra_compile_args=[*FLAGS, *flags],
+        extra_compile_args=[*FLAGS, "-fvisibility=hidden", *ANY, *flags],
+        extra_link_args=["-s"],
         libraries=["m"],
     )
     return ffi

@@ -46,7 +46,7 @@ static int index_parts(const uint8_t *index, int64_t size, index_part *parts) {
   return found;
 }
 
-/* Whether a payload holds, of what is the same in all of its channel, enough. */
+/* Whether a payload is as long as others of its channel, and has the same bytes in its places. */
 static int is_laid_out(const layouts *wanted, int64_t c, const uint8_t *payload, int64_t size) {
   if (size < wanted->least[c]) return 0;
   for (int64_t k = c * wanted->marks; k < (c + 1) * wanted->marks; k++) {

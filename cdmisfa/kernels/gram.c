@@ -409,7 +409,7 @@ static void begin_still(const incsfa *s, const frames *x, still *t) {
 }
 
 /* Bring mean and vectors to the end of the block where it stands still. `before` has
- * (K + 1 + 4, BATCH CELL). L is lower triangular: four rows need the columns up to the last. */
+ * (K + 1 + 3, BATCH CELL). L is lower triangular: three rows need the columns up to the last. */
 static void settle_still(const incsfa *s, const still *t, double *before) {
   int64_t K = s->components, row = BATCH * CELL;
   double *after = before + (K + 1) * row;
@@ -421,10 +421,10 @@ static void settle_still(const incsfa *s, const still *t, double *before) {
       for (int64_t n = 0; n < few; n++)
         memcpy(before + (k + 1) * row + n * CELL, s->v + k * s->inputs + at[n] * CELL,
                CELL * sizeof(double));
-    for (int64_t j = 0; j < K; j += 4) {
-      int64_t stop = smaller(j + 4, K);
-      combine(stop - j, stop + 1, t->table + j * t->width, t->width, before, row, few * CELL,
-              after, row);
+    for (int64_t j = 0; j < K; j += 3) {
+      int64_t stop = smaller(j + 3, K);
+      multiply(stop - j, stop + 1, few * CELL, t->table + j * t->width, t->width, before, row,
+               after, row);
       for (int64_t k = j; k < stop; k++)
         for (int64_t n = 0; n < few; n++)
           memcpy(s->v + k * s->inputs + at[n] * CELL, after + (k - j) * row + n * CELL,
@@ -463,12 +463,6 @@ static int learn_groups(const incsfa *s, const frames *x, int gap, int pending, 
   }
 }
 
-static double *part(double **memory, int64_t n) {
-  double *here = *memory;
-  *memory += n;
-  return here;
-}
-
 int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
   int64_t size = s->inputs, K = s->components, J = s->outputs, every = size / CELL;
   if (s->counts[0] < 0 || s->counts[2] < 0) return NOT_A_STATE;
@@ -477,12 +471,12 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
   gap = gap || s->counts[0] == 0;
   int64_t tiles = (size + TILE - 1) / TILE;
   int64_t needed = 2 * every + tiles * GROUP * TILE + K * (7 * GROUP + 6) + K * K + 2 * J * K +
-                   J * TILE + every * CELL + (K + GROUP) * (K + 2) + (K + 5) * BATCH * CELL;
-  double *memory = malloc((size_t)needed * sizeof *memory), *free_part = memory, *copies = NULL;
+                   J * TILE + every * CELL + (K + GROUP) * (K + 2) + (K + 4) * BATCH * CELL;
+  double *memory = malloc((size_t)needed * sizeof *memory), *spare = memory, *copies = NULL;
   if (!memory) return NO_MEMORY;
-  int64_t *cells = (int64_t *)part(&free_part, every);
+  int64_t *cells = (int64_t *)take(&spare, every);
   columns c = {size, every, cells, s->mean, s->v};
-  uint64_t *changed = (uint64_t *)part(&free_part, every);
+  uint64_t *changed = (uint64_t *)take(&spare, every);
   if (pending)
     for (int64_t n = 0; n < every; n++) cells[n] = n;
   else
@@ -499,9 +493,9 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
     c.v = copies + c.size;
     copy_columns(1, s->mean, size, &c, c.mean, 0);
     copy_columns(K, s->v, size, &c, c.v, 0);
-    t.p = part(&free_part, t.cells * CELL);
-    t.table = part(&free_part, K * t.width);
-    t.r = part(&free_part, GROUP * t.width);
+    t.p = take(&spare, t.cells * CELL);
+    t.table = take(&spare, K * t.width);
+    t.r = take(&spare, GROUP * t.width);
     begin_still(s, x, &t);
   }
   if (s->counts[2] == 0 || s->counts[2] >= REFRESH) {
@@ -512,30 +506,30 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
     s->counts[2] = 0;
   }
   s->counts[2] += x->n;
-  group w = {.u = part(&free_part, tiles * GROUP * TILE)};
-  w.e = part(&free_part, K * GROUP);
-  w.steps = part(&free_part, K * 2 * GROUP);
-  w.keep = part(&free_part, K * GROUP);
-  w.gain = part(&free_part, K * GROUP);
-  w.take = part(&free_part, K * GROUP);
-  w.e_before = part(&free_part, K * GROUP);
-  w.gram_before = part(&free_part, K * K);
-  w.m = part(&free_part, J * K);
-  w.m_before = part(&free_part, J * K);
-  w.rows = part(&free_part, J * TILE);
-  w.shrink = part(&free_part, K);
-  w.products = part(&free_part, K);
-  w.scale = part(&free_part, K);
-  w.rest = part(&free_part, K);
-  w.z_dot = part(&free_part, K);
-  w.scratch = part(&free_part, K);
+  group w = {.u = take(&spare, tiles * GROUP * TILE)};
+  w.e = take(&spare, K * GROUP);
+  w.steps = take(&spare, K * 2 * GROUP);
+  w.keep = take(&spare, K * GROUP);
+  w.gain = take(&spare, K * GROUP);
+  w.take = take(&spare, K * GROUP);
+  w.e_before = take(&spare, K * GROUP);
+  w.gram_before = take(&spare, K * K);
+  w.m = take(&spare, J * K);
+  w.m_before = take(&spare, J * K);
+  w.rows = take(&spare, J * TILE);
+  w.shrink = take(&spare, K);
+  w.products = take(&spare, K);
+  w.scale = take(&spare, K);
+  w.rest = take(&spare, K);
+  w.z_dot = take(&spare, K);
+  w.scratch = take(&spare, K);
   for (int64_t k = 0; k < K; k++) w.shrink[k] = 1;
   features_in_vectors(s, w.scale, w.m);
   int shown = learn_groups(s, x, gap, pending, &c, &t, &w, xi);
   if (t.width) {
     copy_columns(1, s->mean, size, &c, c.mean, 1);
     copy_columns(K, s->v, size, &c, c.v, 1);
-    settle_still(s, &t, part(&free_part, (K + 5) * BATCH * CELL));
+    settle_still(s, &t, take(&spare, (K + 4) * BATCH * CELL));
     for (int64_t start = 0; shown && start < size; start += TILE)
       slow_features(s, w.m, start, smaller(TILE, size - start), w.rows, TILE);
   }

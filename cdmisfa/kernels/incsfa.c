@@ -114,7 +114,7 @@ INLINE void features_in_vectors(const incsfa *s, double *scale, double *m) {
  * `rows` (J, stride) is scratch. */
 INLINE double slow_features(const incsfa *s, const double *m, int64_t start, int64_t width,
                             double *rows, int64_t stride) {
-  combine(s->outputs, s->components, m, s->components, s->v + start, s->inputs, width, rows, stride);
+  multiply(s->outputs, s->components, width, m, s->components, s->v + start, s->inputs, rows, stride);
   double square = 0;
   for (int64_t j = 0; j < s->outputs; j++) {
     double *phi = s->phi + j * s->inputs + start;

@@ -20,6 +20,10 @@ typedef struct {
 /* Whether this processor has AVX2 and FMA, which one of the two modules is compiled for. */
 int has_wide_lanes(void);
 
+/* lanes.h */
+void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
+              const double *b, int64_t b_row, double *c, int64_t c_row);
+
 /* elementary.c */
 double exp_of(double x);
 double log_of(double x);
@@ -43,6 +47,82 @@ typedef struct {
   int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
+
+/* The agent: S streams, J outputs, M frozen modules; what each field is, agents/agent.py tells. */
+enum { NOVEL = 0, CONSTANT = -1 }; /* what knows a block that no module does */
+
+typedef struct {
+  int64_t iteration, module, stream, last_stream, last_action, fed_stream, fed_until;
+  int64_t novel_blocks, rewards;
+  double scale, roc_error, xi, share, epsilon;
+  int64_t idle;
+} memory;
+
+typedef struct {
+  int64_t stream, module;
+  bool novel;
+  int64_t known_by;
+  bool saved;
+  double share;
+  int64_t novel_blocks;
+  double roc_error, roc_error_inst, xi, xi_dot, curiosity, expert, reward, epsilon;
+  bool explored;
+  int64_t action, next_stream;
+} outcome;
+
+typedef struct {
+  double sigma, beta, delta, gamma, epsilon_start, epsilon_decay, epsilon_knee, epsilon_tail_decay;
+  double slowness_window, eta_dot_window, gate_window, warm_up, min_variance, novel_share;
+  double alpha, roc_radius, roc_memory, roc_error, patience;
+  int64_t tabular;
+} rules;
+
+typedef struct {
+  int64_t streams, outputs, tau; /* S, J, frames of a block */
+  int64_t tensor, places;        /* whether `dense` is kept; centres of each stream, or 0 */
+  const rules *rules;
+  outcome *out;
+  memory *memory;
+  double *eta, *eta_dot, *eta_inst, *gate_mean, *gate_variance, *derivative; /* (J,) */
+  double *y_sum, *square_sum;                                                /* (J,) */
+  int64_t *y_frames;                                                         /* (1,) */
+  double *recent_mean, *recent_square;                                       /* (J,) */
+  double *stay_sum, *switch_sum, *dense;                                     /* (S,), (S, 2, S) */
+  int64_t *policy;                                                           /* (S,) */
+  double *centres, *counts; /* (S, places, tau, J), (S, places) */
+} agent;
+
+typedef struct {
+  int64_t modules;
+  double *phi, *offset;        /* (M J, I), (M J,) */
+  double *band_mean, *band_sd; /* (M, J) */
+  double *centres, *counts;    /* (M, S, places, tau, J), (M, S, places) */
+} frozen;
+
+/* What is kept of each iteration of a trial. */
+typedef struct {
+  outcome *outcome;                 /* (N,) */
+  double *eta_dot, *R, *Q;          /* (N, J), (N, S) of the stay entries, (N, S, 2) */
+  int64_t *policy;                  /* (N, S) */
+} curves;
+
+/* gate.c */
+double slowness(double derivative, double variance);
+void instantaneous_slowness(int64_t n, int64_t J, const double *y, double *eta);
+int recognise(const agent *a, const frozen *f, const frames *shown, const frames *x,
+              double *y_frozen, double *eta_inst, double *roc_error);
+
+/* agent.c */
+void action_values(const agent *a, double *Q);
+int think(const agent *a, const double *xi, const double *y, int64_t t, const double *uniforms);
+int iterate(const agent *a, const frozen *f, const incsfa *feature, const frames *shown,
+            const frames *x, int64_t t, const double *uniforms, double *y, double *y_frozen,
+            double *eta_inst, double *roc_error);
+int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const frames *shown,
+                   const frames *x, const double *uniforms, int64_t n, double swap_below,
+                   const curves *kept);
+void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
+              const double *y_frozen, double *told);
 int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
 int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
 
@@ -66,3 +146,22 @@ typedef struct {
   const int64_t *starts, *counts; /* (n,) its first pixel, and how many; within the pixels */
 } areas;
 int average(const uint8_t *image, const areas *across, const areas *down, uint8_t *out);
+
+/* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
+void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);
+
+/* recursive.c: I inputs, L directions, K whitened components, J outputs */
+enum { PIECE = 64 }; /* frames taken in at once; longer blocks are cut into pieces of so many */
+typedef struct {
+  int64_t inputs, size, components, outputs; /* I, L, K, J */
+  int64_t window;      /* frames of the exponential window */
+  double *mean;        /* (I,) */
+  double *basis;       /* (L, I) orthonormal directions, those of the largest variance first */
+  double *variance;    /* (L,) along them */
+  double *differences; /* (L, L) mean square of the differences of consecutive frames along them */
+  double *weights;     /* (J, L) slow features as weights of the directions */
+  double *spectrum;    /* (K,) slowness of all slow features */
+  double *last;        /* (I,) the last frame */
+  int64_t *counts;     /* (3,) directions in use, frames seen, differences seen */
+} recursive;
+int recursive_update(const recursive *sfa, const frames *x, int gap, double *change);

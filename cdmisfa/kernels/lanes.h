@@ -9,10 +9,14 @@
 #define LANES_H
 
 #include <math.h>
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
 #if defined(__AVX2__) && defined(__FMA__)
 #include <immintrin.h>
 #endif
@@ -47,9 +51,15 @@ INLINE int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
 INLINE double larger(double a, double b) { return a > b ? a : b; }
 
+/* Without __builtin_cpu_supports, which is 0 where clang's run-time library is that of zig. */
 int has_wide_lanes(void) {
 #if defined(__x86_64__)
-  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  const unsigned needed = bit_FMA | bit_AVX | bit_OSXSAVE, kept_by_system = 6;
+  unsigned a, b, c, d, state, high;
+  if (!__get_cpuid(1, &a, &b, &c, &d) || (c & needed) != needed) return 0;
+  __asm__("xgetbv" : "=a"(state), "=d"(high) : "c"(0));
+  if ((state & kept_by_system) != kept_by_system) return 0;
+  return __get_cpuid_count(7, 0, &a, &b, &c, &d) && (b & bit_AVX2);
 #else
   return 0;
 #endif
@@ -204,50 +214,69 @@ static void add_products(int64_t rows, int64_t frames, const double *v, int64_t 
   }
 }
 
-/* Some rows of `combine`, over `blocks` times four columns at once; both are constants. */
-INLINE void combine_of(int rows, int blocks, int64_t terms, const double *c, int64_t c_row,
-                       const double *x, int64_t x_row, int64_t width, double *out,
-                       int64_t out_row) {
-  int64_t i = 0;
-  for (; i + blocks * LANES <= width; i += blocks * LANES) {
-    lanes a[4][4];
+/* Some rows of `multiply`, over `blocks` times four columns; both are constants where it is called. */
+INLINE void multiply_block(int rows, int blocks, int64_t parts, const double *a, int64_t a_row,
+                           const double *b, int64_t b_row, double *c, int64_t c_row) {
+  lanes s[3][4];
+#pragma GCC unroll 3
+  for (int r = 0; r < rows; r++)
 #pragma GCC unroll 4
-    for (int r = 0; r < rows; r++)
+    for (int i = 0; i < blocks; i++) s[r][i] = spread(0);
+  for (int64_t p = 0; p < parts; p++)
 #pragma GCC unroll 4
-      for (int b = 0; b < blocks; b++) a[r][b] = spread(0);
-    for (int64_t k = 0; k < terms; k++)
+    for (int i = 0; i < blocks; i++) {
+      lanes x = load(b + p * b_row + i * LANES);
+#pragma GCC unroll 3
+      for (int r = 0; r < rows; r++) s[r][i] = add_product(spread(a[r * a_row + p]), x, s[r][i]);
+    }
+#pragma GCC unroll 3
+  for (int r = 0; r < rows; r++)
 #pragma GCC unroll 4
-      for (int b = 0; b < blocks; b++) {
-        lanes y = load(x + k * x_row + i + b * LANES);
-#pragma GCC unroll 4
-        for (int r = 0; r < rows; r++)
-          a[r][b] = add_product(spread(c[r * c_row + k]), y, a[r][b]);
-      }
-#pragma GCC unroll 4
-    for (int r = 0; r < rows; r++)
-#pragma GCC unroll 4
-      for (int b = 0; b < blocks; b++) store(out + r * out_row + i + b * LANES, a[r][b]);
-  }
-  for (; i < width; i++)
-    for (int r = 0; r < rows; r++) {
+    for (int i = 0; i < blocks; i++) store(c + r * c_row + i * LANES, s[r][i]);
+}
+
+/* All rows of `multiply` over `blocks` times four columns. */
+INLINE void multiply_columns(int blocks, int64_t rows, int64_t parts, const double *a,
+                             int64_t a_row, const double *b, int64_t b_row, double *c,
+                             int64_t c_row) {
+  int64_t r = 0;
+  for (; r + 3 <= rows; r += 3)
+    multiply_block(3, blocks, parts, a + r * a_row, a_row, b, b_row, c + r * c_row, c_row);
+  if (r + 2 == rows)
+    multiply_block(2, blocks, parts, a + r * a_row, a_row, b, b_row, c + r * c_row, c_row);
+  if (r + 1 == rows)
+    multiply_block(1, blocks, parts, a + r * a_row, a_row, b, b_row, c + r * c_row, c_row);
+}
+
+/* c = a b, of (rows, parts) and (parts, width): every number is a sum in the order of the parts. */
+void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
+              const double *b, int64_t b_row, double *c, int64_t c_row) {
+  int64_t j = 0;
+  for (; j + 4 * LANES <= width; j += 4 * LANES)
+    multiply_columns(4, rows, parts, a, a_row, b + j, b_row, c + j, c_row);
+  for (; j + LANES <= width; j += LANES)
+    multiply_columns(1, rows, parts, a, a_row, b + j, b_row, c + j, c_row);
+  for (; j < width; j++)
+    for (int64_t r = 0; r < rows; r++) {
       double total = 0;
-      for (int64_t k = 0; k < terms; k++) total = fma(c[r * c_row + k], x[k * x_row + i], total);
-      out[r * out_row + i] = total;
+      for (int64_t p = 0; p < parts; p++) total = fma(a[r * a_row + p], b[p * b_row + j], total);
+      c[r * c_row + j] = total;
     }
 }
 
-/* out[r] = sum of c[r][k] x[k] over k in order, for rows of `width` columns. */
-static void combine(int64_t rows, int64_t terms, const double *c, int64_t c_row, const double *x,
-                    int64_t x_row, int64_t width, double *out, int64_t out_row) {
-  int64_t r = 0;
-  for (; r + 4 <= rows; r += 4)
-    combine_of(4, 2, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
-  if (r + 3 == rows)
-    combine_of(3, 2, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
-  if (r + 2 == rows)
-    combine_of(2, 4, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
-  if (r + 1 == rows)
-    combine_of(1, 4, terms, c + r * c_row, c_row, x, x_row, width, out + r * out_row, out_row);
+/* The first n of spare numbers, which are then no longer spare. */
+static double *take(double **spare, int64_t n) {
+  double *taken = *spare;
+  *spare += n;
+  return taken;
 }
+
+/* The same, set to 0. */
+static double *take_zeros(double **spare, int64_t n) {
+  double *taken = take(spare, n);
+  return memset(taken, 0, (size_t)n * sizeof *taken);
+}
+
+static void copy(const double *x, double *y, int64_t n) { memcpy(y, x, (size_t)n * sizeof *y); }
 
 #endif

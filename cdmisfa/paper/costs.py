@@ -9,14 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-from cdmisfa.agents.agent import Agent, Rules, new_agent, rules
-from cdmisfa.agents.gate import verdict
-from cdmisfa.agents.reward import add_reward, add_reward_locally
-from cdmisfa.agents.roc import known_to
-from cdmisfa.agents.saving import track_clusters, track_output
-from cdmisfa.core.arithmetic.compiled import compiled
+from cdmisfa import kernels
+from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
+from cdmisfa.agents.gate import Frozen
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.paper.oscillatory import STREAMS, learner_config
@@ -42,9 +37,6 @@ OWN = {
     "2.0": ("delta", "gate_window"),
 }
 """Keys of the configuration that only one of the two uses."""
-
-Float = NDArray[np.float64]
-
 
 def plan(request: Request) -> list[dict[str, Any]]:
     """Ten rounds of each world; in a round both are timed in turn, in one process."""
@@ -76,7 +68,6 @@ def _whole(streams: int, seed: int) -> float:
         result = run_trial(config, names, seed=seed, max_iterations=iterations, max_modules=1)
         return result.iterations
 
-    iterate(1)  # compiles
     return _timed(iterate, ITERATIONS)
 
 
@@ -93,62 +84,18 @@ def _work(algorithm: str, streams: int, modules: int) -> Callable[[int], float]:
     theta = 2 * np.pi * np.arange(PHASES * config.tau) / (PHASES * config.tau)
     y = np.sqrt(2.0) * np.sin(4 * theta).reshape(PHASES, config.tau, 1)
     y_frozen = np.repeat(y[:, None], modules, axis=1)
-    agent, constants = new_agent(config, streams, 0), rules(config, streams)
-    centres = np.zeros((modules, *agent.centres.shape))
-    counts = np.zeros((modules, *agent.counts.shape))
-    if algorithm == "1.0" and modules:
-        _clustering(agent, constants, y, y_frozen[:, :0], centres[:0], counts[:0], PHASES)
-        centres[:], counts[:] = agent.centres, agent.counts
+    agent, told = new_agent(config, streams, 0), np.empty((modules, 1))
+    known = as_struct(agent, rules(config, streams), np.zeros(1, OUTCOME))
+    outputs = [kernels.pointer("y", array, array.shape) for array in (y, y_frozen, told)]
 
-    def repeat(blocks: int) -> None:
-        if algorithm == "1.0":
-            _clustering(agent, constants, y, y_frozen, centres, counts, blocks)
-        else:
-            _slowness(agent, constants, y, y_frozen, blocks)
+    def repeat(blocks: int, count: int = modules) -> None:
+        clusters = (np.repeat(array[None], count, axis=0) for array in (agent.centres, agent.counts))
+        band = np.zeros((count, 1))
+        frozen = Frozen(np.zeros((count, 1)), np.zeros(count), band, band, *clusters).struct
+        kernels.lib.own_work(known.pointer, frozen.pointer, blocks, PHASES, *outputs)
 
-    def tell(blocks: int) -> float:
-        repeat(1)  # compiles
-        return _timed(repeat, blocks)
-
-    return tell
-
-
-@compiled
-def _slowness(agent: Agent, constants: Rules, y: Float, y_frozen: Float, blocks: int) -> None:
-    """2.0's own work: slowness of the output and of the modules', and the running reward."""
-    modules = y_frozen.shape[1]
-    band, eta_inst = np.zeros((modules, 1)), np.zeros((modules, 1))
-    for k in range(blocks):
-        block = k % len(y)
-        agent.memory[0]["novel_blocks"] += 1
-        track_output(agent, constants, 0, y[block, :, 0])
-        agent.y_frames[0] += y.shape[1]
-        verdict(y_frozen[block], band, band, eta_inst)
-        s = k % len(agent.policy)
-        add_reward(agent.stay_sum, agent.switch_sum, agent.dense, s, 0, s, 0.001)
-
-
-@compiled
-def _clustering(
-    agent: Agent,
-    constants: Rules,
-    y: Float,
-    y_frozen: Float,
-    centres: Float,
-    counts: Float,
-    blocks: int,
-) -> None:
-    """1.0's own work: clusters of the output and of the modules', and the tabular reward."""
-    error = np.zeros(y_frozen.shape[1])
-    for k in range(blocks):
-        block = k % len(y)
-        agent.memory[0]["novel_blocks"] += 1
-        s = k % len(agent.policy)
-        track_clusters(agent, constants, s, y[block])
-        known_to(centres, counts, s, y_frozen[block], constants.roc_error, error)
-        add_reward_locally(
-            agent.stay_sum, agent.switch_sum, agent.dense, s, 0, s, 0.001, constants.alpha
-        )
+    repeat(PHASES, 0)  # finds the clusters
+    return lambda blocks: _timed(repeat, blocks)
 
 
 def parameters(algorithm: str) -> list[str]:

@@ -63,7 +63,7 @@ def expanded_period(stream: int) -> NDArray[np.float64]:
 def slowness_on(module: Module) -> float:
     """Slowness of a module's output on one period of its own stream, in cycles per frame."""
     x = expanded_period(module.stream_index)
-    return float(instantaneous_slowness((x - module.mean) @ module.phi[0]))
+    return float(instantaneous_slowness((x - module.mean) @ module.phi[:1].T)[0])
 
 
 def evaluate(trials: Sequence[Trial]) -> Findings:

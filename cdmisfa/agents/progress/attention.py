@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arithmetic.elementary import fading, log
+from cdmisfa import kernels
 
 Float = NDArray[np.float64]
 
@@ -110,9 +110,14 @@ def _gamma_progress(s: Situation) -> Float:
     return _of_each(s, value, -1e3)
 
 
+def fading(base: float, n: int) -> Float:
+    """n >= 1 weights, from base^(n-1) to 1."""
+    return np.asarray(np.multiply.accumulate(np.append(1.0, np.full(n - 1, base)))[::-1])
+
+
 def _upper_bound(s: Situation) -> Float:
     """Upper confidence bound on the relative fall of the learning error (UCB1)."""
-    total = log(max(int(s.visits.sum()), 2))
+    total = kernels.log(max(int(s.visits.sum()), 2))
 
     def value(errors: Float, visits: int) -> float:
         if len(errors) < RECENT:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.arithmetic.elementary import log
+from cdmisfa import kernels
 from cdmisfa.core.learning import overwrite
-from cdmisfa.features.projection import mean_output, project
-from cdmisfa.features.recursive.recursive import RecursiveSFA, State
+from cdmisfa.features.projection import project
+from cdmisfa.features.recursive import RecursiveSFA, State
 from cdmisfa.features.slowness import slowness, window_rate
 
 Float = NDArray[np.float64]
@@ -34,7 +34,7 @@ UNTESTED = 3.0
 
 def log_ratio(a: float, b: float) -> float:
     """ln(a / b) of two slownesses, finite where one of them is 0."""
-    return log(max(a, _TINY) / max(b, _TINY))
+    return kernels.log(max(a, _TINY) / max(b, _TINY))
 
 
 def learning_error(change: float, tested: float, fitted: float) -> float:
@@ -122,14 +122,14 @@ class Candidate:
         self.tests += 1
         rate = window_rate(self.test_window, self.tests)
         phi = self.sfa.phi
-        offset = mean_output(phi, self.sfa.mean)
-        y = self.y = project(phi, offset, frames)
+        offset = kernels.mean_output(phi, self.sfa.mean)
+        y = self.y = kernels.outputs(phi, offset, frames)
         steps = np.diff(y, axis=0)
         if self._phi.any() and not gap:
-            first = project(self._phi, np.zeros(len(phi)), frames[:1])
+            first = kernels.outputs(self._phi, np.zeros(len(phi)), frames[:1])
             steps = np.concatenate([first - self._last, steps])
         self._phi[:], self._last[:] = phi, y[-1] + offset
-        now = np.stack([y.mean(axis=0), (y**2).mean(axis=0), (steps**2).mean(axis=0)])
+        now = np.stack([y.mean(axis=0), (y * y).mean(axis=0), (steps * steps).mean(axis=0)])
         self._moments += rate * (now - self._moments)
 
     def _look_back(self) -> None:

@@ -7,10 +7,8 @@ from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.modules import Module
 
 FULL = 4.0
-"""Windows of tests after which an output counts as settled at `learner.settled`."""
-
-STEEPNESS = 2
-"""Power with which that threshold grows until then."""
+"""Windows of tests after which an output counts as settled at `learner.settled`; until then the
+threshold grows with the square of their number."""
 
 STILL_GAINING = 0.1
 """Regret above which nothing is settled, however little the output changes with a block."""
@@ -90,7 +88,8 @@ def mastered(candidate: Candidate, config: ProgressConfig) -> bool:
     windows = candidate.tests / candidate.test_window
     if windows < 1.0:
         return False
-    firm = candidate.change < config.settled * min(1.0, windows / FULL) ** STEEPNESS
+    grown = min(1.0, windows / FULL)
+    firm = candidate.change < config.settled * (grown * grown)
     turning = (
         windows >= FULL
         and candidate.change < TURNING * config.settled

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa import kernels
 from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
 from cdmisfa.agents.progress.candidate import Candidate
@@ -41,13 +42,11 @@ from cdmisfa.agents.progress.streams import (
     outcomes,
     watch,
 )
-from cdmisfa.core.arithmetic.choice import in_own_arithmetic
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.features.projection import mean_output, outputs
 from cdmisfa.features.slowness import instantaneous_slowness
 
 Float = NDArray[np.float64]
@@ -104,6 +103,11 @@ class ProgressLearner:
         return int(self._counts["stream"][0])
 
     @property
+    def arithmetic(self) -> int:
+        """Version of how it computes; see `arithmetic_of`."""
+        return kernels.ARITHMETIC
+
+    @property
     def iteration(self) -> int:
         """Iterations so far."""
         return int(self._counts["iteration"][0])
@@ -150,7 +154,6 @@ class ProgressLearner:
         self._freeze()
         self._rng.bit_generator.state = dict(state.policy_rng)
 
-    @in_own_arithmetic
     def step(self, block: Block) -> BlockSignals:
         """One iteration: test on tau frames, learn from them, and decide what to watch next.
 
@@ -167,7 +170,7 @@ class ProgressLearner:
         own, counts = self._streams[stream], self._counts[0]
         novel = int(own["state"]) == LEARNING
         candidate = self._candidates.begun(stream, self._streams)
-        y_frozen = outputs(self._phi, self._offset, frames)
+        y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(own["next"]) != block.t)
         own["next"], own["last"] = block.t + len(block), counts["iteration"]
@@ -199,10 +202,10 @@ class ProgressLearner:
             eta=tested,
             eta_dot=none,
             variance=candidate.variance if candidate.tests else none,
-            eta_inst=_each(y),
+            eta_inst=instantaneous_slowness(y),
             gate_mean=none,
             gate_sd=none,
-            eta_inst_frozen=np.array([_each(module) for module in y_frozen]).reshape(shape),
+            eta_inst_frozen=np.array([instantaneous_slowness(y) for y in y_frozen]).reshape(shape),
             band_mean=np.array([m.eta for m in self.modules[:count]]).reshape(shape),
             band_sd=np.full(shape, np.nan),
             roc_error_inst=math.nan,
@@ -343,7 +346,7 @@ class ProgressLearner:
     def _freeze(self) -> None:
         """Stack the modules' rows, so that one pass over a block serves all of them."""
         self._phi = np.array([m.phi for m in self.modules]).reshape(-1, self._n_inputs)
-        self._offset = np.array([mean_output(m.phi, m.mean) for m in self.modules]).reshape(-1)
+        self._offset = np.array([kernels.mean_output(m.phi, m.mean) for m in self.modules]).reshape(-1)
 
     def _choose(self, draws: Float) -> tuple[Float, bool]:
         """Choose the next stream; what each promises, and whether one was drawn at random."""
@@ -362,8 +365,3 @@ class ProgressLearner:
             counts["stay"] = 0
             counts["stream"], explored = RULES[self.config.attention](situation)
         return interest(situation), explored
-
-
-def _each(y: Float) -> Float:
-    """Slowness of each output within a block, (J,), from its (n, J) values."""
-    return np.array([instantaneous_slowness(y[:, j].copy()) for j in range(y.shape[1])])

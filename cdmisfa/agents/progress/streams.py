@@ -61,7 +61,8 @@ def decide(own: Any, state: int, module: int, slowness: float, why: int = 0) -> 
 
 def begin_watching(own: Any, power: float, slowness: float) -> None:
     """Note the mean square and the slowness of the output of a stream's module, to compare with."""
-    own["then_power"], own["then_steps"] = power, power * (2.0 * math.pi * slowness) ** 2
+    turn = 2.0 * math.pi * slowness
+    own["then_power"], own["then_steps"] = power, power * (turn * turn)
     own["watched"] = 0
 
 

@@ -1,0 +1,60 @@
+"""Setuptools as build backend, which takes a C compiler from PyPI where the machine has none."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+import sysconfig
+from typing import Any
+
+from setuptools import build_meta
+from setuptools.build_meta import *  # noqa: F403 - the hooks that stay as they are
+
+ZIG = "ziglang>=0.13,<0.18"
+"""Clang, and all it needs to link, in 100 MB."""
+
+
+def compiler() -> str | None:
+    """The machine's C compiler: what was asked for, what built Python, or a usual one."""
+    names = os.environ.get("CC"), sysconfig.get_config_var("CC"), "cc", "gcc", "clang"
+    return next((name for name in names if name and shutil.which(shlex.split(name)[0])), None)
+
+
+def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
+    """What else must be installed to build a wheel."""
+    return build_meta.get_requires_for_build_wheel(config_settings) + _lacking()
+
+
+def get_requires_for_build_editable(config_settings: Any = None) -> list[str]:
+    """What else must be installed to use the checkout itself."""
+    return build_meta.get_requires_for_build_editable(config_settings) + _lacking()
+
+
+def build_wheel(*args: Any, **options: Any) -> str:
+    """Build a wheel."""
+    _choose_compiler()
+    return build_meta.build_wheel(*args, **options)
+
+
+def build_editable(*args: Any, **options: Any) -> str:
+    """Build the kernels in the checkout, and a wheel that points to it."""
+    _choose_compiler()
+    return build_meta.build_editable(*args, **options)
+
+
+def _lacking() -> list[str]:
+    return [] if compiler() else [ZIG]
+
+
+def _choose_compiler() -> None:
+    """Have setuptools compile with what there is; each hook is a process of its own."""
+    found = compiler()
+    zig = f"{shlex.quote(sys.executable)} -m ziglang cc -mcpu=baseline"
+    os.environ["CC"] = found or zig
+    if not found:
+        os.environ["LDSHARED"] = f"{zig} -shared"
+        os.environ["ZIG_GLOBAL_CACHE_DIR"] = os.path.abspath("build/zig")
+        # The flags of the compiler that Python was built with may be unknown to this one.
+        sysconfig.get_config_vars()["CFLAGS"] = ""

@@ -1,0 +1,91 @@
+"""Recursive SFA as one writes it in numpy: what the kernels must come to, but for rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.features.recursive import PIECE, State
+
+Float = NDArray[np.float64]
+
+
+def most_different(rows: Float, most: int, least: float) -> Float:
+    """An orthonormal basis of the rows that differ most from those chosen before, (P, I)."""
+    left, span = rows.copy(), np.zeros((0, rows.shape[1]))
+    least = max(least, 1e-10 * (rows**2).sum(axis=1).max())
+    while len(span) < most:
+        squares = (left**2).sum(axis=1)
+        largest = squares.argmax()
+        if not squares[largest] > least:
+            break
+        own = left[largest] - (left[largest] @ span.T) @ span
+        own /= np.sqrt(own @ own)
+        span, left = np.vstack([span, own]), left - np.outer(left @ own, own)
+    return span
+
+
+def eigen(matrix: Float) -> tuple[Float, Float]:
+    """Eigenvalues, the largest first, and eigenvectors as rows."""
+    values, vectors = np.linalg.eigh(matrix)
+    return values[::-1], vectors.T[::-1]
+
+
+def learn_piece(state: State, x: Float, gap: bool, window: int) -> float:
+    """Take in a piece of a block (m, I) of values; the change of the outputs."""
+    rank, seen, pairs = state.counts.tolist()
+    size, (m, _) = len(state.variance), x.shape
+    if not seen:
+        state.mean[:] = x[0]
+    basis, u = state.basis[:rank].copy(), x - state.mean
+    moved = 1 - np.sqrt(seen / (seen + m))
+    weighted = np.sqrt(seen * state.variance[:rank, None]) * basis
+    rows = np.vstack([weighted, u - moved * u.mean(axis=0)])
+    least = 1e-28 * (state.mean @ state.mean) * (seen + m)
+    span = most_different(rows, min(size + size // 2, len(rows)), least)
+    squares, vectors = eigen((rows @ span.T).T @ (rows @ span.T))
+    k = int((squares > max(least, 1e-8 * squares.max(initial=0.0)))[:size].sum())
+    new, variance = vectors[:k] @ span, squares[:k] / (seen + m)
+    turn = new @ basis.T
+    steps = np.diff(x if gap or not seen else np.vstack([state.last, x]), axis=0) @ new.T
+    total = pairs * (turn @ state.differences[:rank, :rank] @ turn.T) + steps.T @ steps
+    before = state.weights[:, :rank] @ turn.T
+    state.mean[:] += u.mean(axis=0) * m / (seen + m)
+    state.last[:] = x[-1]
+    state.basis[:k] = new
+    for array in (state.variance, state.differences, state.weights):
+        array[...] = 0.0
+    state.variance[:k] = variance
+    state.differences[:k, :k] = total / max(pairs + len(steps), 1)
+    state.counts[:] = k, min(seen + m, window), min(pairs + len(steps), window)
+    solve(state, k)
+    return change(state.weights[:, :k], before, variance)
+
+
+def solve(state: State, rank: int) -> None:
+    """The slow features: least difference among the whitened components."""
+    k = min(rank, len(state.spectrum))
+    scale = 1 / np.sqrt(state.variance[:k])
+    values, vectors = eigen(scale[:, None] * state.differences[:k, :k] * scale)
+    state.spectrum[:] = np.nan
+    state.spectrum[:k] = np.sqrt(np.maximum(values[::-1], 0.0)) / (2 * np.pi)
+    shown = (vectors[::-1] * scale)[: len(state.weights)]
+    state.weights[: len(shown), :k] = shown
+
+
+def change(weights: Float, before: Float, variance: Float) -> float:
+    """Change of the outputs, from the singular values of their correlations with those before."""
+    power = (before**2 * variance).sum(axis=1)
+    if not power.all():
+        return float("nan")
+    alike = (before * variance) @ weights.T / np.sqrt(power)[:, None]
+    return float(np.sqrt(max(0.0, 2 - 2 * np.linalg.svd(alike, compute_uv=False).mean())))
+
+
+def update(state: State, frames: Float, gap: bool, window: int) -> Float:
+    """Learn from consecutive frames of values; what `RecursiveSFA.update` returns."""
+    out = np.full(len(frames), np.nan)
+    for start in range(0, len(frames), PIECE):
+        piece = frames[start : start + PIECE]
+        out[start + len(piece) - 1] = learn_piece(state, piece, gap and start == 0, window)
+    return out
