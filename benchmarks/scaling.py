@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa import kernels
 from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
+from cdmisfa.agents.gate import NOVEL
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Workers
@@ -25,8 +26,9 @@ STREAMS = (10, 100, 1000, 10_000)
 def agent_steps(n: int, blocks: int) -> Callable[[], int]:
     """A call of some iterations of an agent of n streams whose every block is novel."""
     config = LearnerConfig(outputs=1, tau=3)
-    agent = as_struct(new_agent(config, n, 0), rules(config, n), np.zeros(1, OUTCOME))
-    rng = np.random.default_rng(0)
+    rng, out = np.random.default_rng(0), np.zeros(1, OUTCOME)
+    out["known_by"] = NOVEL
+    agent = as_struct(new_agent(config, n, 0), rules(config, n), out)
     y, draws = rng.standard_normal((3, 1)), rng.random((997, 3))
     xi = 1e-3 * (1 + rng.random((997, 3)))
 

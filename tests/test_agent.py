@@ -9,60 +9,42 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kernel_agent import STAY, KernelAgent
+from reference.agent import IDLE_EPSILON, has_gap, ready_to_save
 
-from cdmisfa.agents.agent import OUTCOME, Agent, begin_abstraction, new_agent, rules
+from cdmisfa.agents.agent import Agent, begin_abstraction, new_agent
 from cdmisfa.agents.gate import CONSTANT, NOVEL
-from cdmisfa.agents.iteration import IDLE_EPSILON, has_gap, mean_change, think
-from cdmisfa.agents.policy import action_values
-from cdmisfa.agents.saving import ready_to_save, recent_variance
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.signals import DENSE_STREAMS
 from cdmisfa.features.slowness import instantaneous_slowness
 
 TAU = 50
 SLOW = np.sin(2 * np.pi * np.arange(5000) / 250)
-STAY = (0.999999, 0.0, 0.0)
-"""Draws that explore only while epsilon is 1 or more, and then stay."""
 
 
 def config(**values: Any) -> LearnerConfig:
     return LearnerConfig(**{"warm_up": 2, **values})
 
 
-class Bench:
-    """An agent that is told what its gate and its abstraction say."""
+class Bench(KernelAgent):
+    """An agent that is told what its gate and its abstraction say, of a slow output by default."""
 
     def __init__(self, n: int = 3, first: int = 0, **values: Any) -> None:
-        self.config = config(**values)
-        self.agent = new_agent(self.config, n, first)
-        self.rules = rules(self.config, n)
-        self.t = 0
+        super().__init__(config(**{"tau": TAU, **values}), n, first)
 
     def step(
         self,
-        xi: float = 0.01,
+        xi: Any = 0.01,
         known_by: int = NOVEL,
         draws: tuple[float, float, float] = STAY,
         y: np.ndarray | None = None,
     ) -> dict[str, Any]:
         start = self.t % 4000
-        y = SLOW[start : start + TAU, None] if y is None else y
-        self.t += len(y)
-        out = np.zeros(1, OUTCOME)
-        think(self.agent, self.rules, out, known_by, xi, y, self.t, np.array(draws))
-        return dict(zip(OUTCOME.names or (), out[0].item(), strict=True))
-
-    def values(self) -> np.ndarray:
-        """The action values, (S, 2)."""
-        Q = np.full((len(self.agent.policy), 2), np.nan)
-        agent, scale = self.agent, self.memory["scale"]
-        action_values(agent.stay_sum, agent.switch_sum, scale, self.config.gamma, agent.policy, Q)
-        return Q
+        return self.think(xi, known_by, draws, SLOW[start : start + TAU, None] if y is None else y)
 
     @property
-    def memory(self) -> dict[str, Any]:
-        memory = self.agent.memory
-        return dict(zip(memory.dtype.names, memory[0].item(), strict=True))
+    def variance(self) -> float:
+        return float((self.agent.recent_square - self.agent.recent_mean**2)[0])
 
 
 def test_it_begins_with_nothing_known_and_the_stream_it_is_told() -> None:
@@ -162,9 +144,10 @@ def test_gaps() -> None:
 
 
 def test_the_mean_change_leaves_out_what_has_none() -> None:
-    assert mean_change(np.array([np.nan, 1.0, 2.0])) == 1.5
-    assert mean_change(np.array([0.5, 1.5])) == 1.0
-    assert math.isnan(mean_change(np.array([np.nan])))
+    bench = Bench()
+    assert bench.step(np.array([np.nan, 1.0, 2.0]))["xi"] == 1.5
+    assert bench.step(np.array([0.5, 1.5]))["xi"] == 1.0
+    assert math.isnan(bench.step(np.nan)["xi"])
 
 
 def test_eta_is_over_all_novel_blocks_and_eta_inst_over_the_last() -> None:
@@ -172,9 +155,9 @@ def test_eta_is_over_all_novel_blocks_and_eta_inst_over_the_last() -> None:
     y = np.random.default_rng(0).standard_normal((40, TAU, 1))
     for block in y:
         bench.step(y=block)
-    assert bench.agent.eta_inst[0] == instantaneous_slowness(y[-1, :, 0].copy())
+    assert bench.agent.eta_inst[0] == instantaneous_slowness(y[-1])[0]
     assert bench.agent.eta[0] == pytest.approx(0.2251, rel=0.1)
-    assert recent_variance(bench.agent, 0) == pytest.approx(1.0, rel=0.2)
+    assert bench.variance == pytest.approx(1.0, rel=0.2)
 
 
 def test_eta_dot_is_the_running_mean_change_of_eta() -> None:
@@ -207,7 +190,7 @@ def test_a_block_longer_than_the_window_counts_fully_and_not_more() -> None:
         y = rng.standard_normal((TAU, 1)) * rng.choice([0.1, 10.0])
         bench.step(y=y)
         assert bench.agent.derivative[0] == pytest.approx(np.mean(np.diff(y[:, 0]) ** 2))
-        assert recent_variance(bench.agent, 0) == pytest.approx(np.var(y))
+        assert bench.variance == pytest.approx(np.var(y))
 
 
 def test_one_output_that_stood_still_does_not_ruin_the_gate() -> None:
@@ -237,7 +220,7 @@ def test_a_settled_output_is_saved_after_more_blocks_than_the_window() -> None:
 
 
 def test_a_dead_output_is_not_saved() -> None:
-    bench = Bench(delta=1.0)
+    bench = Bench(delta=1.0, tau=250)
     tiny = 0.3 * SLOW[:250, None]  # variance .045, below .1
     assert saving(bench, limit=100, y=tiny) == 0
     assert not ready_to_save(bench.agent, bench.rules)

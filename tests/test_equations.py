@@ -19,14 +19,16 @@ PAGES = {
 
 EQUATIONS = [number for numbers in PAGES.values() for number in numbers]
 LINE = re.compile(r"^\s*Equation:(.*)$", re.MULTILINE)
-ROW = re.compile(r"^\| \((P?\d+)\) \|.*?\| `([\w/]+\.py)` `(\w+)` \|$", re.MULTILINE)
+ROW = re.compile(r"^\| \((P?\d+)\) \|.*?\| `([\w/]+\.(?:py|c))` `(\w+)` \|$", re.MULTILINE)
+IN_C = re.compile(r"/\*((?:(?!\*/).)*)\*/\n[^\n;{(]*?(\w+)\(", re.DOTALL)
+"""A comment in C, and the function that it stands before."""
 
 Place = tuple[str, str]
 
 
 @cache
 def stated() -> list[tuple[str, Place]]:
-    """Every `Equation:` line of a docstring: what it says, and of which function."""
+    """Every `Equation:` line of a docstring or comment: what it says, and of which function."""
     return list(_stated())
 
 
@@ -38,6 +40,10 @@ def _stated() -> Iterator[tuple[str, Place]]:
                     name = getattr(node, "name", "")
                     for text in LINE.findall(ast.get_docstring(node) or ""):
                         yield text.strip(), (file.relative_to(ROOT).as_posix(), name)
+    for file in sorted((ROOT / "cdmisfa/kernels").glob("*.c")):
+        for comment, name in IN_C.findall(file.read_text("utf-8")):
+            for text in LINE.findall(comment.replace("\n *", "\n")):
+                yield text.strip(), (file.relative_to(ROOT).as_posix(), name)
 
 
 def stated_by_number() -> dict[str, set[Place]]:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from cdmisfa.agents.exploration import choose, decay, other_stream
+from reference.agent import choose, decay, other_stream
 
 unit = st.floats(0, 1, exclude_max=True)
 

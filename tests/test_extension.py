@@ -20,11 +20,12 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
 from cdmisfa.experiments.trial import has_compiled_trials, run_trial
 from cdmisfa.features.feature import Feature
-from cdmisfa.features.incsfa.abstraction import MANY_INPUTS
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
 
 STREAMS = ("x1", "x2", "x3")
+MANY_INPUTS = 200
+"""From so many on IncSFA learns on the Gram matrix."""
 
 
 def cubic(frames: NDArray[Any]) -> NDArray[np.float64]:

@@ -10,14 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference.agent import BAND
 
-from cdmisfa.agents.gate import BAND, CONSTANT
+from cdmisfa import kernels
+from cdmisfa.agents.gate import CONSTANT
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import overwrite
 from cdmisfa.core.signals import BlockSignals, SignalsHash, values
+from cdmisfa.features.incsfa import IncSFA
 from recorder.world.oscillatory import OscillatorySource, one_period
 
 CONFIG = build(LearnerConfig, "learner", load_preset("oscillatory")["learner"])
@@ -294,28 +297,24 @@ def test_a_constant_block_carries_nothing() -> None:
         assert not learner.phi.any()
 
 
-def gaps_seen(learner: CuriousLearner, blocks: list[Block]) -> list[bool | None]:
-    """For each block, whether the abstraction was told of a gap; None where it was not fed."""
-    told: list[bool | None] = []
-    update = learner.abstraction.update
+class InPython(IncSFA):
+    """The same abstraction as a feature of somebody else; it notes when it is told of a gap."""
 
-    def spy(frames: np.ndarray, gap: bool) -> np.ndarray:
-        told[-1] = bool(gap)
-        return update(frames, gap)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._own, self.kernel = self.kernel, None
+        self.gaps: list[bool] = []
 
-    learner.abstraction.update = spy  # type: ignore[method-assign]
-    for one in blocks:
-        told.append(None)
-        learner.step(one)
-    return told
+    def update(self, frames: np.ndarray, gap: bool = False) -> np.ndarray:
+        self.gaps.append(gap)
+        return kernels.incsfa_update(self._own, frames, gap)
 
 
-def test_derivatives_never_reach_across_a_gap() -> None:
-    spec = SourceSpec(("only",), (2,), "float64")
+def blocks_with_gaps() -> list[Block]:
     rng = np.random.default_rng(1)
-    noise = [freeze(rng.standard_normal((100, 2))) for _ in range(6)]
+    noise = [freeze(rng.standard_normal((100, 2))) for _ in range(5)]
     still = freeze(np.ones((100, 2)))
-    blocks = [
+    return [
         block(0, 0, noise[0]),
         block(0, 100, noise[1]),
         block(0, 200, still),  # not learned from
@@ -323,19 +322,51 @@ def test_derivatives_never_reach_across_a_gap() -> None:
         block(0, 400, noise[3]),
         block(0, 900, noise[4]),  # frames are missing before it
     ]
-    told = gaps_seen(CuriousLearner(CONFIG, spec, 0), blocks)
-    assert told == [True, False, None, True, False, True]
+
+
+def test_derivatives_never_reach_across_a_gap() -> None:
+    spec = SourceSpec(("only",), (2,), "float64")
+    learner = CuriousLearner(CONFIG, spec, 0, feature=InPython)
+    novel = [learner.step(one).novel for one in blocks_with_gaps()]
+    assert novel == [True, True, False, True, True, True]
+    assert learner.abstraction.gaps == [True, False, True, False, True]
 
 
 def test_a_switch_of_stream_is_a_gap() -> None:
     source = OscillatorySource()
-    learner = CuriousLearner(CONFIG, source.spec, 0)
-    told, streams = [], []
+    learner = CuriousLearner(CONFIG, source.spec, 0, feature=InPython)
+    streams = []
     for _ in range(30):
         streams.append(learner.stream)
-        told += gaps_seen(learner, [source.take(learner.stream, 100)])
+        learner.step(source.take(learner.stream, 100))
+    told = learner.abstraction.gaps
     assert told == [True] + [a != b for a, b in itertools.pairwise(streams)]
     assert set(told) == {True, False}
+
+
+@pytest.mark.parametrize("algorithm", ["2.0", "1.0"])
+def test_a_feature_that_learns_in_python_gives_the_same_bits(algorithm: str) -> None:
+    config = dataclasses.replace(CONFIG, algorithm=algorithm, delta=0.01, roc_error=0.3)
+    hashes = []
+    for feature in (IncSFA, InPython):
+        source, digest = OscillatorySource(), SignalsHash()
+        learner = CuriousLearner(config, source.spec, 3, feature=feature)
+        for _ in range(600):
+            digest.add(learner.step(source.take(learner.stream, learner.tau)))
+        assert learner.modules
+        alone = CuriousLearner(config, SourceSpec(("only",), (2,), "float64"), 0, feature=feature)
+        for one in blocks_with_gaps():
+            digest.add(alone.step(one))
+        hashes.append(digest.hexdigest())
+    assert hashes[0] == hashes[1]
+
+
+def test_a_feature_of_another_shape_is_refused() -> None:
+    def feature(config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> IncSFA:
+        return IncSFA(config, n_inputs - 1, rng)
+
+    with pytest.raises(UsageError, match=r"phi of \(1, 4\): it must be \(1, 5\)"):
+        CuriousLearner(CONFIG, SPEC, 0, feature=feature)
 
 
 def test_pixels_count_one_255th() -> None:

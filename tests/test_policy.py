@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernel_agent import STAY, KernelAgent
+from reference.agent import value_sum
 
-from cdmisfa.agents.policy import action_values, policy_iteration, value_sum
+from cdmisfa.agents.gate import NOVEL
+from cdmisfa.core.config import LearnerConfig
 
 ACTIONS = 2
 
@@ -37,12 +40,15 @@ def dense_q(r: np.ndarray, policy: np.ndarray, gamma: float) -> np.ndarray:
 def solve(
     stay: np.ndarray, switch: np.ndarray, count: int, gamma: float, start: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    n = len(stay)
-    policy = np.zeros(n, np.int64) if start is None else start.copy()
-    Q = np.full((n, ACTIONS), np.nan)
-    policy_iteration(stay, switch, gamma, policy)
-    action_values(stay, switch, count, gamma, policy, Q)
-    return policy, Q
+    """Policy and Q after a reward of 0 that makes so many of them, (n,) and (n, 2)."""
+    known = KernelAgent(LearnerConfig(gamma=gamma, sigma=0.0, warm_up=0), len(stay))
+    known.agent.stay_sum[:], known.agent.switch_sum[:] = stay, switch
+    known.agent.policy[:] = 0 if start is None else start
+    memory = known.agent.memory
+    memory["rewards"], memory["novel_blocks"], memory["last_stream"] = count - 1, 1, 0
+    memory["xi"] = 0.5
+    assert known.think(0.5, NOVEL, STAY, np.zeros((100, 1)))["reward"] == 0.0
+    return known.agent.policy, known.values()
 
 
 @st.composite
@@ -95,9 +101,9 @@ def test_where_it_starts_does_not_matter(
 
 
 def test_before_the_first_reward_nothing_has_a_value() -> None:
-    Q = np.full((3, 2), np.nan)
-    action_values(np.zeros(3), np.zeros(3), 0.0, 0.99, np.array([0, 1, 1]), Q)
-    assert not Q.any()
+    known = KernelAgent(LearnerConfig(gamma=0.99))
+    known.agent.policy[:] = [0, 1, 1]
+    assert not known.values().any()
 
 
 def test_one_stream_stays() -> None:

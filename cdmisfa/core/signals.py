@@ -4,7 +4,7 @@ Every consumer walks over its fields: the schema of run.mcap, Rerun's entities a
 layout, the columns of an export, the table of signals in the docs. Adding a signal is
 raising `SCHEMA_VERSION` and adding a field whose `since` is the new version. Its value is
 set in `agents/learner.py` and `agents/progress/learner.py` or, if it is a scalar of the paper's
-iteration, is a field of `OUTCOME` (`agents/agent.py`) set in `agents/iteration.py`.
+iteration, is a field of `OUTCOME` (`agents/agent.py`) set in `kernels/agent.c`.
 """
 
 from __future__ import annotations

@@ -47,6 +47,8 @@ typedef struct {
   int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
+int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
+int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
 
 /* The agent: S streams, J outputs, M frozen modules; what each field is, agents/agent.py tells. */
 enum { NOVEL = 0, CONSTANT = -1 }; /* what knows a block that no module does */
@@ -101,9 +103,9 @@ typedef struct {
 
 /* What is kept of each iteration of a trial. */
 typedef struct {
-  outcome *outcome;                 /* (N,) */
-  double *eta_dot, *R, *Q;          /* (N, J), (N, S) of the stay entries, (N, S, 2) */
-  int64_t *policy;                  /* (N, S) */
+  outcome *outcome;        /* (N,) */
+  double *eta_dot, *R, *Q; /* (N, J), (N, S) of the stay entries, (N, S, 2) */
+  int64_t *policy;         /* (N, S) */
 } curves;
 
 /* gate.c */
@@ -123,8 +125,6 @@ int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const
                    const curves *kept);
 void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
               const double *y_frozen, double *told);
-int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
-int incsfa_by_gram(const incsfa *state, const frames *x, int gap, double *xi);
 
 /* frames.c: C channels of a log, with M marks in each of their messages */
 typedef struct {

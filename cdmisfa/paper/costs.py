@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from cdmisfa import kernels
 from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
 from cdmisfa.agents.gate import Frozen
@@ -37,6 +38,7 @@ OWN = {
     "2.0": ("delta", "gate_window"),
 }
 """Keys of the configuration that only one of the two uses."""
+
 
 def plan(request: Request) -> list[dict[str, Any]]:
     """Ten rounds of each world; in a round both are timed in turn, in one process."""
@@ -89,9 +91,9 @@ def _work(algorithm: str, streams: int, modules: int) -> Callable[[int], float]:
     outputs = [kernels.pointer("y", array, array.shape) for array in (y, y_frozen, told)]
 
     def repeat(blocks: int, count: int = modules) -> None:
-        clusters = (np.repeat(array[None], count, axis=0) for array in (agent.centres, agent.counts))
-        band = np.zeros((count, 1))
-        frozen = Frozen(np.zeros((count, 1)), np.zeros(count), band, band, *clusters).struct
+        clusters = [np.repeat(a[None], count, axis=0) for a in (agent.centres, agent.counts)]
+        none = np.zeros((count, 1))
+        frozen = Frozen(none, np.zeros(count), none, none, *clusters).struct
         kernels.lib.own_work(known.pointer, frozen.pointer, blocks, PHASES, *outputs)
 
     repeat(PHASES, 0)  # finds the clusters

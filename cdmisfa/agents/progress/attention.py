@@ -111,7 +111,7 @@ def _gamma_progress(s: Situation) -> Float:
 
 
 def fading(base: float, n: int) -> Float:
-    """n >= 1 weights, from base^(n-1) to 1."""
+    """N >= 1 weights, from base^(n-1) to 1."""
     return np.asarray(np.multiply.accumulate(np.append(1.0, np.full(n - 1, base)))[::-1])
 
 

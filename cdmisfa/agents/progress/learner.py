@@ -346,7 +346,8 @@ class ProgressLearner:
     def _freeze(self) -> None:
         """Stack the modules' rows, so that one pass over a block serves all of them."""
         self._phi = np.array([m.phi for m in self.modules]).reshape(-1, self._n_inputs)
-        self._offset = np.array([kernels.mean_output(m.phi, m.mean) for m in self.modules]).reshape(-1)
+        offsets = [kernels.mean_output(m.phi, m.mean) for m in self.modules]
+        self._offset = np.array(offsets).reshape(-1)
 
     def _choose(self, draws: Float) -> tuple[Float, bool]:
         """Choose the next stream; what each promises, and whether one was drawn at random."""
