@@ -39,9 +39,7 @@ def _source(run: Path) -> tuple[str, ...]:
     return () if _number(run) == 1 else (str(SAMPLE),)
 
 
-def test_runs_say_with_which_arithmetic_they_were_learned(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
+def test_runs_say_with_which_arithmetic_they_were_learned(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     for name, words in LEARN.items():
         run = tmp_path / str(name)
         assert cdmisfa(*words, "--no-rerun", "-o", run).code == 0
@@ -59,9 +57,9 @@ def test_check_compares_up_to_rounding_and_says_why(cdmisfa: Cdmisfa, former: Pa
     told = cdmisfa("check", former, *words, "--json").json
     assert (told["identical"], told["same_up_to_rounding"]) == (False, True)
     log = former / "run.mcap"
-    log.write_bytes(log.read_bytes().replace(b'"nu": 0.05', b'"nu": 0.04').replace(
-        b'"nu": 0.01', b'"nu": 0.02'
-    ))
+    log.write_bytes(
+        log.read_bytes().replace(b'"nu": 0.05', b'"nu": 0.04').replace(b'"nu": 0.01', b'"nu": 0.02')
+    )
     differs = check_run(former, _source(former))
     assert differs.difference is not None
     assert str(differs).endswith(why)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -344,8 +341,9 @@ def test_doctor_says_how_to_get_each_extra(
 
 
 def test_doctor_says_which_kernels_run(cdmisfa: Cdmisfa) -> None:
-    details = {check["what"]: check["detail"] for check in cdmisfa("doctor", "--json").json["checks"]}
-    assert details["kernels"] == ("for AVX2 and FMA" if WIDE else "for any processor: the same bits, slower")
+    checks = cdmisfa("doctor", "--json").json["checks"]
+    detail = next(check["detail"] for check in checks if check["what"] == "kernels")
+    assert detail.startswith("for AVX2 and FMA" if WIDE else "for any processor")
 
 
 @pytest.mark.parametrize("form", ["images", "mp4", "csv"])

@@ -20,7 +20,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS, values
 from cdmisfa.features.feature import Feature
-from cdmisfa.features.incsfa.abstraction import IncSFA
+from cdmisfa.features.incsfa import IncSFA
 from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
 from recorder.cameras.camera import Camera
 from recorder.cameras.words import CAMERAS

@@ -14,11 +14,12 @@ from cdmisfa.core.blocks import Block, SourceSpec, as_frames
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion, expand, quadratic
-from cdmisfa.features.incsfa.abstraction import MANY_INPUTS, IncSFA
+from cdmisfa.features.incsfa import IncSFA
 from cdmisfa.features.projection import project
 from cdmisfa.features.sfa import batch_sfa
+from cdmisfa.kernels import lib
 
-SMALL, LARGE = 5, MANY_INPUTS + 50
+SMALL, LARGE = 5, lib.MANY_INPUTS + 50
 CONFIG = LearnerConfig(components=3)
 TYPES = ("float64", "uint8", "float32", "int8", "bool", "int64", "complex128", ">f8", "U3", "O")
 

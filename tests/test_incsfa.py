@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from both_modules import assert_same_bits, both_modules
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.incsfa import PlainIncSFA
@@ -11,8 +10,8 @@ from reference.incsfa import PlainIncSFA
 from cdmisfa import kernels
 from cdmisfa.core.blocks import PIXEL, freeze
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.core.expansion import quadratic
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.expansion import quadratic
 from cdmisfa.features.incsfa import IncSFA, State, new_state
 from cdmisfa.features.projection import project
 from cdmisfa.features.sfa import batch_sfa, slowness

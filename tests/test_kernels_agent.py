@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from both_modules import assert_same_bits, both_modules
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_agent import KernelAgent
@@ -196,7 +197,6 @@ def digest(config: LearnerConfig, spec: SourceSpec, frames: np.ndarray | None = 
     return signals.hexdigest()
 
 
-@pytest.mark.skipif(not kernels.WIDE, reason="this processor has no AVX2 and FMA")
 @pytest.mark.parametrize(
     "config",
     [
@@ -205,31 +205,35 @@ def digest(config: LearnerConfig, spec: SourceSpec, frames: np.ndarray | None = 
         LearnerConfig(expansion="none", tau=17, outputs=3, components=4, delta=1.0),
     ],
 )
-def test_both_sets_of_instructions_give_the_same_bits(
-    config: LearnerConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learners_have_the_same_bits_on_every_processor(config: LearnerConfig) -> None:
     spec, frames = OscillatorySource().spec, None
     if config.expansion == "none":
         rng = np.random.default_rng(0)
         frames = freeze(rng.integers(0, 256, (5, config.tau, 3, 7), dtype=np.uint8))
         spec = SourceSpec(spec.streams, (3, 7), "uint8")
-    wide = digest(config, spec, frames), of_many_streams()
-    monkeypatch.setattr(kernels, "lib", kernels._plain.lib)
-    monkeypatch.setattr(kernels, "ffi", kernels._plain.ffi)
-    monkeypatch.setattr(kernels, "_buffer", kernels._plain.ffi.from_buffer)
-    assert (digest(config, spec, frames), of_many_streams()) == wide
+    found = []
+    for module in both_modules():
+        with module:
+            found.append(digest(config, spec, frames))
+    assert found[0] == found[1]
 
 
-def of_many_streams() -> list[bytes]:
-    """Policies and values of an agent of 300 streams, with special numbers among its outputs."""
-    known, rng = KernelAgent(LearnerConfig(tau=20, warm_up=0), 300), np.random.default_rng(0)
-    told = []
-    for k in range(200):
-        y = rng.standard_normal((20, 1))
-        y[rng.integers(0, 20)] = SPECIAL[k % len(SPECIAL)] if k > 150 else 0.5
-        known.think(rng.random(20), NOVEL, tuple(rng.random(3)), y)
-        told += [known.values().tobytes(), known.agent.policy.tobytes(), known.agent.eta.tobytes()]
-    return told
+def test_many_streams_and_special_numbers_have_the_same_bits_on_every_processor() -> None:
+    found = []
+    for module in both_modules():
+        with module:
+            known, rng = (
+                KernelAgent(LearnerConfig(tau=20, warm_up=0), 300),
+                np.random.default_rng(0),
+            )
+            for k in range(200):
+                y = rng.standard_normal((20, 1))
+                y[rng.integers(0, 20)] = SPECIAL[k % len(SPECIAL)] if k > 150 else 0.5
+                known.think(rng.random(20), NOVEL, tuple(rng.random(3)), y)
+                if k == 150:
+                    finite = known.values(), *copied(known.agent)[1:]
+            found.append((*finite, known.values(), *known.agent[1:]))
+    assert_same_bits(*found)
 
 
 DAMAGES = [("stream", -1), ("stream", 3), ("stream", 2**62), ("last_stream", -2)]

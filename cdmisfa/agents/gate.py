@@ -44,7 +44,8 @@ class Frozen(NamedTuple):
     def struct(self) -> kernels.Struct:
         """The stack as the kernels take it."""
         arrays = {n: kernels.pointer(n, a, a.shape) for n, a in self._asdict().items()}
-        return kernels.Struct("frozen", {"modules": len(self.band_mean)}, arrays)
+        sizes = {"modules": len(self.band_mean), "inputs": self.phi.shape[1]}
+        return kernels.Struct("frozen", sizes, arrays)
 
 
 def stacked(modules: Sequence[Module], agent: Agent, n_inputs: int) -> Frozen:

@@ -68,9 +68,7 @@ def end_at_once(code: int | None = None) -> None:
 def stoppable(
     notice: str = "finishing what is begun; again to stop at once\n",
 ) -> Iterator[Stop]:
-    """Let the body end its step at the first signal, and say so; the second one interrupts it.
-
-    """
+    """Let the body end its step at the first signal, and say so; the second one interrupts it."""
     stop, outer = Stop(), {int(number): signal.getsignal(number) for number in SIGNALS}
 
     def ask(number: int, frame: FrameType | None) -> None:

@@ -202,13 +202,16 @@ def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
     """An abstraction as the kernels take it: the arrays of its `State`, and its constants."""
     (K, size), J = state.v.shape, len(state.w)
     shapes = {
-        "mean": (size,), "v": (K, size), "d": (K,), "gram": (K, K), "w": (J, K), "z_prev": (K,),
-        "phi": (J, size), "counts": (3,),
+        "mean": (size,),
+        "v": (K, size),
+        "d": (K,),
+        "gram": (K, K),
+        "w": (J, K),
+        "z_prev": (K,),
+        "phi": (J, size),
     }
-    arrays = {
-        name: pointer(name, getattr(state, name), shape, INT64 if name == "counts" else FLOAT64)
-        for name, shape in shapes.items()
-    }
+    arrays = {name: pointer(name, getattr(state, name), shape) for name, shape in shapes.items()}
+    arrays["counts"] = pointer("counts", state.counts, (3,), INT64)
     numbers = {"inputs": size, "components": K, "outputs": J, "nu": nu, "window": mean_window}
     return Struct("incsfa", numbers, arrays)
 
@@ -220,7 +223,8 @@ def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update
     """
     x = frames_of(frames, abstraction.pointer.inputs)
     xi = np.empty(x.pointer.n)
-    code = getattr(lib, f"incsfa_{by}")(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
+    learn = getattr(lib, f"incsfa_{by}")
+    code = learn(abstraction.pointer, x.pointer, bool(gap), _buffer("double[]", xi))
     check(code, "the abstraction")
     return xi
 
@@ -234,7 +238,13 @@ def instantaneous_slowness(y: Any) -> Float:
 
 
 def iterate(
-    agent: Struct, frozen: Struct, feature: Struct, shown: Struct, x: Struct, t: int, uniforms: Float
+    agent: Struct,
+    frozen: Struct,
+    feature: Struct,
+    shown: Struct,
+    x: Struct,
+    t: int,
+    uniforms: Float,
 ) -> tuple[Float, Float, Float, Float]:
     """One iteration of a curious agent whose abstraction is `feature`; see `CuriousLearner.step`.
 
@@ -251,7 +261,8 @@ def iterate(
         Outputs (n, J), NaN where the block is not novel; those of the frozen modules (M, n, J),
         their slowness (M, J) and clustering error (M,).
     """
-    n, J = _block(agent, shown, x)
+    n, J = _block(agent, frozen, shown, x)
+    _fits(feature, agent, x)
     y, told = np.empty((n, J)), _told(agent, frozen)
     into = [_buffer("double[]", array) for array in (y, *told)]
     draws = readable("uniforms", uniforms, (3,))
@@ -266,7 +277,7 @@ def recognise(
     agent: Struct, frozen: Struct, shown: Struct, x: Struct
 ) -> tuple[Float, Float, Float]:
     """The first part of `iterate`: the agent's outcome says what knows the block."""
-    _block(agent, shown, x)
+    _block(agent, frozen, shown, x)
     told = _told(agent, frozen)
     into = [_buffer("double[]", array) for array in told]
     code = lib.recognise(agent.pointer, frozen.pointer, shown.pointer, x.pointer, *into)
@@ -293,9 +304,11 @@ def iterations(
     kept: Struct | None,
 ) -> int:
     """Iterate on streams that repeat until something is to be done; see `CuriousLearner.repeat`."""
-    n, rows = len(uniforms), shown.pointer.n
-    if x.pointer.n != rows or rows % agent.pointer.streams:
+    n, rows, streams = len(uniforms), shown.pointer.n, agent.pointer.streams
+    if x.pointer.n != rows or rows % streams or rows <= streams * agent.pointer.tau:
         raise UsageError(f"{rows} frames shown and {x.pointer.n} expanded: give as many a stream")
+    _fits(feature, agent, x)
+    _fits(frozen, None, x)
     draws, curves = readable("uniforms", uniforms, (n, 3)), kept.pointer if kept else ffi.NULL
     done: int = lib.iterations(
         *(agent.pointer, frozen.pointer, feature.pointer, shown.pointer, x.pointer),
@@ -312,11 +325,19 @@ def action_values(agent: Struct) -> Float:
     return Q
 
 
-def _block(agent: Struct, shown: Struct, x: Struct) -> tuple[int, int]:
+def _block(agent: Struct, frozen: Struct, shown: Struct, x: Struct) -> tuple[int, int]:
     n = agent.pointer.tau
     if not n == shown.pointer.n == x.pointer.n:
         raise UsageError(f"{x.pointer.n} frames after expansion of {shown.pointer.n}: give {n}")
+    _fits(frozen, None, x)
     return n, agent.pointer.outputs
+
+
+def _fits(weights: Struct, agent: Struct | None, x: Struct) -> None:
+    if weights.pointer.inputs != x.pointer.size:
+        raise UsageError(f"frames of {x.pointer.size} values for {weights.pointer.inputs} inputs")
+    if agent is not None and weights.pointer.outputs != agent.pointer.outputs:
+        raise UsageError(f"{weights.pointer.outputs} outputs for {agent.pointer.outputs}")
 
 
 def _told(agent: Struct, frozen: Struct) -> tuple[Float, Float, Float]:

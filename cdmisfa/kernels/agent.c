@@ -314,7 +314,8 @@ int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const
                    const frames *x, const double *uniforms, int64_t n, double swap_below,
                    const curves *kept) {
   memory *m = a->memory;
-  int64_t M = f->modules, J = a->outputs, block = a->tau * J, done = 0, rows = shown->n / a->streams;
+  int64_t M = f->modules, J = a->outputs, block = a->tau * J;
+  int64_t done = 0, rows = shown->n / a->streams;
   double *y = malloc((size_t)((M + 1) * (block + J + 1)) * sizeof *y);
   if (!y) return NO_MEMORY;
   double *y_frozen = y + block, *eta_inst = y_frozen + M * block, *error = eta_inst + M * J;

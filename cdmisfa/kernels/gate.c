@@ -1,4 +1,4 @@
-/* The gate: whether a frozen module knows a block, by slowness or, for CD-MISFA 1.0, by clusters. */
+/* The gate: whether a frozen module knows a block, by slowness or (CD-MISFA 1.0) by clusters. */
 
 static const double TWO_PI = 6.28318530717958647693;
 static const double CONSTANT_VARIANCE = 1e-12; /* up to which an input counts as constant */

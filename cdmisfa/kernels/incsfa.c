@@ -13,9 +13,6 @@ static const double RANK_TOLERANCE = 1e-10;
 /* Variance below which a component is rounding noise whatever the others are. */
 static const double LEAST_VARIANCE = 1e-30;
 
-/* From so many inputs on the Gram kernel is faster, hence taken; nothing else decides. */
-static const int64_t MANY_INPUTS = 200;
-
 /* Rate of the running mean at the n-th frame (from 1): 1/n, then 2/(window + 1). */
 INLINE double mean_rate(int64_t n, double window) {
   return larger(2.0 / (window + 1.0), 1.0 / (double)n);
@@ -114,7 +111,8 @@ INLINE void features_in_vectors(const incsfa *s, double *scale, double *m) {
  * `rows` (J, stride) is scratch. */
 INLINE double slow_features(const incsfa *s, const double *m, int64_t start, int64_t width,
                             double *rows, int64_t stride) {
-  multiply(s->outputs, s->components, width, m, s->components, s->v + start, s->inputs, rows, stride);
+  multiply(s->outputs, s->components, width, m, s->components, s->v + start, s->inputs, rows,
+           stride);
   double square = 0;
   for (int64_t j = 0; j < s->outputs; j++) {
     double *phi = s->phi + j * s->inputs + start;

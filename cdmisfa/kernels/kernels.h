@@ -6,7 +6,7 @@
  */
 enum {
   NO_MEMORY = -1, /* there is not enough memory for what is in between */
-  NOT_A_STATE = -2, /* a number in the state, which is an index, lies outside of what it points to */
+  NOT_A_STATE = -2, /* an index in the state lies outside of what it points to */
   OUT_OF_ORDER = -3 /* a chunk is not as its index says, or as its messages are laid out */
 };
 
@@ -36,6 +36,7 @@ int outputs(int64_t rows, const double *phi, const double *offset, const frames 
 void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean, double *offset);
 
 /* incsfa.c: I inputs, K components, J outputs */
+enum { MANY_INPUTS = 200 }; /* from so many on the Gram matrix is faster; nothing else decides */
 typedef struct {
   int64_t inputs, components, outputs;
   double nu, window;  /* learning rate of MCA, frames of the running mean */
@@ -44,7 +45,7 @@ typedef struct {
   double *gram;       /* (K, K) inner products of v; kept for many inputs only */
   double *w, *z_prev; /* (J, K) MCA rows, (K,) whitened frame before */
   double *phi;        /* (J, I) slow features */
-  int64_t *counts;    /* (3,) frames seen; 1 where the last one followed a gap; since `gram` is new */
+  int64_t *counts;    /* (3,) frames seen; 1 after a gap; frames since `gram` is new */
 } incsfa;
 int incsfa_update(const incsfa *state, const frames *x, int gap, double *xi);
 int incsfa_by_frame(const incsfa *state, const frames *x, int gap, double *xi);
@@ -95,7 +96,7 @@ typedef struct {
 } agent;
 
 typedef struct {
-  int64_t modules;
+  int64_t modules, inputs;
   double *phi, *offset;        /* (M J, I), (M J,) */
   double *band_mean, *band_sd; /* (M, J) */
   double *centres, *counts;    /* (M, S, places, tau, J), (M, S, places) */

@@ -14,10 +14,11 @@ static void add_products_once(const frames *x, int64_t first, int64_t count, con
     add_products(1, count, phi + start, size, x->values + at, size, width, e, 0);
     return;
   }
+  const uint8_t *pixels = x->pixels + at;
   for (; t + 8 <= count; t += 8)
-    add_products_of(1, 8, phi + start, size, NULL, x->pixels + at + t * size, size, width, e + t, 0);
+    add_products_of(1, 8, phi + start, size, NULL, pixels + t * size, size, width, e + t, 0);
   for (; t < count; t++)
-    add_products_of(1, 1, phi + start, size, NULL, x->pixels + at + t * size, size, width, e + t, 0);
+    add_products_of(1, 1, phi + start, size, NULL, pixels + t * size, size, width, e + t, 0);
 }
 
 /* y = phi x - offset.
@@ -53,6 +54,7 @@ int outputs(int64_t rows, const double *phi, const double *offset, const frames 
 }
 
 /* What phi gives out on the mean input: the offset of a centred projection. */
-void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean, double *offset) {
+void mean_output(int64_t rows, int64_t size, const double *phi, const double *mean,
+                 double *offset) {
   for (int64_t r = 0; r < rows; r++) offset[r] = dot(phi + r * size, mean, size);
 }

@@ -230,7 +230,8 @@ static void solve_slowest(const recursive *sfa, int64_t rank, double *spare) {
  */
 static double align_outputs(const recursive *sfa, int64_t k, const double *before, double *spare) {
   int64_t n = sfa->outputs, size = sfa->size;
-  double *alike = take_zeros(&spare, n * n), *squares = take_zeros(&spare, n * n), *old = take_zeros(&spare, k);
+  double *alike = take_zeros(&spare, n * n), *squares = take_zeros(&spare, n * n);
+  double *old = take_zeros(&spare, k);
   double *values = take_zeros(&spare, n), *vectors = take_zeros(&spare, n * n), total = 0;
   for (int64_t o = 0; o < n; o++) {
     for (int64_t j = 0; j < k; j++) old[j] = before[o * k + j] * sfa->variance[j];

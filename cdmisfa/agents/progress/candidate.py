@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.core.learning import overwrite
-from cdmisfa.features.projection import project
 from cdmisfa.features.recursive import RecursiveSFA, State
 from cdmisfa.features.slowness import slowness, window_rate
 

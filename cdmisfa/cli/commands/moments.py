@@ -11,7 +11,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.learn import Reporter, outcome_line, show
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.progress import bar, compiling_said
+from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -212,7 +212,7 @@ def fork_command(
 
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
     try:
-        with bar("learning", "blocks") as shown, compiling_said(shown), stoppable() as stop:
+        with bar("learning", "blocks") as shown, stoppable() as stop:
             reporter = Reporter(shown, max_iterations)
             result = fork_run(
                 run,
