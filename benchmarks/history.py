@@ -48,7 +48,7 @@ def _logs(column: str, logs: str) -> Kept:
 
 PANELS: Mapping[str, Sequence[Kept]] = {
     "Gram kernel, times faster": (
-        *(_kernel(K, "vs plain numba") for K in (16, 32, 64)),
+        *(_kernel(K, "vs plain numpy") for K in (16, 32, 64)),
         Kept("still pixels, K = 32", "kernels", {"K": 32, "J": 5}, "gain"),
     ),
     "Iteration, preset icub, times that without a log": (
@@ -67,9 +67,9 @@ PANELS: Mapping[str, Sequence[Kept]] = {
         Kept("256 inputs, vs numpy", "recursive", {"inputs": 256}, "vs plain numpy"),
         Kept("6144 inputs, vs numpy", "recursive", {"inputs": 6144}, "vs plain numpy"),
     ),
-    "Starting, times the import of numba": (
+    "Starting, times the import of numpy": (
         *(
-            Kept(words, "startup", {"warm: process": words}, "times the import of numba")
+            Kept(words, "startup", {"process": words}, "times the import of numpy")
             for words in ("learn oscillatory", "learn oscillatory --no-rerun")
         ),
     ),
@@ -136,6 +136,24 @@ def add(commit: str, date: str, measured: Mapping[str, float]) -> Path:
     return path
 
 
+def curves(commits: Sequence[Mapping[str, Any]], panel: str) -> dict[str, list[tuple[int, float]]]:
+    """What a panel shows: by name the places of commits and their ratios.
+
+    Those that are no longer measured come after those that are.
+    """
+    names = [f"{panel}: {kept.name}" for kept in PANELS[panel]]
+    names += sorted({n for told in commits for n in told["ratios"] if n.startswith(f"{panel}: ")})
+    found = {
+        name.removeprefix(f"{panel}: "): [
+            (place, told["ratios"][name])
+            for place, told in enumerate(commits)
+            if name in told["ratios"]
+        ]
+        for name in names
+    }
+    return {name: measured for name, measured in found.items() if measured}
+
+
 def _git(root: Path, *words: str) -> str:
     done = subprocess.run(
         ["git", "-C", str(root), *words], capture_output=True, text=True, check=False
@@ -156,12 +174,9 @@ def draw(picture: Path) -> bool:
         return False
     figure = Figure(figsize=(11.0, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, (panel, all_kept) in zip(figure.subplots(3, 2).flat, PANELS.items(), strict=True):
-        for kept in all_kept:
-            values = [told["ratios"].get(f"{panel}: {kept.name}") for told in commits]
-            measured = [(i, value) for i, value in enumerate(values) if value is not None]
-            if measured:
-                axes.plot(*zip(*measured, strict=True), "o-", ms=3, lw=1, label=kept.name)
+    for axes, panel in zip(figure.subplots(3, 2).flat, PANELS, strict=True):
+        for name, measured in curves(commits, panel).items():
+            axes.plot(*zip(*measured, strict=True), "o-", ms=3, lw=1, label=name)
         axes.set_title(panel, fontsize=9)
         axes.set_xlim(-0.5, len(commits) - 0.5)
         axes.set_ylim(0, 1.15 * axes.get_ylim()[1])

@@ -97,7 +97,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     """Measure, and write results/live_streams.json."""
     del full
     with tempfile.TemporaryDirectory() as folder:
-        watch(Path(folder) / "first", 1)  # imports and compiles what it needs
+        watch(Path(folder) / "first", 1)  # imports what it needs
         row = watch(Path(folder) / "recording", 8 if quick else 60)
     header = ["streams", "seconds", "cores busy", "cores of the sender", *_LOST]
     save(

@@ -116,15 +116,15 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "Long recordings",
         f"One view of {SHAPE[0]} x {SHAPE[1]} frames, uncompressed, each kind of work in a "
         "process of its own, whose peak counts Python and its libraries, too. Seconds and bytes "
-        "read are of a second recording, once all is imported and compiled. What is read is "
-        "checked against its checksums.",
+        "read are of a second recording, once all is imported. What is read is checked against "
+        "its checksums.",
         [(header, list(rows.values()))],
     )
 
 
 def _one(work: str, path: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        WORK[work](write_long(Path(folder), MEGABYTE))  # imports and compiles what it needs
+        WORK[work](write_long(Path(folder), MEGABYTE))  # imports what it needs
     bytes_before, before = bytes_read(), time.perf_counter()
     WORK[work](path)
     seconds, read = time.perf_counter() - before, bytes_read() - bytes_before

@@ -96,5 +96,5 @@ def main(*, quick: bool = False, full: bool = False) -> None:
 
 if __name__ == "__main__":
     folder = Path(sys.argv[2])
-    record_and_learn(2, folder / "warm")  # imports and compiles what it needs
+    record_and_learn(2, folder / "warm")  # imports what it needs
     print(json.dumps(record_and_learn(int(sys.argv[1]), folder / "measured")))

@@ -111,7 +111,7 @@ def share(out: Path) -> tuple[int, float]:
 def moments(out: Path, iterations: int) -> list[float]:
     """Seconds of CPU to go to each of some moments, the least of three times."""
     chosen = np.random.default_rng(0).integers(0, iterations, MOMENTS).tolist()
-    learner_after(out, iterations - 1)  # loads what is compiled
+    learner_after(out, iterations - 1)  # imports what it needs
     return [min(_seconds(out, at) for _ in range(3)) for at in chosen]
 
 
@@ -131,7 +131,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
                 case: learning(word, Path(folder) / name / case, keyframes, frames)
                 for case, keyframes in CASES.items()
             }
-            iterations = {case: call() for case, call in work.items()}  # all is compiled now
+            iterations = {case: call() for case, call in work.items()}  # all is imported now
             rounds = [
                 {c: timed(call) for c, call in work.items()} for _ in range(1 if quick else 5)
             ]

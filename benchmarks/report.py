@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
+from cdmisfa import kernels
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.experiments.documents import markdown
 
@@ -57,7 +57,7 @@ def ratio(slow: Sequence[float], fast: Sequence[float]) -> float:
 
 
 def platform_facts() -> dict[str, Any]:
-    """What the numbers depend on: CPU and versions."""
+    """What the numbers depend on: CPU, versions, and the instructions that the kernels use."""
     cpu = platform.processor()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -67,7 +67,7 @@ def platform_facts() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "numba": numba.__version__,
+        "kernels for": "AVX2" if kernels.WIDE else f"any {platform.machine()}",
     }
 
 

@@ -27,14 +27,14 @@ def agent_steps(n: int, blocks: int) -> Callable[[], int]:
     """A call of some iterations of an agent of n streams whose every block is novel."""
     config = LearnerConfig(outputs=1, tau=3)
     rng, out = np.random.default_rng(0), np.zeros(1, OUTCOME)
-    agent = new_agent(config, n, 0)
-    known = as_struct(agent, rules(config, n), out)
-    y, uniforms, xi = rng.standard_normal((3, 1)), rng.random((997, 3)), rng.random((997, 3))
     out["known_by"] = NOVEL
+    agent = as_struct(new_agent(config, n, 0), rules(config, n), out)
+    y, draws = rng.standard_normal((3, 1)), rng.random((997, 3))
+    xi = 1e-3 * (1 + rng.random((997, 3)))
 
     def call() -> int:
         for b in range(blocks):
-            kernels.think(known, xi[b % 997], y, 3 * b, uniforms[b % 997])
+            kernels.think(agent, xi[b % 997], y, 3 * b, draws[b % 997])
         return blocks
 
     return call
@@ -55,7 +55,7 @@ def learn_frames(frames: int) -> tuple[float, float]:
 def apart(frames: int) -> tuple[float, float]:
     """`learn_frames` in a process of its own, so that the peak is this one's."""
     with contextlib.closing(Workers(1)) as worker:
-        worker.submit(learn_frames, 1000).result()  # compiles
+        worker.submit(learn_frames, 1000).result()  # imports
         return worker.submit(learn_frames, frames).result()
 
 
@@ -120,8 +120,8 @@ def main(*, quick: bool = False, full: bool = False) -> None:
     save(
         "scaling",
         "Scaling",
-        "One iteration of the agent for n streams (every block novel, policy iteration "
-        "included). CPU time a frame and peak memory of a process that learns from the "
+        "One iteration of the agent for n streams, called from Python (every block novel, policy "
+        "iteration included). CPU time a frame and peak memory of a process that learns from the "
         "oscillatory streams in blocks of 100. Trials in processes, by the wall's clock. What a "
         "sweep takes for a trial of the oscillatory streams, from start to end, beyond computing "
         "it: planning all trials reads the preset once.",
