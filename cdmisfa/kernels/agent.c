@@ -15,7 +15,7 @@ static void track_output(const agent *a, int64_t j, const double *y) {
   int64_t blocks = a->memory->novel_blocks;
   double n = (double)a->tau, frames = (double)*a->y_frames + n;
   moments now = moments_of(y + j, a->tau, a->outputs);
-  double square = fma(now.mean, now.mean, now.variance);
+  double square = fused(now.mean, now.mean, now.variance);
   double rate = larger(2 * n / (r->slowness_window + n), 1 / (double)blocks);
   if (rate > 1) rate = 1;
   a->derivative[j] += rate * (now.derivative - a->derivative[j]);

@@ -29,10 +29,10 @@ static double power_of_two(int64_t k) { return from_bits((uint64_t)(k + 1023) <<
 double exp_of(double x) {
   if (!(x >= -745.2)) return x < 0 ? 0.0 : NAN;
   if (x > 709.8) return INFINITY;
-  int64_t halvings = (int64_t)floor(fma(x, 1.0 / LN_2, 0.5));
-  double rest = fma(-(double)halvings, LN_2_LOW, fma(-(double)halvings, LN_2_HIGH, x));
+  int64_t halvings = (int64_t)floor(fused(x, 1.0 / LN_2, 0.5));
+  double rest = fused(-(double)halvings, LN_2_LOW, fused(-(double)halvings, LN_2_HIGH, x));
   double total = 1.0;
-  for (int n = 14; n > 0; n--) total = fma(rest * total, 1.0 / n, 1.0);
+  for (int n = 14; n > 0; n--) total = fused(rest * total, 1.0 / n, 1.0);
   return total * power_of_two(halvings / 2) * power_of_two(halvings - halvings / 2);
 }
 
@@ -54,18 +54,18 @@ double log_of(double x) {
   }
   double ratio = (m - 1) / (m + 1), square = ratio * ratio, total = 0;
   for (int n = 12; n > 0; n--) total = (total + 1.0 / (2 * n + 1)) * square;
-  double small = fma(2 * ratio, total, (double)exponent * LN_2_LOW);
-  return fma((double)exponent, LN_2_HIGH, 2 * ratio + small);
+  double small = fused(2 * ratio, total, (double)exponent * LN_2_LOW);
+  return fused((double)exponent, LN_2_HIGH, 2 * ratio + small);
 }
 
 /* Sine of x + `ahead` quarter turns, by the series of both within an eighth of a turn. */
 static double sine(double x, int ahead) {
-  double turns = floor(fma(x, 1.0 / (HALF_PI[0] + HALF_PI[1]), 0.5));
-  double rest = fma(-turns, HALF_PI[2], fma(-turns, HALF_PI[1], fma(-turns, HALF_PI[0], x)));
+  double turns = floor(fused(x, 1.0 / (HALF_PI[0] + HALF_PI[1]), 0.5));
+  double rest = fused(-turns, HALF_PI[2], fused(-turns, HALF_PI[1], fused(-turns, HALF_PI[0], x)));
   double square = rest * rest, sine = 1, cosine = 1;
   for (int n = 10; n > 0; n--) {
-    sine = fma(-square * sine, 1.0 / ((2 * n) * (2 * n + 1)), 1);
-    cosine = fma(-square * cosine, 1.0 / ((2 * n - 1) * (2 * n)), 1);
+    sine = fused(-square * sine, 1.0 / ((2 * n) * (2 * n + 1)), 1);
+    cosine = fused(-square * cosine, 1.0 / ((2 * n - 1) * (2 * n)), 1);
   }
   int quarter = (int)(turns - 4 * floor(turns / 4)) + ahead;
   double y = quarter % 2 == 0 ? rest * sine : cosine;
@@ -111,7 +111,7 @@ int64_t normals(const uint64_t *words, int64_t n_words, double *out, int64_t n) 
       if (layer > 0) {
         if (used == n_words) return -1;
         double u = (double)(words[used++] >> 11) * power_of_two(-53);
-        double between = fma(height[layer - 1] - height[layer], u, height[layer]);
+        double between = fused(height[layer - 1] - height[layer], u, height[layer]);
         if (between >= exp_of(-0.5 * x * x)) continue;
       } else {
         double beyond, y;

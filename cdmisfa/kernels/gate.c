@@ -39,8 +39,8 @@ INLINE moments moments_by(const double *y, int64_t n, int64_t step) {
   for (; k < n; k++) {
     double change = y[k * step] - y[(k - 1) * step], from = y[k * step] - y[0];
     apart += from;
-    square = fma(from, from, square);
-    derivative = fma(change, change, derivative);
+    square = fused(from, from, square);
+    derivative = fused(change, change, derivative);
   }
   apart /= (double)n;
   return (moments){y[0] + apart, square / (double)n - apart * apart,

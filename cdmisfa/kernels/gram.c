@@ -76,13 +76,13 @@ static void ccipca_coefficients(const incsfa *s, double weight, double energy, d
   for (int64_t i = 0; i < K; i++) {
     double *restrict row = gram + i * K;
     double kept = s->d[i] > floor ? 1.0 - weight : 1.0, g = weight * e[i] / s->d[i];
-    double updated = fma(g, fma(2.0 * kept, e[i], g * energy), kept * kept * row[i]);
-    double projection = fma(g, energy, kept * e[i]), t = projection / updated;
+    double updated = fused(g, fused(2.0 * kept, e[i], g * energy), kept * kept * row[i]);
+    double projection = fused(g, energy, kept * e[i]), t = projection / updated;
     for (int64_t j = i + 1; j < K; j++) {
-      row[j] = fma(g, e[j], kept * row[j]);
-      e[j] = fma(-t, row[j], e[j]);
+      row[j] = fused(g, e[j], kept * row[j]);
+      e[j] = fused(-t, row[j], e[j]);
     }
-    energy = larger(fma(-projection, t, energy), 0);
+    energy = larger(fused(-projection, t, energy), 0);
     row[i] = updated;
     keep[i] = kept, gain[i] = g, take[i] = t;
   }
@@ -91,14 +91,14 @@ static void ccipca_coefficients(const incsfa *s, double weight, double energy, d
     double rest[4] = {0};
     for (int64_t j = first; j < stop; j++)
       for (int64_t i = j + 1; i < stop; i++) {
-        double x = fma(gain[i], rest[j - first], keep[i] * gram[j * K + i]);
-        rest[j - first] = fma(-take[i], x, rest[j - first]);
+        double x = fused(gain[i], rest[j - first], keep[i] * gram[j * K + i]);
+        rest[j - first] = fused(-take[i], x, rest[j - first]);
         gram[j * K + i] = gram[i * K + j] = x;
       }
     for (int64_t i = stop; i < K; i++)
       for (int64_t j = 0; j < 4; j++) {
-        double x = fma(gain[i], rest[j], keep[i] * gram[(first + j) * K + i]);
-        rest[j] = fma(-take[i], x, rest[j]);
+        double x = fused(gain[i], rest[j], keep[i] * gram[(first + j) * K + i]);
+        rest[j] = fused(-take[i], x, rest[j]);
         gram[(first + j) * K + i] = gram[i * K + first + j] = x;
       }
   }
@@ -126,16 +126,16 @@ static double change_of_features(const incsfa *s, const group *w, int64_t first,
     for (int64_t t = last; t >= first; t--) {
       double along = 0;
       for (int64_t k = K - 1; k >= 0; k--) {
-        double x = fma(-w->take[t * K + k], along, change[k]);
-        along = fma(w->gain[t * K + k], x, along);
+        double x = fused(-w->take[t * K + k], along, change[k]);
+        along = fused(w->gain[t * K + k], x, along);
         change[k] = w->keep[t * K + k] * x;
       }
       delta[t] = along;
     }
     for (int64_t k = 0; k < K; k++) change[k] -= w->m_before[r * K + k];
     for (int64_t p = first; p <= last; p++) {
-      xi = fma(2.0 * delta[p], dot(w->e_before + p * K, change, K), xi);
-      for (int64_t q = first; q <= last; q++) xi = fma(delta[p] * delta[q], w->g[p][q], xi);
+      xi = fused(2.0 * delta[p], dot(w->e_before + p * K, change, K), xi);
+      for (int64_t q = first; q <= last; q++) xi = fused(delta[p] * delta[q], w->g[p][q], xi);
     }
     for (int64_t k = 0; k < K; k++) w->products[k] = dot(w->gram_before + k * K, change, K);
     xi += dot(change, w->products, K);
@@ -208,7 +208,7 @@ INLINE void centre_tile(const frames *x, int pixels, int64_t first, int64_t coun
   for (int64_t i = whole < 0 ? 0 : whole; i < width; i++)
     for (int64_t s = 0; s < count; s++) {
       double value = read_value(x, row[s] + beyond + start + i), *m = c->mean + start + i;
-      *m = fma(rate[s], value - *m, *m);
+      *m = fused(rate[s], value - *m, *m);
       u[s * TILE + i] = value - *m;
     }
   for (int64_t s = count; s < GROUP; s++) memset(u + s * TILE, 0, TILE * sizeof *u);
@@ -262,8 +262,8 @@ static void apply_tile(int64_t K, double *v, int64_t v_row, int64_t width, doubl
       for (int64_t j = panel; j < stop; j++)
         for (int64_t t = 0; t < GROUP; t++) {
           double *x = v + j * v_row + i, *rest = r + t * r_row + i;
-          *x = fma(steps[j * 2 * GROUP + 2 * t], *rest, *x);
-          *rest = fma(steps[j * 2 * GROUP + 2 * t + 1], *x, *rest);
+          *x = fused(steps[j * 2 * GROUP + 2 * t], *rest, *x);
+          *rest = fused(steps[j * 2 * GROUP + 2 * t + 1], *x, *rest);
         }
   }
 }
@@ -280,15 +280,16 @@ static void measure_still(const incsfa *s, still *t, group *w, int64_t count) {
   memset(t->r, 0, (size_t)(GROUP * t->width) * sizeof(double));
   memset(t->a, 0, sizeof t->a);
   for (int64_t q = 0; q < count; q++) {
-    t->taken = fma(mean_rate(seen + q + 1, s->window), 1.0 - t->taken, t->taken);
+    t->taken = fused(mean_rate(seen + q + 1, s->window), 1.0 - t->taken, t->taken);
     t->a[q] = seen + q == 0 ? 1.0 : 1.0 - t->taken;
     t->r[q * t->width] = t->a[q];
     t->r[q * t->width + K + 1] = t->a[q] * t->energy;
   }
   for (int64_t q = 0; q < GROUP; q++) {
-    for (int64_t p = 0; p < GROUP; p++) w->g[q][p] = fma(t->a[q] * t->a[p], t->energy, w->g[q][p]);
+    for (int64_t p = 0; p < GROUP; p++)
+      w->g[q][p] = fused(t->a[q] * t->a[p], t->energy, w->g[q][p]);
     for (int64_t j = 0; j < K; j++)
-      w->e[j * GROUP + q] = fma(t->table[j * t->width + K + 1], t->a[q], w->e[j * GROUP + q]);
+      w->e[j * GROUP + q] = fused(t->table[j * t->width + K + 1], t->a[q], w->e[j * GROUP + q]);
   }
 }
 
@@ -432,7 +433,7 @@ static void settle_still(const incsfa *s, const still *t, double *before) {
     }
     for (int64_t n = 0; n < few * CELL; n++) {
       double *mean = s->mean + at[n / CELL] * CELL + n % CELL;
-      *mean = fma(t->taken, before[n], *mean);
+      *mean = fused(t->taken, before[n], *mean);
     }
   }
 }

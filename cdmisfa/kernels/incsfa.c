@@ -64,7 +64,7 @@ INLINE void mca_step(const incsfa *s, double *z_dot, const double *scale, double
     for (int64_t p = 0; p < j; p++)
       add_multiple(dot(s->w + p * K, w, K) * gamma, s->w + p * K, step, K);
     for (int64_t k = 0; k < K; k++) {
-      w[k] = fma(1.5 - rate, w[k], -rate * step[k]);
+      w[k] = fused(1.5 - rate, w[k], -rate * step[k]);
       if (scale[k] == 0) w[k] *= 0.5;
     }
     double length = 1.0 / sqrt(dot(w, w, K));
@@ -76,7 +76,7 @@ INLINE void mca_step(const incsfa *s, double *z_dot, const double *scale, double
 INLINE void centre(const incsfa *s, int64_t n, double *u) {
   double rate = mean_rate(n, s->window);
   for (int64_t i = 0; i < s->inputs; i++) {
-    s->mean[i] = fma(rate, u[i] - s->mean[i], s->mean[i]);
+    s->mean[i] = fused(rate, u[i] - s->mean[i], s->mean[i]);
     if (n > 1) u[i] -= s->mean[i];
   }
 }
@@ -92,7 +92,7 @@ INLINE void ccipca_step(const incsfa *s, double weight, double *restrict r) {
     double *restrict v = s->v + j * size;
     double keep = s->d[j] > floor ? 1.0 - weight : 1.0;
     double gain = weight / s->d[j] * dot(r, v, size);
-    for (int64_t i = 0; i < size; i++) v[i] = fma(gain, r[i], keep * v[i]);
+    for (int64_t i = 0; i < size; i++) v[i] = fused(gain, r[i], keep * v[i]);
     double square = dot(v, v, size);
     s->d[j] = sqrt(square);
     add_multiple(-dot(r, v, size) / square, v, r, size);

@@ -35,13 +35,70 @@ INLINE void store(double *p, lanes x) { *(lanes *)p = x; }
 
 INLINE lanes spread(double x) { return (lanes){x, x, x, x}; }
 
+#if !(defined(__AVX2__) && defined(__FMA__)) && !defined(__aarch64__)
+
+typedef double pair __attribute__((vector_size(16)));
+typedef int64_t bits __attribute__((vector_size(16)));
+
+/* x + y, and what rounding took away. */
+INLINE pair two_sum(pair x, pair y, pair *lost) {
+  pair total = x + y, rest = total - x;
+  *lost = (x - (total - rest)) + (y - rest);
+  return total;
+}
+
+/* The first 26 bits of x; what is left are the others. */
+INLINE pair upper_half(pair x) {
+  pair shifted = x * 134217729.0;
+  return shifted - (shifted - x);
+}
+
+INLINE bits between(pair x, double low, double high) {
+  pair size = (pair)((bits)x & INT64_MAX);
+  return (bits)(size >= low) & (bits)(size <= high);
+}
+
+/* x y + z, rounded once, where the processor has no instruction for it.
+ *
+ * Product and sums are split into what is rounded and what rounding took away, and that is added up
+ * rounded to odd, so that the last addition rounds as the exact sum would: Boldo and Melquiond
+ * (2008). The C library has what is too large or too small for it.
+ */
+INLINE pair add_product_of_pair(pair x, pair y, pair z) {
+  bits zero = (bits)(x == 0) | (bits)(y == 0);
+  bits fits = between(x, 0x1p-450, 0x1p450) & between(y, 0x1p-450, 0x1p450);
+  fits = (fits & between(z, 0, 0x1p900)) | zero;
+  if (!(fits[0] & fits[1])) return (pair){fma(x[0], y[0], z[0]), fma(x[1], y[1], z[1])};
+  pair p = x * y, a = upper_half(x), b = upper_half(y), c = x - a, d = y - b, lost, last, odd;
+  pair error = ((a * b - p) + a * d + c * b) + c * d;
+  pair high = two_sum(p, two_sum(z, error, &lost), &last), low = two_sum(lost, last, &odd);
+  bits away = ((bits)(odd > 0) ^ (bits)(low > 0)) | 1, even = ((bits)low & 1) - 1;
+  low = (pair)((bits)low + (away & even & (bits)(odd != 0)));
+  return (pair)(((bits)(p + z) & zero) | ((bits)(high + low) & ~zero));
+}
+
+#endif
+
 /* x y + z, rounded once. */
 INLINE lanes add_product(lanes x, lanes y, lanes z) {
 #if defined(__AVX2__) && defined(__FMA__)
   return (lanes)_mm256_fmadd_pd((__m256d)x, (__m256d)y, (__m256d)z);
-#else
-  for (int i = 0; i < LANES; i++) z[i] = fma(x[i], y[i], z[i]);
+#elif defined(__aarch64__)
+  for (int i = 0; i < LANES; i++) z[i] = __builtin_fma(x[i], y[i], z[i]);
   return z;
+#else
+  pair low = add_product_of_pair((pair){x[0], x[1]}, (pair){y[0], y[1]}, (pair){z[0], z[1]});
+  pair high = add_product_of_pair((pair){x[2], x[3]}, (pair){y[2], y[3]}, (pair){z[2], z[3]});
+  return (lanes){low[0], low[1], high[0], high[1]};
+#endif
+}
+
+/* The same of single numbers. */
+INLINE double fused(double x, double y, double z) {
+#if defined(__FMA__) || defined(__aarch64__)
+  return __builtin_fma(x, y, z);
+#else
+  return add_product_of_pair((pair){x, x}, (pair){y, y}, (pair){z, z})[0];
 #endif
 }
 
@@ -77,7 +134,7 @@ static double long_dot(const double *x, const double *y, int64_t n) {
   }
   for (; i + LANES <= n; i += LANES) a = add_product(load(x + i), load(y + i), a);
   double total = sum((a + b) + (c + d));
-  for (; i < n; i++) total = fma(x[i], y[i], total);
+  for (; i < n; i++) total = fused(x[i], y[i], total);
   return total;
 }
 
@@ -86,17 +143,17 @@ INLINE double dot(const double *x, const double *y, int64_t n) {
   if (n >= 2 * LANES) return long_dot(x, y, n);
   double even = 0, odd = 0;
   for (int64_t i = 0; i < n - 1; i += 2) {
-    even = fma(x[i], y[i], even);
-    odd = fma(x[i + 1], y[i + 1], odd);
+    even = fused(x[i], y[i], even);
+    odd = fused(x[i + 1], y[i + 1], odd);
   }
-  return (n % 2 ? fma(x[n - 1], y[n - 1], even) : even) + odd;
+  return (n % 2 ? fused(x[n - 1], y[n - 1], even) : even) + odd;
 }
 
 /* y += a x. */
 INLINE void add_multiple(double a, const double *x, double *y, int64_t n) {
   int64_t i = 0;
   for (; i + LANES <= n; i += LANES) store(y + i, add_product(spread(a), load(x + i), load(y + i)));
-  for (; i < n; i++) y[i] = fma(a, x[i], y[i]);
+  for (; i < n; i++) y[i] = fused(a, x[i], y[i]);
 }
 
 /* |x - y|^2, see `dot`. */
@@ -109,7 +166,7 @@ static double square_distance(const double *x, const double *y, int64_t n) {
     b = add_product(d, d, b);
   }
   double total = sum(a + b);
-  for (; i < n; i++) total = fma(x[i] - y[i], x[i] - y[i], total);
+  for (; i < n; i++) total = fused(x[i] - y[i], x[i] - y[i], total);
   return total;
 }
 
@@ -172,7 +229,7 @@ INLINE void add_products_of(int rows, int frames, const double *v, int64_t v_row
       double total = sum(s[r][t]);
       for (int64_t i = whole; i < width; i++) {
         double x = pixels ? pixels[t * u_row + i] * PIXEL : u[t * u_row + i];
-        total = fma(v[r * v_row + i], x, total);
+        total = fused(v[r * v_row + i], x, total);
       }
       e[r * e_row + t] += total;
     }
@@ -259,7 +316,7 @@ void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64
   for (; j < width; j++)
     for (int64_t r = 0; r < rows; r++) {
       double total = 0;
-      for (int64_t p = 0; p < parts; p++) total = fma(a[r * a_row + p], b[p * b_row + j], total);
+      for (int64_t p = 0; p < parts; p++) total = fused(a[r * a_row + p], b[p * b_row + j], total);
       c[r * c_row + j] = total;
     }
 }

@@ -203,7 +203,7 @@ static void update_differences(const recursive *sfa, const piece *b, int skipped
   for (int64_t i = 0; i < k; i++)
     for (int64_t j = 0; j < k; j++) { /* symmetric whatever rounding does */
       double both = 0.5 * (turned[i * k + j] + turned[j * k + i]);
-      sfa->differences[i * size + j] = share * fma(pairs, both, new[i * k + j]);
+      sfa->differences[i * size + j] = share * fused(pairs, both, new[i * k + j]);
     }
 }
 
