@@ -25,7 +25,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # Other cores have processes of their own: threads for one product would wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Compiling takes longer than any deadline, and a test run says the same thing every time.
+# Machines are shared, and a test run says the same thing every time.
 hypothesis.settings.register_profile("cdmisfa", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("cdmisfa")
 

@@ -136,7 +136,7 @@ def _played(blocks: list[Block], source: RecordedSource) -> int:
 
 
 def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
-    """Compare the blocks that were played with what the uncompiled reader decodes."""
+    """Compare the blocks that were played with what the reader in Python decodes."""
     if not blocks:
         return
     with contextlib.closing(ViewFile(path, salvage=salvage)) as view:
@@ -151,14 +151,14 @@ def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
             truth = np.empty((n, len(view.facts.truth)))
             tabled_rows(view, start, frames, truth)
             if frames.tobytes() != all_frames[at : at + n].tobytes():
-                raise BrokenPromise("the compiled reader gives other frames")
+                raise BrokenPromise("the reader in C gives other frames")
             if truth.tobytes() != all_truth[at : at + n].tobytes():
-                raise BrokenPromise("the compiled reader gives other ground truth")
+                raise BrokenPromise("the reader in C gives other ground truth")
             at += n
 
 
 def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarray) -> None:
-    """As `ViewFile.take`, by the tables of chunks alone and with nothing compiled."""
+    """As `ViewFile.take`, by the tables of chunks alone and with nothing in C."""
     outs = (frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8))
     channels = zip(view._channels, view._layouts, outs, strict=False)
     for which, (rows, layout, out) in enumerate(channels):

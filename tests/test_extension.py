@@ -18,7 +18,7 @@ from cdmisfa.agents.learners import LEARNERS, LearnerEntry
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
-from cdmisfa.experiments.trial import has_compiled_trials, run_trial
+from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from cdmisfa.features.feature import Feature
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
@@ -46,7 +46,7 @@ class Settled(NamedTuple):
 
 
 class PlainFeature:
-    """Learns nothing but the mean, and says so: a feature without compiled code."""
+    """Learns nothing but the mean, and says so: a feature in Python."""
 
     def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
         self.state = Settled(np.zeros(n_inputs), rng.standard_normal((config.outputs, n_inputs)))
@@ -90,7 +90,7 @@ def _added() -> Iterator[None]:
 
 
 @pytest.mark.parametrize(("expansion", "least"), [("cubic", 1), ("many", 0)])
-def test_a_compiled_trial_is_the_learner_with_an_expansion_of_ones_own(
+def test_a_whole_trial_is_the_learner_with_an_expansion_of_ones_own(
     expansion: str, least: int
 ) -> None:
     config = dataclasses.replace(QUICK, expansion=expansion, delta=0.005)
@@ -135,10 +135,10 @@ def test_a_feature_of_ones_own_is_learned_with_and_restored() -> None:
     np.testing.assert_allclose(one.y, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_a_learner_without_compiled_code_has_no_trials() -> None:
-    assert has_compiled_trials(QUICK)
-    assert not has_compiled_trials(PlainConfig())
-    with pytest.raises(UsageError, match=r"learner\.algorithm plain has no compiled trials"):
+def test_a_learner_in_python_has_no_whole_trials() -> None:
+    assert has_whole_trials(QUICK)
+    assert not has_whole_trials(PlainConfig())
+    with pytest.raises(UsageError, match=r"learner\.algorithm plain has no whole trials"):
         run_trial(PlainConfig(), seed=0)
 
 

@@ -1,4 +1,4 @@
-"""Frames are checked where they come in: compiled code never reads beyond what it was given."""
+"""Frames are checked where they come in: C never reads beyond what it was given."""
 
 from __future__ import annotations
 

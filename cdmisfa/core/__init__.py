@@ -1,4 +1,4 @@
-"""For all: blocks, signals, modules, configuration, errors, registries, compiling, processes."""
+"""For all: blocks, signals, modules, configuration, errors, registries, processes."""
 
 from cdmisfa.core.faces import face
 

@@ -36,7 +36,7 @@ WENT_AWAY = "the scheduler went away: start it and say the same again, finished 
 CONNECT_SECONDS = 15
 """How long a scheduler and its first worker may take to answer."""
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 """Environment of local workers: the processes are the parallelism."""
 
 

@@ -32,7 +32,7 @@ from cdmisfa.experiments.sources import (
     streams_of,
 )
 from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
-from cdmisfa.experiments.trial import has_compiled_trials, run_trial
+from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.log.whole import whole
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES
@@ -249,7 +249,7 @@ def _identify(
 def compute(trial: SweepTrial) -> Mapping[str, Any]:
     """Compute one trial: its result, or under "error" why there is none.
 
-    Oscillatory trials without a log run as a whole in compiled code where the learner has it;
+    Oscillatory trials without a log run as a whole in C where the learner can;
     all others as `learn` does.
     """
     return answer(trial, code(), _compute)
@@ -257,12 +257,12 @@ def compute(trial: SweepTrial) -> Mapping[str, Any]:
 
 def _compute(trial: SweepTrial) -> dict[str, Any]:
     live = trial.source == ("oscillatory",) and trial.log is None
-    if live and has_compiled_trials(trial.configuration.learner):
-        return _compiled_trial(trial)
+    if live and has_whole_trials(trial.configuration.learner):
+        return _whole_trial(trial)
     return _logged_trial(trial)
 
 
-def _compiled_trial(trial: SweepTrial) -> dict[str, Any]:
+def _whole_trial(trial: SweepTrial) -> dict[str, Any]:
     streams = cast(OscillatoryConfig, trial.configuration.scene).streams
     result = run_trial(
         trial.configuration.learner,

@@ -73,12 +73,12 @@ class TrialResult:
     curves: Mapping[str, NDArray[Any]] | None
 
 
-def has_compiled_trials(config: Any) -> bool:
+def has_whole_trials(config: Any) -> bool:
     """Whether the learner of a configuration, and what it learns with, can learn in C alone."""
-    return _compiles(open_learner(config, OscillatorySource().spec, 0))
+    return _learns_in_c(open_learner(config, OscillatorySource().spec, 0))
 
 
-def _compiles(learner: Learner) -> TypeGuard[CuriousLearner]:
+def _learns_in_c(learner: Learner) -> TypeGuard[CuriousLearner]:
     return isinstance(learner, CuriousLearner) and learner.kernel is not None
 
 
@@ -104,12 +104,12 @@ def run_trial(
         curves: keep what every iteration came to.
 
     Raises:
-        UsageError: the learner, or the feature it learns with, has no compiled code.
+        UsageError: the learner, or the feature it learns with, is in Python.
     """
     learner = open_learner(config, OscillatorySource(streams).spec, seed)
-    if not _compiles(learner):
+    if not _learns_in_c(learner):
         raise UsageError(
-            f"learner.algorithm {config.algorithm} has no compiled trials: use learn for it"
+            f"learner.algorithm {config.algorithm} has no whole trials: use learn for it"
         )
     tables = [one_period(name) for name in streams]
     frames, x = _expand(config, tables)

@@ -138,7 +138,7 @@ class ViewFile:
             self._scanner.copy(chunk, piece.which, piece.low, out)
 
     def pass_over(self, segment: Segment) -> None:
-        """Look at every frame of the next chunk of the file, and compile nothing for it.
+        """Look at every frame of the next chunk of the file, and copy none.
 
         Raises:
             LogDamagedError: a time is no frame's, or a message is laid out unlike the others.

@@ -95,7 +95,7 @@ def case(job: Job) -> Outcome:
     words = work.words(place, given["folder"])
     process = (Process if rng.random() < REAL else Fork)(job.folder, *words)
     until(lambda: bool(workers(process.pid)) or not process.running, 60)
-    # half of them at once: while workers begin, import and load what is compiled
+    # half of them at once: while workers begin and import
     takes = rng.choice((0.3, 2.0, BEGINNING + given["seconds"][name]))
     until(lambda: not process.running, rng.uniform(0, takes))
     if rng.random() < 0.5:

@@ -141,7 +141,7 @@ UNNAMED = ("png",)
 
 
 def prepare(folder: Path) -> dict[str, Any]:
-    """Make all materials, and learn of them: also so that everything is imported and compiled."""
+    """Make all materials, and learn of them: also so that everything is imported."""
     signals = {}
     for name in MAKERS.keys() - missing():
         MAKERS[name](folder / name)
