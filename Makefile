@@ -4,7 +4,10 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
 
-.PHONY: demo test suite lint bench pictures fuzz torture clean install
+SANITIZED := build/sanitized
+SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
+
+.PHONY: demo test suite lint bench pictures fuzz torture sanitized clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
@@ -31,10 +34,18 @@ fuzz: $(INSTALLED)
 	$(BIN)/python tests/fuzz.py --cases 1000000 --jobs 2
 
 # The streams of the arena take minutes to make: they are kept.
-torture: $(INSTALLED)
+torture: $(INSTALLED) sanitized
 	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
 	    --seeds 0:2 --frames 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
 	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),60) --seed $(or $(SEED),0)
+
+# The tests of the kernels, which then end where they leave an array or the range of a number.
+sanitized: $(INSTALLED)
+	CFLAGS="$(SANITIZERS)" LDFLAGS="$(SANITIZERS)" $(BIN)/python setup.py -q \
+	    build --build-base $(SANITIZED) --build-lib $(SANITIZED)/lib
+	LD_PRELOAD="$$(gcc -print-file-name=libasan.so)" ASAN_OPTIONS=detect_leaks=0 \
+	    $(BIN)/pytest -q -o "pythonpath=$(SANITIZED)/lib ." $(wildcard tests/test_kernels*.py) \
+	    tests/test_areas.py tests/test_incsfa.py tests/test_recursive_sfa.py tests/test_scan.py
 
 install: $(INSTALLED)
 
@@ -45,5 +56,5 @@ $(INSTALLED): pyproject.toml setup.py $(KERNELS)
 	touch $@
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist cdmisfa/kernels/*.so *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find cdmisfa recorder replay tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
