@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -285,6 +287,30 @@ def test_values_that_are_no_numbers_are_refused_with_the_place(bad: float) -> No
     with pytest.raises(CdmisfaError, match=r"stream x\d .*no finite number in frames 300 to 399"):
         learner.step(block(learner.stream, 300, frames))
     assert learner.iteration == 0
+
+
+def test_values_whose_products_overflow_are_refused() -> None:
+    learner = CuriousLearner(CONFIG, SPEC, 0)
+    frames = FRAMES.copy()
+    frames[40, 1] = -1e160
+    with pytest.raises(CdmisfaError, match=r"larger than 1e\+100 in frames 300 to 399"):
+        learner.step(block(learner.stream, 300, frames))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_learns_on_for_itself(copied: Callable[[Any], Any]) -> None:
+    source = OscillatorySource()
+    learner = CuriousLearner(CONFIG, source.spec, 0)
+    for _ in range(3):
+        learner.step(source.take(learner.stream, learner.tau))
+    other, after = copied(learner), copy.deepcopy(source)
+    digests = []
+    for one, shown in ((learner, source), (other, after)):
+        digest = SignalsHash()
+        for _ in range(5):
+            digest.add(one.step(shown.take(one.stream, one.tau)))
+        digests.append(digest.hexdigest())
+    assert digests[0] == digests[1]
 
 
 def test_a_constant_block_carries_nothing() -> None:

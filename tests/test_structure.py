@@ -198,3 +198,14 @@ def test_page_of_signals_is_what_the_command_prints(cdmisfa: Cdmisfa) -> None:
     assert cdmisfa("signals", "--markdown").out == page, (
         "make it again: cdmisfa signals --markdown > docs/signals.md"
     )
+
+
+def test_sources_without_compiled_kernels_say_so(tmp_path: Path) -> None:
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.so"))
+    words = [sys.executable, "-m", "cdmisfa", "learn", "oscillatory", "--max-iterations", "1"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("cdmisfa: ")
+    assert "holds no compiled kernels: install cdmisfa" in done.stderr
+    assert done.stderr.count("\n") == 1

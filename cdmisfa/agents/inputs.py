@@ -11,6 +11,9 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expanded_size
 
+LARGEST_VALUE = 1e100
+"""Squares and products of values up to this, and their sums, are finite."""
+
 MAX_INPUTS = 2_000_000
 """An abstraction of more inputs than this (a grey image of 1400 x 1400) is refused."""
 
@@ -62,9 +65,11 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
         raise ValueError(
             f"the learner asked for frames of {spec.frame_shape} {spec.dtype}, not {shape} {dtype}"
         )
-    if dtype.kind == "f" and not np.isfinite(block.frames).all():
+    if dtype.kind == "f" and not (np.abs(block.frames) <= LARGEST_VALUE).all():
+        finite = np.isfinite(block.frames).all()
+        what = f"larger than {LARGEST_VALUE:g}" if finite else "no finite number"
         raise CdmisfaError(
-            f"stream {spec.streams[block.stream]} holds a value that is no finite number "
+            f"stream {spec.streams[block.stream]} holds a value that is {what} "
             f"in frames {block.t} to {block.t + len(block) - 1}: learn from frames without it"
         )
     return block.frames.reshape(len(block), -1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -99,6 +100,17 @@ class CuriousLearner:
         self._no_state = freeze(np.full(n_streams, NO_STATE))
         self._freeze()
         self.abstraction = self._new_abstraction()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what has pointers of this process."""
+        pointers = ("_agent", "_frozen")
+        return {name: value for name, value in vars(self).items() if name not in pointers}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        """See `__getstate__`."""
+        vars(self).update(state)
+        self._agent = as_struct(self.agent, self.rules, self.out)
+        self._frozen = self.frozen.struct
 
     @property
     def tau(self) -> int:

@@ -7,6 +7,7 @@ as IncSFA: Kompella, Luciw and Schmidhuber 2012. How it is computed: `kernels/in
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,6 @@ class IncSFA:
 
     Attributes:
         state: every array the abstraction consists of.
-        kernel: the same with the constants of the rule, as the kernels take it.
 
     Example:
         >>> sfa = IncSFA(LearnerConfig(), 5, np.random.default_rng(0))
@@ -85,7 +85,16 @@ class IncSFA:
 
     def __init__(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> None:
         self.state = new_state(rng, n_inputs, config)
-        self.kernel = kernels.incsfa(self.state, config.nu, config.mean_window)
+        self._nu, self._window = config.nu, config.mean_window
+
+    @cached_property
+    def kernel(self) -> kernels.Struct:
+        """The state with the constants of the rule, as the kernels take it."""
+        return kernels.incsfa(self.state, self._nu, self._window)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without `kernel`, whose pointers are of this process."""
+        return {name: value for name, value in vars(self).items() if name != "kernel"}
 
     def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
         """Learn from consecutive frames.

@@ -14,9 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import cdmisfa.kernels._plain as _plain
 from cdmisfa.core.blocks import UINT8, as_frames
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
+
+try:
+    import cdmisfa.kernels._plain as _plain
+except ImportError as error:
+    raise CdmisfaError(
+        f"{__path__[0]} holds no compiled kernels: install cdmisfa with make clean install or "
+        "pip, and run it in another folder than its sources where these are not what is installed"
+    ) from error
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

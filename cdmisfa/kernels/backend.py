@@ -19,7 +19,7 @@ ZIG = "ziglang>=0.13,<0.18"
 def compiler() -> str | None:
     """The machine's C compiler: what was asked for, what built Python, or a usual one."""
     names = os.environ.get("CC"), sysconfig.get_config_var("CC"), "cc", "gcc", "clang"
-    return next((name for name in names if name and shutil.which(shlex.split(name)[0])), None)
+    return next((n for n in names if n and n.strip() and shutil.which(shlex.split(n)[0])), None)
 
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.plugins import GROUPS, find, plugins
 from cdmisfa.core.registry import Registry
 
@@ -127,8 +127,8 @@ def _simulator() -> Iterator[Check]:
 def _kernels() -> Iterator[Check]:
     try:
         from cdmisfa import kernels
-    except ImportError as error:
-        yield Check("kernels", False, f"{error}: install cdmisfa anew", "learning")
+    except CdmisfaError as error:
+        yield Check("kernels", False, str(error), "learning")
         return
     detail = "for AVX2 and FMA" if kernels.WIDE else "for any processor: the same bits, slower"
     yield Check("kernels", True, detail, "learning")

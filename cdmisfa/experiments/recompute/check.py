@@ -138,8 +138,9 @@ def learner_after(run: Path, iterations: int, source: Sequence[str] = ()) -> tup
         at, found = _learned_again(again, iterations)
         if found is not None:
             then, now = again.header.arithmetic, arithmetic_of(again.learner)
-            remedy = "name its own source with --source"
-            why = remedy if then == now else _otherwise(then, now)
+            why = "name its own source with --source"
+            if then != now:
+                why = f"{_otherwise(then, now)}: only states at its keyframes are exact"
             raise NotReproducedError(f"{again.log}: learned again, {found}: {why}")
         if at < iterations:
             raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")

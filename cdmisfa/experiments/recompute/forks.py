@@ -12,7 +12,7 @@ from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.config import as_table, build, differences, parse_settings
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Keyframe, arithmetic_of
-from cdmisfa.experiments.recompute.again import Era, source_of, told_anew
+from cdmisfa.experiments.recompute.again import Again, Era, source_of, told_anew
 from cdmisfa.experiments.recompute.check import learner_after
 from cdmisfa.experiments.resume import FORK, Fork, command_of, read_command
 from cdmisfa.experiments.runs import RunResult, run
@@ -58,12 +58,14 @@ def fork_run(
     if os.path.realpath(log.parent) == os.path.realpath(out):
         raise UsageError(f"{out} is the run itself: choose another folder")
     header = read_header(log)
-    learner, t = learner_after(log, at, source)
-    if header.arithmetic != arithmetic_of(learner):
+    with Again(log, 0, source) as again:
+        now = arithmetic_of(again.learner)
+    if header.arithmetic != now:
         raise UsageError(
             f"{log} was learned with arithmetic {header.arithmetic}, this version computes with "
-            f"{arithmetic_of(learner)}: learn it anew, and fork that"
+            f"{now}: learn it anew, and fork that"
         )
+    learner, t = learner_after(log, at, source)
     manifest = header.manifest
     before, seed_before = manifest["config"]["learner"], int(manifest["seed"])
     seed = seed_before if seed is None else seed
