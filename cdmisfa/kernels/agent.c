@@ -3,10 +3,7 @@
 static const double TIE = 1e-12;         /* share of a value below which a gain is rounding */
 static const double IDLE_EPSILON = 1e-3; /* below this the agent practically does not explore */
 
-enum {
-  MAX_SWEEPS = 100, /* of policy iteration, which takes a handful; this bounds rounding cycles */
-  SIDE_BY_SIDE = 16 /* sums over many streams: one alone waits for each addition */
-};
+enum { MAX_SWEEPS = 100 }; /* of policy iteration, which takes a handful; bounds rounding cycles */
 
 /* Take output j on a block into its slowness, its change, and the gate's statistics; the block
  * counts among the novel ones already, its frames do not. */
@@ -114,15 +111,19 @@ static double value_sum(const agent *a) {
   const double *stay = a->stay_sum, *leave = a->switch_sum;
   const int64_t *policy = a->policy;
   double gamma = a->rules->gamma, n = (double)a->streams, horizon = (n - 1 + gamma) / (1 - gamma);
-  double totals[SIDE_BY_SIDE] = {0}, total = 0;
-  int64_t leavers = 0, s = 0;
-  for (; s + SIDE_BY_SIDE <= a->streams; s += SIDE_BY_SIDE)
-    for (int64_t i = 0; i < SIDE_BY_SIDE; i++) {
-      double kept = stay[s + i] * horizon, left = leave[s + i];
-      totals[i] += policy[s + i] == 1 ? left : kept;
-      leavers += policy[s + i] == 1;
+  lanes totals[4] = {0};
+  whole_lanes leaving = {0};
+  int64_t s = 0;
+  for (; s + 4 * LANES <= a->streams; s += 4 * LANES)
+#pragma GCC unroll 4
+    for (int i = 0; i < 4; i++) {
+      int64_t at = s + i * LANES;
+      whole_lanes leaves = (whole_lanes)(load_whole(policy + at) == 1);
+      totals[i] += choose(leaves, load(leave + at), load(stay + at) * horizon);
+      leaving -= leaves;
     }
-  for (int i = 0; i < SIDE_BY_SIDE; i++) total += totals[i];
+  double total = sum((totals[0] + totals[1]) + (totals[2] + totals[3]));
+  int64_t leavers = leaving[0] + leaving[1] + leaving[2] + leaving[3];
   for (; s < a->streams; s++) {
     total += policy[s] == 1 ? leave[s] : stay[s] * horizon;
     leavers += policy[s] == 1;
@@ -141,7 +142,17 @@ static bool improve(const agent *a) {
   int64_t *policy = a->policy, S = a->streams, changed = 0;
   double gamma = a->rules->gamma, mean = 1 / (double)(S - 1), share = gamma / (double)(S - 1);
   double arriving = share * value_sum(a), damp = 1 / (1 + share), horizon = 1 / (1 - gamma);
-  for (int64_t s = 0; s < S; s++) {
+  whole_lanes differ = {0};
+  int64_t s = 0;
+  for (; s + LANES <= S; s += LANES) {
+    lanes kept = load(stay + s) * horizon, left = (load(leave + s) * mean + arriving) * damp;
+    lanes least = TIE * (absolute(left) + absolute(kept));
+    whole_lanes better = (whole_lanes)(left - kept > least) & 1;
+    differ |= better ^ load_whole(policy + s);
+    *(whole_lanes *)(policy + s) = better;
+  }
+  changed = differ[0] | differ[1] | differ[2] | differ[3];
+  for (; s < S; s++) {
     double kept = stay[s] * horizon, left = (leave[s] * mean + arriving) * damp;
     int64_t better = left - kept > TIE * (fabs(left) + fabs(kept));
     changed |= better ^ policy[s];

@@ -29,11 +29,23 @@ enum { LANES = 4 };
 
 typedef double lanes __attribute__((vector_size(32), aligned(8), may_alias));
 
+/* As many whole numbers, or what a comparison of lanes gives: all bits or none. */
+typedef int64_t whole_lanes __attribute__((vector_size(32), aligned(8), may_alias));
+
 INLINE lanes load(const double *p) { return *(const lanes *)p; }
 
 INLINE void store(double *p, lanes x) { *(lanes *)p = x; }
 
 INLINE lanes spread(double x) { return (lanes){x, x, x, x}; }
+
+INLINE whole_lanes load_whole(const int64_t *p) { return *(const whole_lanes *)p; }
+
+/* x where a comparison holds, else y. */
+INLINE lanes choose(whole_lanes holds, lanes x, lanes y) {
+  return (lanes)(((whole_lanes)x & holds) | ((whole_lanes)y & ~holds));
+}
+
+INLINE lanes absolute(lanes x) { return (lanes)((whole_lanes)x & INT64_MAX); }
 
 #if !(defined(__AVX2__) && defined(__FMA__)) && !defined(__aarch64__)
 
