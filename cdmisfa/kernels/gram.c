@@ -10,10 +10,9 @@
 enum {
   GROUP = 4,      /* frames applied in one pass */
   TILE = 256,     /* columns of a tile: a group's frames in it are 8 KB, a quarter of L1 */
-  VECTORS = 4,    /* applied with the residuals in registers; rows of images are multiples of
-                     4 KB, so more of them would fall on the same lines of L1 */
   CELL = 8,       /* neighbouring columns that change or stand still together */
   BATCH = 32,     /* cells that are settled together */
+  ROW = BATCH * CELL + CELL, /* their columns, and as many as keep rows apart in L1 */
   REFRESH = 1000, /* frames after which the Gram matrix is computed from the vectors again */
   WORTH = 4       /* still columns cost K^2 / 2 multiply-adds to write: too many where a block
                      has fewer than K / WORTH frames */
@@ -331,24 +330,31 @@ static double run_pass(const incsfa *s, const columns *c, still *t, group *w, in
   return square;
 }
 
+/* Note which cells, of some words of eight bytes each, are not the same in two frames. */
+INLINE void note_changes(int64_t cells, int words, const char *one, const char *other,
+                         uint64_t *restrict changed) {
+  for (int64_t c = 0; c < cells; c++)
+    for (int64_t k = 0; k < words; k++) {
+      uint64_t a, b;
+      memcpy(&a, one + (c * words + k) * 8, 8);
+      memcpy(&b, other + (c * words + k) * 8, 8);
+      changed[c] |= a ^ b;
+    }
+}
+
 /* Write which cells change within a block, in order, and behind them those that stand still;
  * return how many change: all, where too few stand still. `changed` has a word for each cell. */
 static int64_t find_changing(const incsfa *s, const frames *x, uint64_t *restrict changed,
                              int64_t *cells) {
-  int64_t every = s->inputs / CELL, words = x->pixels ? 1 : CELL, count = 0;
+  int64_t every = s->inputs / CELL, count = 0;
   size_t item = x->pixels ? 1 : sizeof(double);
   const char *data = x->pixels ? (const char *)x->pixels : (const char *)x->values;
   int worth = x->n * WORTH >= s->components;
   memset(changed, 0, (size_t)every * sizeof *changed);
   for (int64_t t = x->n - 1; worth && t > 0; t--) { /* the last frame most often tells */
     const char *row = data + (size_t)(t * x->size) * item;
-    for (int64_t c = 0; c < every; c++)
-      for (int64_t k = 0; k < words; k++) {
-        uint64_t a, b;
-        memcpy(&a, data + (c * words + k) * 8, 8);
-        memcpy(&b, row + (c * words + k) * 8, 8);
-        changed[c] |= a ^ b;
-      }
+    if (x->pixels) note_changes(every, 1, data, row, changed);
+    else note_changes(every, CELL, data, row, changed);
     if (t > 1 && t < x->n - 1) continue;
     count = 0;
     for (int64_t c = 0; c < every; c++) count += changed[c] != 0;
@@ -359,17 +365,22 @@ static int64_t find_changing(const incsfa *s, const frames *x, uint64_t *restric
   return moving;
 }
 
+/* Copy the columns of a cell; as many bytes as the compiler knows of. */
+INLINE void copy_cell(const double *from, double *to) { memcpy(to, from, CELL * sizeof *to); }
+
 /* Copy the columns of some cells, and what is beyond the last whole cell, out of rows or back. */
 static void copy_columns(int64_t rows, double *all, int64_t size, const columns *c, double *few,
                          int back) {
+  int64_t beyond = size % CELL;
   for (int64_t j = 0; j < rows; j++) {
-    double *from = all + j * size, *to = few + j * c->size;
-    for (int64_t n = 0; n <= c->cells; n++) {
-      int64_t at = n < c->cells ? c->at[n] * CELL : size - size % CELL;
-      size_t bytes = (size_t)(n < c->cells ? CELL : size % CELL) * sizeof(double);
-      if (back) memcpy(from + at, to + n * CELL, bytes);
-      else memcpy(to + n * CELL, from + at, bytes);
-    }
+    double *own = all + j * size, *part = few + j * c->size;
+    for (int64_t n = 0; n < c->cells; n++)
+      if (back) copy_cell(part + n * CELL, own + c->at[n] * CELL);
+      else copy_cell(own + c->at[n] * CELL, part + n * CELL);
+    double *rest = own + size - beyond, *last = part + c->size - beyond;
+    for (int64_t i = 0; i < beyond; i++)
+      if (back) rest[i] = last[i];
+      else last[i] = rest[i];
   }
 }
 
@@ -410,9 +421,9 @@ static void begin_still(const incsfa *s, const frames *x, still *t) {
 }
 
 /* Bring mean and vectors to the end of the block where it stands still. `before` has
- * (K + 1 + 3, BATCH CELL). L is lower triangular: three rows need the columns up to the last. */
+ * (K + 1 + 3, ROW). L is lower triangular: three rows need the columns up to the last. */
 static void settle_still(const incsfa *s, const still *t, double *before) {
-  int64_t K = s->components, row = BATCH * CELL;
+  int64_t K = s->components, row = ROW;
   double *after = before + (K + 1) * row;
   for (int64_t first = 0; first < t->cells; first += BATCH) {
     int64_t few = smaller(BATCH, t->cells - first);
@@ -420,16 +431,14 @@ static void settle_still(const incsfa *s, const still *t, double *before) {
     memcpy(before, t->p + first * CELL, (size_t)(few * CELL) * sizeof(double));
     for (int64_t k = 0; k < K; k++)
       for (int64_t n = 0; n < few; n++)
-        memcpy(before + (k + 1) * row + n * CELL, s->v + k * s->inputs + at[n] * CELL,
-               CELL * sizeof(double));
+        copy_cell(s->v + k * s->inputs + at[n] * CELL, before + (k + 1) * row + n * CELL);
     for (int64_t j = 0; j < K; j += 3) {
       int64_t stop = smaller(j + 3, K);
       multiply(stop - j, stop + 1, few * CELL, t->table + j * t->width, t->width, before, row,
                after, row);
       for (int64_t k = j; k < stop; k++)
         for (int64_t n = 0; n < few; n++)
-          memcpy(s->v + k * s->inputs + at[n] * CELL, after + (k - j) * row + n * CELL,
-                 CELL * sizeof(double));
+          copy_cell(after + (k - j) * row + n * CELL, s->v + k * s->inputs + at[n] * CELL);
     }
     for (int64_t n = 0; n < few * CELL; n++) {
       double *mean = s->mean + at[n / CELL] * CELL + n % CELL;
@@ -472,7 +481,7 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
   gap = gap || s->counts[0] == 0;
   int64_t tiles = (size + TILE - 1) / TILE;
   int64_t needed = 2 * every + tiles * GROUP * TILE + K * (7 * GROUP + 6) + K * K + 2 * J * K +
-                   J * TILE + every * CELL + (K + GROUP) * (K + 2) + (K + 4) * BATCH * CELL;
+                   J * TILE + every * CELL + (K + GROUP) * (K + 2) + (K + 4) * ROW;
   double *memory = malloc((size_t)needed * sizeof *memory), *spare = memory, *copies = NULL;
   if (!memory) return NO_MEMORY;
   int64_t *cells = (int64_t *)take(&spare, every);
@@ -530,7 +539,7 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
   if (t.width) {
     copy_columns(1, s->mean, size, &c, c.mean, 1);
     copy_columns(K, s->v, size, &c, c.v, 1);
-    settle_still(s, &t, take(&spare, (K + 4) * BATCH * CELL));
+    settle_still(s, &t, take(&spare, (K + 4) * ROW));
     for (int64_t start = 0; shown && start < size; start += TILE)
       slow_features(s, w.m, start, smaller(TILE, size - start), w.rows, TILE);
   }

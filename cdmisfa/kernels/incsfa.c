@@ -99,6 +99,9 @@ INLINE void ccipca_step(const incsfa *s, double weight, double *restrict r) {
   }
 }
 
+enum { VECTORS = 4 }; /* that are read together: rows of images are multiples of 4 KB, so more of
+                         them would fall on the same lines of L1 */
+
 /* Express phi on the vectors: m = w diag(scale). */
 INLINE void features_in_vectors(const incsfa *s, double *scale, double *m) {
   whitening_scales(s->components, s->d, scale);
@@ -111,8 +114,11 @@ INLINE void features_in_vectors(const incsfa *s, double *scale, double *m) {
  * `rows` (J, stride) is scratch. */
 INLINE double slow_features(const incsfa *s, const double *m, int64_t start, int64_t width,
                             double *rows, int64_t stride) {
-  multiply(s->outputs, s->components, width, m, s->components, s->v + start, s->inputs, rows,
-           stride);
+  int64_t K = s->components, J = s->outputs;
+  for (int64_t j = 0; j < J; j++) memset(rows + j * stride, 0, (size_t)width * sizeof *rows);
+  for (int64_t k = 0; k < K; k += VECTORS)
+    add_multiplied(J, smaller(VECTORS, K - k), width, m + k, K, s->v + k * s->inputs + start,
+                   s->inputs, rows, stride);
   double square = 0;
   for (int64_t j = 0; j < s->outputs; j++) {
     double *phi = s->phi + j * s->inputs + start;

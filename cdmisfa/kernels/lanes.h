@@ -283,14 +283,14 @@ static void add_products(int64_t rows, int64_t frames, const double *v, int64_t 
   }
 }
 
-/* Some rows of `multiply`, over `blocks` times four columns; both are constants where called. */
+/* Some rows of `add_multiplied`, of `blocks` times four columns; both are constants where called. */
 INLINE void multiply_block(int rows, int blocks, int64_t parts, const double *a, int64_t a_row,
                            const double *b, int64_t b_row, double *c, int64_t c_row) {
   lanes s[3][4];
 #pragma GCC unroll 3
   for (int r = 0; r < rows; r++)
 #pragma GCC unroll 4
-    for (int i = 0; i < blocks; i++) s[r][i] = spread(0);
+    for (int i = 0; i < blocks; i++) s[r][i] = load(c + r * c_row + i * LANES);
   for (int64_t p = 0; p < parts; p++)
 #pragma GCC unroll 4
     for (int i = 0; i < blocks; i++) {
@@ -304,7 +304,7 @@ INLINE void multiply_block(int rows, int blocks, int64_t parts, const double *a,
     for (int i = 0; i < blocks; i++) store(c + r * c_row + i * LANES, s[r][i]);
 }
 
-/* All rows of `multiply` over `blocks` times four columns. */
+/* All rows of it over `blocks` times four columns. */
 INLINE void multiply_columns(int blocks, int64_t rows, int64_t parts, const double *a,
                              int64_t a_row, const double *b, int64_t b_row, double *c,
                              int64_t c_row) {
@@ -317,9 +317,10 @@ INLINE void multiply_columns(int blocks, int64_t rows, int64_t parts, const doub
     multiply_block(1, blocks, parts, a + r * a_row, a_row, b, b_row, c + r * c_row, c_row);
 }
 
-/* c = a b, of (rows, parts) and (parts, width): every number is a sum in the order of the parts. */
-void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
-              const double *b, int64_t b_row, double *c, int64_t c_row) {
+/* c += a b, see `multiply`. */
+static void add_multiplied(int64_t rows, int64_t parts, int64_t width, const double *a,
+                           int64_t a_row, const double *b, int64_t b_row, double *c,
+                           int64_t c_row) {
   int64_t j = 0;
   for (; j + 4 * LANES <= width; j += 4 * LANES)
     multiply_columns(4, rows, parts, a, a_row, b + j, b_row, c + j, c_row);
@@ -327,10 +328,17 @@ void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64
     multiply_columns(1, rows, parts, a, a_row, b + j, b_row, c + j, c_row);
   for (; j < width; j++)
     for (int64_t r = 0; r < rows; r++) {
-      double total = 0;
+      double total = c[r * c_row + j];
       for (int64_t p = 0; p < parts; p++) total = fused(a[r * a_row + p], b[p * b_row + j], total);
       c[r * c_row + j] = total;
     }
+}
+
+/* c = a b, of (rows, parts) and (parts, width): every number is a sum in the order of the parts. */
+void multiply(int64_t rows, int64_t parts, int64_t width, const double *a, int64_t a_row,
+              const double *b, int64_t b_row, double *c, int64_t c_row) {
+  for (int64_t r = 0; r < rows; r++) memset(c + r * c_row, 0, (size_t)width * sizeof *c);
+  add_multiplied(rows, parts, width, a, a_row, b, b_row, c, c_row);
 }
 
 /* The first n of spare numbers, which are then no longer spare. */
