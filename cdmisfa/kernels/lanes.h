@@ -283,7 +283,7 @@ static void add_products(int64_t rows, int64_t frames, const double *v, int64_t 
   }
 }
 
-/* Some rows of `add_multiplied`, of `blocks` times four columns; both are constants where called. */
+/* Some rows of `add_multiplied`, over `blocks` times four columns; both constants where called. */
 INLINE void multiply_block(int rows, int blocks, int64_t parts, const double *a, int64_t a_row,
                            const double *b, int64_t b_row, double *c, int64_t c_row) {
   lanes s[3][4];
