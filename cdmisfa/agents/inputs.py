@@ -65,7 +65,10 @@ def rows_of(block: Block, spec: SourceSpec, stream: int, tau: int) -> NDArray[An
         raise ValueError(
             f"the learner asked for frames of {spec.frame_shape} {spec.dtype}, not {shape} {dtype}"
         )
-    if dtype.kind == "f" and not (np.abs(block.frames) <= LARGEST_VALUE).all():
+    if dtype.kind == "f" and not (  # a NaN is neither, and no array is made
+        block.frames.max(initial=0) <= LARGEST_VALUE
+        and block.frames.min(initial=0) >= -LARGEST_VALUE
+    ):
         finite = np.isfinite(block.frames).all()
         what = f"larger than {LARGEST_VALUE:g}" if finite else "no finite number"
         raise CdmisfaError(

@@ -547,3 +547,12 @@ int incsfa_by_gram(const incsfa *s, const frames *x, int gap, double *xi) {
   free(memory);
   return 0;
 }
+
+/* Learn from consecutive frames (n, I).
+ *
+ * The first frame after a gap, and the very first, update mean and whitening only. xi (n,)
+ * receives the change of phi at each frame, NaN at such ones.
+ */
+int incsfa_update(const incsfa *s, const frames *x, int gap, double *xi) {
+  return s->inputs < MANY_INPUTS ? incsfa_by_frame(s, x, gap, xi) : incsfa_by_gram(s, x, gap, xi);
+}

@@ -167,12 +167,3 @@ int incsfa_by_frame(const incsfa *s, const frames *x, int gap, double *xi) {
   }
   return update_by_frame(s, x, gap, xi);
 }
-
-/* Learn from consecutive frames (n, I).
- *
- * The first frame after a gap, and the very first, update mean and whitening only. xi (n,)
- * receives the change of phi at each frame, NaN at such ones.
- */
-int incsfa_update(const incsfa *s, const frames *x, int gap, double *xi) {
-  return s->inputs < MANY_INPUTS ? incsfa_by_frame(s, x, gap, xi) : incsfa_by_gram(s, x, gap, xi);
-}
