@@ -16,8 +16,8 @@ from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream, NothingLoggedError
 from replay.camera_logs.video_messages import in_order
-from replay.mcap.identity import hashed
 from replay.storage.hashing import Hashed, HashedFiles
+from replay.storage.identity import hashed
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
 

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import frames as kernels
-from replay.mcap.reader import LogReader
-from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord
-from replay.mcap.segments import Segment
-from replay.mcap.tables import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Place, Segment
+from recorder.mcap.tables import MessageTable
 from replay.recordings.channel_rows import own_messages
-from replay.storage.location import Location
 
 Places = NDArray[np.int64]
 
@@ -47,7 +45,7 @@ class RowLayout:
     distances: Places
     width: int
 
-    def checked_ends(self, path: Location, segment: Segment, table: MessageTable) -> Places:
+    def checked_ends(self, path: Place, segment: Segment, table: MessageTable) -> Places:
         """Place after each message of the channel in its chunk, (n,), if all are laid out so.
 
         Raises:

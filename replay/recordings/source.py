@@ -15,11 +15,11 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.log.whole import PARTIAL
-from replay.mcap.identity import hashed
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
+from recorder.mcap.store import PARTIAL
 from replay.recordings.view_file import ViewFile, intersection
 from replay.storage.hashing import Hashed, LoggedSource
+from replay.storage.identity import hashed
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url
 from replay.stored import joined

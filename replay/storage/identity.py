@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
-from recorder.mcap.writer import MAGIC
-from replay.mcap.reader import LogReader
-from replay.storage.hashing import Hashed, HashedBytes, Told
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAGIC
+from replay.storage.hashing import PIECE, Hashed, HashedBytes, Told, sampled
 from replay.storage.location import Url
 
 
@@ -44,7 +45,12 @@ class _HashedLog(HashedBytes):
         self._found = "", 0
 
     def sample(self) -> str:
-        return self._data.sample()
+        found = hashlib.sha256()
+        for place in sampled(self.size):
+            found.update(self._data.read(place, PIECE))
+        for block in self._data.tail():
+            found.update(block)
+        return found.hexdigest()
 
     def read(self, memory: memoryview, told: Told) -> None:
         self._found = self._data.hashed(0, memory, told)

@@ -12,15 +12,15 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from replay.mcap.records import (
+from recorder.mcap.records import (
     MESSAGE_FIELDS,
     MESSAGE_HEADER,
     RECORD_HEADER,
     Bytes,
     MalformedRecord,
+    Segment,
     walk,
 )
-from replay.mcap.segments import Segment
 
 MAX_MESSAGES: Final = 1 << 20
 """Most messages of a chunk that are read; their table takes some 100 bytes of each."""

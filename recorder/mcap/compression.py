@@ -10,7 +10,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
+from recorder.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
 
 _WINDOW: Final = MAX_CHUNK // 2
 """Most memory that zstd may take for its window, in bytes."""
