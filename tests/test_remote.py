@@ -190,7 +190,7 @@ def test_cut_logs_are_said_to_be_cut_and_saved(
 def test_damage_in_a_chunk_is_found_when_it_is_read(
     cdmisfa: Cdmisfa, web: WebServer, views: list[str]
 ) -> None:
-    with LogReader(views[0]) as reader:
+    with LogReader(open_store(views[0])) as reader:
         segment = reader.segments[len(reader.segments) // 2]
     broken = bytearray(web.files["/rec/x1.mcap"])
     broken[segment.data_offset + segment.stored // 2] ^= 1
