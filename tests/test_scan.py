@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz_oracle import tabled_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import frames as reference
@@ -26,6 +25,7 @@ from recorder.mcap.tables import indexed_table
 from recorder.recording import record_scene
 from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
+from tools.fuzz.oracle import tabled_rows
 
 pytestmark = pytest.mark.usefixtures("both_modules")
 

@@ -1,8 +1,8 @@
 """The MCAP file: read with no trust in what it says, and written."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.mcap.reader": "LogReader",

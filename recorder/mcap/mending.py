@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 from mcap.opcode import Opcode
 
+from cdmisfa.core.arrays import ByteArray
 from recorder.mcap.compression import Decompressor, check_size
 from recorder.mcap.records import (
     MESSAGE_HEADER,
     RECORD_HEADER,
-    Bytes,
     MalformedRecord,
     Problem,
     Segment,
@@ -117,7 +117,7 @@ def _checked_table(
 ) -> MessageTable:
     """The messages of a chunk whose CRC matches."""
     check_size(chunk.compression, chunk.size)
-    raw: Bytes = np.empty(chunk.size, np.uint8)
+    raw: ByteArray = np.empty(chunk.size, np.uint8)
     stored = memoryview(store.read(chunk.data_offset, chunk.stored))
     decompressor.decompress(stored, chunk.compression, raw)
     if not crc or crc32(raw.data) != crc:

@@ -13,13 +13,13 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.chunks import CACHE_BYTES, Chunks
 from recorder.mcap.data_section import DataSection
 from recorder.mcap.records import (
     MAX_CHUNK,
     Attachment,
-    Bytes,
     Channel,
     MalformedRecord,
     Message,
@@ -284,7 +284,7 @@ class LogReader:
         """Read a chunk's message indexes; see `Chunks.index`."""
         return self._chunks.index(segment)
 
-    def unpack(self, segment: Segment, out: Bytes) -> memoryview:
+    def unpack(self, segment: Segment, out: ByteArray) -> memoryview:
         """Decompress the records of a chunk with message indexes; see `Chunks.unpack`."""
         return self._chunks.unpack(segment, out)
 

@@ -13,7 +13,6 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 
@@ -43,8 +42,6 @@ MESSAGE_HEADER: Final = np.dtype(
 INDEX_HEADER: Final = RECORD_HEADER.size + 6
 """Bytes before the pairs of a message index."""
 MESSAGE_FIELDS: Final = MESSAGE_HEADER.itemsize - RECORD_HEADER.size
-
-Bytes = NDArray[np.uint8]
 
 
 class Place(Protocol):

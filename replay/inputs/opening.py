@@ -18,8 +18,8 @@ from replay.camera_logs.source import ForeignSource, UnequalError
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
-from replay.storage.identity import starts_as_log
 from replay.storage.location import Location, Url
+from replay.storage.log_identity import starts_as_log
 from replay.storage.opening import open_store
 
 Logged = RecordedSource | ForeignSource

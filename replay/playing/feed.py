@@ -25,8 +25,8 @@ from recorder.mcap.reader import LogReader
 from replay.camera_logs.catalogue import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
-from replay.storage.identity import starts_as_log
 from replay.storage.listing import log_files
+from replay.storage.log_identity import starts_as_log
 from replay.storage.opening import open_store
 
 READ_AHEAD = 50
