@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import asdict, dataclass
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS, time_of
 from recorder.cameras.camera import Picture
-from recorder.images.pixels import Bytes
 
 
 @dataclass(slots=True)
@@ -97,14 +97,14 @@ class Grid:
             counts.late += 1
         self._coming[stream].append(picture)
 
-    def decide(self) -> list[Bytes | None]:
+    def decide(self) -> list[ByteArray | None]:
         """What each stream shows at the next tick, None where it shows nothing."""
         now = self.time_ns
         row = [self._show(stream, now) for stream in range(len(self.counts))]
         self.tick += 1
         return row
 
-    def _show(self, stream: int, now: int) -> Bytes | None:
+    def _show(self, stream: int, now: int) -> ByteArray | None:
         counts, coming = self.counts[stream], self._coming[stream]
         while coming and coming[0].time_ns <= now:
             counts.dropped += not self._shown[stream]

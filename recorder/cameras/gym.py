@@ -12,13 +12,14 @@ from typing import Any, Final
 import numpy as np
 from PIL import Image
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, one_line
 from recorder.cameras.stepped import Step, SteppedSource
 from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
-from recorder.images.pixels import RECIPE, Bytes
+from recorder.images.pixels import RECIPE
 
 LARGEST_SEED: Final = 2**31 - 1
 
@@ -178,7 +179,7 @@ def package(name: str, extra: str) -> Any:
         raise UsageError(missing) from error
 
 
-def picture(seen: Any) -> Bytes:
+def picture(seen: Any) -> ByteArray:
     """A colour picture in gray, (height, width) uint8."""
     return np.asarray(Image.fromarray(seen).convert("L"))
 
