@@ -5,10 +5,9 @@ from cdmisfa.core.faces import face
 __getattr__, __dir__, __all__ = face(
     __name__,
     {
-        "recorder.cameras.camera": "Camera",
-        "recorder.cameras.gym": "GymSource",
         "recorder.cameras.live": "LiveSource",
-        "recorder.cameras.stepped": "ArraySource",
+        "recorder.cameras.readers": "Camera",
+        "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.cameras.words": "CAMERAS CameraKind open_live",
     },
 )
