@@ -12,7 +12,7 @@ records sources, `replay` reads and shows what was logged.
 
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
 if TYPE_CHECKING:
     from cdmisfa.agents.learner import CuriousLearner as CuriousLearner
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-_load, __dir__, __all__ = face(
+_load, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.agents.learner": "CuriousLearner",

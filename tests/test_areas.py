@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from PIL import Image
 from reference import frames as reference
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.kernels import frames as kernels
 from recorder.images import areas, pixels
 from recorder.images.areas import averaged
 from recorder.images.framing import Fit, Framing
-from recorder.images.pixels import Bytes
 
 pytestmark = pytest.mark.usefixtures("both_modules", "untried")
 
@@ -29,11 +29,11 @@ def untried(both_modules: None) -> Iterator[None]:
     areas._as_pillow.cache_clear()
 
 
-def by_pillow(image: Bytes, height: int, width: int) -> Bytes:
+def by_pillow(image: ByteArray, height: int, width: int) -> ByteArray:
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BOX))
 
 
-def noise(rows: int, columns: int, seed: int = 0, least: int = 0) -> Bytes:
+def noise(rows: int, columns: int, seed: int = 0, least: int = 0) -> ByteArray:
     return np.random.default_rng(seed).integers(least, 256, (rows, columns), np.uint8)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz_oracle import tabled_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import frames as reference
@@ -27,6 +26,7 @@ from replay.mcap.segments import Segment
 from replay.mcap.tables import indexed_table
 from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
+from tools.fuzz.oracle import tabled_rows
 
 pytestmark = pytest.mark.usefixtures("both_modules")
 

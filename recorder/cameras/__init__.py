@@ -1,8 +1,8 @@
 """Live streams from outside: cameras, robots, simulated tasks, and arrays of the caller's."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.cameras.live": "LiveSource",

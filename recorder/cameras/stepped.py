@@ -13,22 +13,22 @@ from itertools import chain, islice
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
 from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
-from recorder.images.pixels import RECIPE, Bytes
+from recorder.images.pixels import RECIPE
 
 LARGEST_SEED: Final = 2**31 - 1
 
 FPS: Final = 30.0
 """Frames a second of an environment that states no rate."""
 
-Step = tuple[Sequence[Any], NDArray[np.float64]]
+Step = tuple[Sequence[Any], FloatArray]
 """The frame of each stream, and what the world knows at it, (D,) float64."""
 
 Policy = Callable[[Any], Any]
@@ -259,7 +259,7 @@ def make_environment(task: str, **options: Any) -> Any:
         raise UsageError(f"gym:{task} cannot be made: {one_line(error)}") from None
 
 
-def gray_picture(seen: Any) -> Bytes:
+def gray_picture(seen: Any) -> ByteArray:
     """A colour picture, (height, width, 3), in gray, (height, width) uint8."""
     return np.asarray(Image.fromarray(seen).convert("L"))
 

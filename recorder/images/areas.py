@@ -10,19 +10,17 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.kernels import Struct
 from cdmisfa.kernels.frames import MOST_AVERAGED, areas, average
-
-Bytes = NDArray[np.uint8]
 
 _TRIED: Final = 2000
 """Averages at least that are compared with Pillow's for each size, of 50 images at most."""
 
 
-def averaged(image: Bytes, height: int, width: int) -> Bytes | None:
+def averaged(image: ByteArray, height: int, width: int) -> ByteArray | None:
     """Average the areas of an image into fewer pixels.
 
     Args:

@@ -10,7 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from recorder.images.pixels import RECIPE, Bytes, raw_image
+from cdmisfa.core.arrays import ByteArray
+from recorder.images.pixels import RECIPE, raw_image
 
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
@@ -40,7 +41,7 @@ _WEIGHTS: Final = {
 """Of BT.709 and BT.601: red by Cr, green by Cb and by Cr, blue by Cb."""
 
 
-def frame_colors(frame: Any) -> Bytes:
+def frame_colors(frame: Any) -> ByteArray:
     """The colours of a frame of PyAV, (height, width, 3) uint8, or the luma of one without.
 
     It is turned upright, as `frame_gray` is.
@@ -48,7 +49,7 @@ def frame_colors(frame: Any) -> Bytes:
     return _upright(_colors(frame), frame)
 
 
-def frame_gray(frame: Any) -> Bytes:
+def frame_gray(frame: Any) -> ByteArray:
     """The luma of a frame of PyAV, or the grey of its colours, (height, width) uint8.
 
     It is turned by quarters and mirrored, as a telephone says how it was held.
@@ -56,7 +57,7 @@ def frame_gray(frame: Any) -> Bytes:
     return _upright(_luma(frame), frame)
 
 
-def _upright(pixels: Bytes, frame: Any) -> Bytes:
+def _upright(pixels: ByteArray, frame: Any) -> ByteArray:
     """Pixels turned by quarters, and mirrored, as the display matrix of their frame says.
 
     Source: FFmpeg's libavutil/display.h. A point (x, y) is shown at (a x + c y, b x + d y).
@@ -73,13 +74,13 @@ def _upright(pixels: Bytes, frame: Any) -> Bytes:
     return np.ascontiguousarray(pixels[:: -1 if down < 0 else 1, :: -1 if right < 0 else 1])
 
 
-def _colors(frame: Any) -> Bytes:
+def _colors(frame: Any) -> ByteArray:
     form = frame.format
     if form.name.startswith("gray"):
         return _luma(frame)
     luma_first = form.name.startswith("yuv") and len(form.components) >= 3
     if not luma_first or form.components[0].bits != 8 or not form.is_planar:
-        colours: Bytes = frame.to_ndarray(format="rgb24")
+        colours: ByteArray = frame.to_ndarray(format="rgb24")
         return colours
     luma = _luma(frame).astype(np.int32) << 16
     full = form.name.startswith("yuvj") or frame.color_range == _FULL_RANGE
@@ -99,7 +100,7 @@ def _colors(frame: Any) -> Bytes:
     return np.stack([((c + 32768) >> 16).clip(0, 255).astype(np.uint8) for c in colors], axis=2)
 
 
-def _luma(frame: Any) -> Bytes:
+def _luma(frame: Any) -> ByteArray:
     form = frame.format
     if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
         colours = frame.to_ndarray(format="rgb24")

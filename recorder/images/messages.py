@@ -17,10 +17,10 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.pixels import (
     DISTANCES,
-    Bytes,
     Depth,
     MalformedImage,
     compressed_image,
@@ -29,7 +29,7 @@ from recorder.images.pixels import (
 )
 from recorder.images.videos import Packet, VideoPackets
 
-Decoder = Callable[[bytes | memoryview], Bytes]
+Decoder = Callable[[bytes | memoryview], ByteArray]
 """Turns a message into a gray image, (height, width) uint8; raises MalformedImage.
 
 One that is `VideoPackets` has to be called with the messages in their order.
@@ -92,7 +92,7 @@ def _foxglove_raw(data: bytes | memoryview) -> Pixels:
     return Pixels(m.data, m.height, m.width, m.encoding, m.step)
 
 
-def _unpacked(image: Compressed, depth: Depth | None, *, color: bool) -> Bytes:
+def _unpacked(image: Compressed, depth: Depth | None, *, color: bool) -> ByteArray:
     """What a compressed image shows; see `raw_image`."""
     if image.encoding not in DISTANCES:
         return compressed_image(image.data, color=color)

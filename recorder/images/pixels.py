@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.areas import averaged
-
-Bytes = NDArray[np.uint8]
 
 Shown = NDArray[Any]
 """What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
@@ -99,7 +98,7 @@ def raw_image(
     big_endian: bool = False,
     depth: Depth | None = None,
     color: bool = False,
-) -> Bytes:
+) -> ByteArray:
     """The image that pixels of any supported format show, gray, (height, width) uint8.
 
     Of a Bayer pattern each two by two pixels become one, (height // 2, width // 2).
@@ -167,7 +166,7 @@ def raw_image(
     return found
 
 
-def _bayer_gray(pixels: Bytes, order: str) -> Bytes:
+def _bayer_gray(pixels: ByteArray, order: str) -> ByteArray:
     """The grey of each two by two pixels of a Bayer pattern, without interpolation."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
@@ -184,7 +183,7 @@ def _bayer_gray(pixels: Bytes, order: str) -> Bytes:
     return found
 
 
-def _bayer_colors(pixels: Bytes, order: str) -> Bytes:
+def _bayer_colors(pixels: ByteArray, order: str) -> ByteArray:
     """The colours of each two by two pixels of a Bayer pattern; green is the mean of its two."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
@@ -195,7 +194,7 @@ def _bayer_colors(pixels: Bytes, order: str) -> Bytes:
     return np.stack([cells[order.index("r")], green, cells[order.index("b")]], axis=2)
 
 
-def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> Bytes:
+def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray:
     """Distances as gray; 0, infinity and NaN, which are none, as black."""
     near, far = depth
     if near < 0:
@@ -214,14 +213,14 @@ def _bands(height: int, width: int) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, height, step))
 
 
-def _high_bytes(pixels: NDArray[Any]) -> Bytes:
+def _high_bytes(pixels: NDArray[Any]) -> ByteArray:
     found = np.empty(pixels.shape, np.uint8)
     for band in _bands(*pixels.shape):
         found[band] = (pixels[band].astype(np.int64) >> 8).clip(0, 255)
     return found
 
 
-def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> Bytes:
+def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) -> ByteArray:
     """Average the areas of a gray image into fewer pixels.
 
     Args:
@@ -246,7 +245,7 @@ def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> B
     return np.asarray(small, np.uint8)
 
 
-def compressed_image(data: bytes, *, color: bool = False) -> Bytes:
+def compressed_image(data: bytes, *, color: bool = False) -> ByteArray:
     """The image in a JPEG or PNG, gray, (height, width) uint8.
 
     Args:

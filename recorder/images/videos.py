@@ -6,10 +6,11 @@ import re
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.memory import BUDGET
 from recorder.images.frames import frame_colors, frame_gray
-from recorder.images.pixels import MAX_PIXELS, Bytes, MalformedImage
+from recorder.images.pixels import MAX_PIXELS, MalformedImage
 
 HELD: Final = 17
 """Pictures that a decoder holds at most, where they are made from one another: 16 and its own."""
@@ -66,7 +67,7 @@ class VideoPackets:
         if self._context is not None:
             self._context.flush_buffers()
 
-    def __call__(self, message: bytes | memoryview) -> Bytes:
+    def __call__(self, message: bytes | memoryview) -> ByteArray:
         """The picture of the next message, (height, width) uint8, or its colours.
 
         Raises:

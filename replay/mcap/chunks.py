@@ -14,16 +14,11 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.blocks import freeze
 from recorder.mcap.checksum import crc32
 from replay.mcap.compression import Decompressor, Memory, check_size
-from replay.mcap.records import (
-    INDEX_HEADER,
-    MAX_CHUNK,
-    RECORD_HEADER,
-    Bytes,
-    MalformedRecord,
-)
+from replay.mcap.records import INDEX_HEADER, MAX_CHUNK, RECORD_HEADER, MalformedRecord
 from replay.mcap.segments import Definitions, Segment
 from replay.mcap.tables import MessageTable, Spans, indexed_table, walked_table
 from replay.storage.once import OnePass
@@ -50,7 +45,7 @@ _OF_CHUNK: Final = bytes([Opcode.CHUNK])
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 """Of a message index: opcode, length, channel, bytes of the pairs."""
 
-Unpacked = tuple[Bytes, bytes]
+Unpacked = tuple[ByteArray, bytes]
 """The records of a chunk, and what of its message indexes follows it in the file."""
 
 
@@ -124,7 +119,7 @@ class Chunks:
             raise MalformedRecord("its message index is larger than any chunk")
         return _pairs(segment, self._file.read(first, size), first)
 
-    def unpack(self, segment: Segment, out: Bytes) -> memoryview:
+    def unpack(self, segment: Segment, out: ByteArray) -> memoryview:
         """Decompress the records of a chunk with message indexes into `out`, (segment.size,).
 
         Returns:
@@ -193,7 +188,7 @@ class Chunks:
         if not segment.crc:
             self._without_crc()
 
-    def _unpack(self, segment: Segment, file: Store, out: Bytes | None = None) -> Unpacked:
+    def _unpack(self, segment: Segment, file: Store, out: ByteArray | None = None) -> Unpacked:
         """Read a chunk with its message indexes at once, decompress it and check its CRC.
 
         Args:
@@ -244,7 +239,9 @@ class Chunks:
             self._definitions.add(opcode, raw[start:stop].tobytes(), segment.name)
         return table
 
-    def _table_of(self, segment: Segment, raw: Bytes, after: bytes) -> tuple[MessageTable, Spans]:
+    def _table_of(
+        self, segment: Segment, raw: ByteArray, after: bytes
+    ) -> tuple[MessageTable, Spans]:
         if not segment.indexes:
             return walked_table(raw)
         try:

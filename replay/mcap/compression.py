@@ -10,7 +10,8 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
+from cdmisfa.core.arrays import ByteArray
+from replay.mcap.records import MAX_CHUNK, MalformedRecord
 
 _WINDOW: Final = MAX_CHUNK // 2
 """Most memory that zstd may take for its window, in bytes."""
@@ -29,10 +30,10 @@ class Memory:
     """
 
     def __init__(self) -> None:
-        self._held: list[Bytes] = []
+        self._held: list[ByteArray] = []
         self._lock = threading.Lock()
 
-    def take(self, size: int) -> Bytes:
+    def take(self, size: int) -> ByteArray:
         """Memory of some bytes, which hold anything."""
         with self._lock:
             held = self._held
@@ -62,7 +63,7 @@ class Decompressor:
         found: zstandard.ZstdDecompressor = self._own.zstd
         return found
 
-    def decompress(self, stored: memoryview, compression: str, out: Bytes) -> None:
+    def decompress(self, stored: memoryview, compression: str, out: ByteArray) -> None:
         """Write the records of a chunk into memory of the size that it states.
 
         Raises:
@@ -85,7 +86,7 @@ class Decompressor:
         if there != size:
             raise MalformedRecord(f"it states {size} bytes decompressed and holds {there}")
 
-    def _from_zstd(self, stored: memoryview, out: Bytes) -> int:
+    def _from_zstd(self, stored: memoryview, out: ByteArray) -> int:
         """How many bytes there are; one more than fit stands for any number of them."""
         size = len(out)
         stated = int(zstandard.frame_content_size(stored))
@@ -139,7 +140,7 @@ def check_size(compression: str, size: int) -> None:
         )
 
 
-def _from_lz4(stored: memoryview, out: Bytes) -> int:
+def _from_lz4(stored: memoryview, out: ByteArray) -> int:
     """How many bytes there are; one more than fit stands for any number of them."""
     size = len(out)
     stated = lz4.frame.get_frame_info(stored)["content_size"]

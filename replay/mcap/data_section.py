@@ -11,7 +11,7 @@ from recorder.mcap.checksum import crc32
 from recorder.mcap.writer import MAGIC
 from replay.mcap.summary import FOOTER_BYTES
 from replay.mcap.walk import DATA_END_BYTES, LogStructure
-from replay.storage.hashing import PIECE, sampled
+from replay.storage.identity import PIECE, Counted, sampled
 from replay.storage.location import Url
 from replay.storage.store import Store
 
@@ -74,33 +74,23 @@ class DataSection:
         spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, size))
         return [self._file.crc(start, stop) for start, stop in spans]
 
-    def sha256(self, start: int) -> str:
-        """SHA-256 of the file from a place on, with its checksum checked where that is 0."""
-        found, crc = self.hashed(start, memoryview(bytearray(1 << 20)), lambda count: None)
-        if start == 0:
-            self.check(crc)
-        return found
-
-    def hashed(
-        self, start: int, memory: memoryview, told: Callable[[int], None]
-    ) -> tuple[str, int]:
-        """SHA-256 of the file from a place on, and the checksum of the data behind that.
-
-        Nothing else of the log is touched, so that a thread of its own may do it.
+    def sha256(self, start: int, counted: Counted = lambda count: None) -> str:
+        """SHA-256 of the file from a place on, with its checksum checked where that is 0.
 
         Args:
             start: the place.
-            memory: as many bytes as are read at once.
-            told: of bytes that were hashed; what it raises ends that.
+            counted: told of bytes that were hashed.
         """
         sha256, crc, at = hashlib.sha256(), 0, start
         end = self._structure.data_end if self._structure.data_crc else 0
-        for piece in self._file.pieces(start, self._file.size, memory):
-            sha256.update(piece)
-            crc = crc32(piece[: max(end - at, 0)], crc)
-            at += len(piece)
-            told(len(piece))
-        return sha256.hexdigest(), crc
+        for block in self._file.blocks(start, self._file.size):
+            sha256.update(block)
+            crc = crc32(block[: max(end - at, 0)], crc)
+            at += len(block)
+            counted(len(block))
+        if start == 0:
+            self.check(crc)
+        return sha256.hexdigest()
 
     def sample(self) -> str:
         """SHA-256 of a few pieces of the file, and where it was opened by its index, of that."""

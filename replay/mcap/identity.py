@@ -1,4 +1,4 @@
-"""What tells a log from other files, and from other logs."""
+"""Identity of an MCAP log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.writer import MAGIC
 from replay.mcap.reader import LogReader
-from replay.storage.hashing import Hashed, HashedBytes, Told
+from replay.storage.identity import ByteIdentity, Counted, Identity
 from replay.storage.location import Url
 
 
@@ -25,61 +25,51 @@ def starts_as_log(path: Path) -> bool:
         raise CdmisfaError(f"{path}: {error.strerror}") from None
 
 
-def hashed(*readers: LogReader) -> Hashed:
-    """What tells a log from others, given its readers, one at least.
+def log_identity(*readers: LogReader) -> Identity:
+    """The identity of a log, given its readers, one at least.
 
     Of a URL, so that not every byte is read, its size and `index_sha256`: over the file from
     its data end record on, which holds the checksum of all data and where each chunk is. Where
     the index does not account for every message, `sha256` over all of it, too.
     """
-    return (_HashedUrl if isinstance(readers[0].path, Url) else _HashedLog)(*readers)
+    return (_RemoteIdentity if isinstance(readers[0].path, Url) else _LocalIdentity)(*readers)
 
 
-class _HashedLog(HashedBytes):
+class _LocalIdentity(ByteIdentity):
     """A log in a file, whose sample holds all from its data end record on."""
 
     def __init__(self, reader: LogReader, *_: LogReader) -> None:
         self.path, self.size = reader.path, reader.size
         self._data = reader.data
-        self._found = "", 0
 
-    def sample(self) -> str:
+    def sample_sha256(self) -> str:
         return self._data.sample()
 
-    def read(self, memory: memoryview, told: Told) -> None:
-        self._found = self._data.hashed(0, memory, told)
-
-    def sha256(self) -> str:
-        found, crc = self._found
-        self._data.check(crc)
-        return found
+    def sha256(self, counted: Counted) -> str:
+        return self._data.sha256(0, counted)
 
     def changed(self) -> bool:
         return self._data.changed()
 
 
-class _HashedUrl(Hashed):
-    """A log behind a URL, of which nothing is read beside other work."""
+class _RemoteIdentity(Identity):
+    """A log behind a URL, of which not all is read."""
 
     def __init__(self, *readers: LogReader) -> None:
         self.path, self.size = readers[0].path, 0
         self._readers = readers
         self._known: dict[str, Any] | None = None
 
-    def at_once(self) -> dict[str, Any]:
-        return self.whole()
+    def sample(self) -> dict[str, Any]:
+        return self.whole(lambda count: None)
 
-    def read(self, memory: memoryview, told: Told) -> None:
-        pass
-
-    def whole(self) -> dict[str, Any]:
+    def whole(self, counted: Counted) -> dict[str, Any]:
         reader = self._readers[0]
         if self._known is None:
             name = "index_sha256" if reader.by_index else "sha256"
             known = {"file": self.path.name, "url": str(self.path), "bytes": reader.size}
             self._known = {**known, name: reader.digest()}
+        else:
+            for reader in self._readers:
+                reader.confirm()
         return self._known
-
-    def confirm(self) -> None:
-        for reader in self._readers:
-            reader.confirm()

@@ -13,9 +13,10 @@ from typing import Final
 import numpy as np
 from mcap.opcode import Opcode
 
+from cdmisfa.core.arrays import ByteArray
 from recorder.mcap.checksum import crc32
 from replay.mcap.compression import Decompressor, check_size
-from replay.mcap.records import MESSAGE_HEADER, RECORD_HEADER, Bytes, MalformedRecord
+from replay.mcap.records import MESSAGE_HEADER, RECORD_HEADER, MalformedRecord
 from replay.mcap.segments import Problem, Segment
 from replay.mcap.summary import stated_chunks
 from replay.mcap.tables import MessageTable, walked_table
@@ -111,7 +112,7 @@ def _checked_table(
 ) -> MessageTable:
     """The messages of a chunk whose CRC matches."""
     check_size(chunk.compression, chunk.size)
-    raw: Bytes = np.empty(chunk.size, np.uint8)
+    raw: ByteArray = np.empty(chunk.size, np.uint8)
     stored = memoryview(store.read(chunk.data_offset, chunk.stored))
     decompressor.decompress(stored, chunk.compression, raw)
     if not crc or crc32(raw.data) != crc:

@@ -13,10 +13,11 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
 from replay.mcap.chunks import CACHE_BYTES, Chunks
 from replay.mcap.data_section import DataSection
-from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord, Schema
+from replay.mcap.records import MAX_CHUNK, Channel, MalformedRecord, Schema
 from replay.mcap.segments import Attachment, Message, Problem, Segment
 from replay.mcap.tables import MessageTable, in_order, within
 from replay.mcap.walk import LogStructure
@@ -280,7 +281,7 @@ class LogReader:
         """Read a chunk's message indexes; see `Chunks.index`."""
         return self._chunks.index(segment)
 
-    def unpack(self, segment: Segment, out: Bytes) -> memoryview:
+    def unpack(self, segment: Segment, out: ByteArray) -> memoryview:
         """Decompress the records of a chunk with message indexes; see `Chunks.unpack`."""
         return self._chunks.unpack(segment, out)
 

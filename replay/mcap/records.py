@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from replay.storage.location import Location
@@ -36,8 +35,6 @@ MESSAGE_HEADER: Final = np.dtype(
 INDEX_HEADER: Final = RECORD_HEADER.size + 6
 """Bytes before the pairs of a message index."""
 MESSAGE_FIELDS: Final = MESSAGE_HEADER.itemsize - RECORD_HEADER.size
-
-Bytes = NDArray[np.uint8]
 
 
 class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where

@@ -17,13 +17,13 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from recorder.mcap.writer import MAGIC
 from replay.mcap.records import (
     INDEX_HEADER,
     MAX_CHUNK,
     MAX_DEFINITION,
     RECORD_HEADER,
-    Bytes,
     Fields,
     MalformedRecord,
     Statistics,
@@ -226,7 +226,7 @@ def _index(file: Store, content: int, length: int) -> Fields:
     return Fields(file.read(content, length), "an index")
 
 
-def _alike(file: Store, at: int, stop: int, width: int) -> Bytes:
+def _alike(file: Store, at: int, stop: int, width: int) -> ByteArray:
     """The record at a place, and those after it of its opcode and length, (n, width) bytes."""
     most, wanted = (stop - at) // width, 1
     while True:
@@ -254,7 +254,7 @@ def _segments(file: Store, content: int, length: int, count: int) -> Iterator[Se
         yield _segment(_index(file, content + i * width, length))
 
 
-def _columns(rows: Bytes) -> list[Segment] | None:
+def _columns(rows: ByteArray) -> list[Segment] | None:
     """The chunks of many chunk indexes alike; None where each is to be looked at.
 
     Args:

@@ -12,14 +12,8 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from replay.mcap.records import (
-    MESSAGE_FIELDS,
-    MESSAGE_HEADER,
-    RECORD_HEADER,
-    Bytes,
-    MalformedRecord,
-    walk,
-)
+from cdmisfa.core.arrays import ByteArray
+from replay.mcap.records import MESSAGE_FIELDS, MESSAGE_HEADER, RECORD_HEADER, MalformedRecord, walk
 from replay.mcap.segments import Segment
 
 MAX_MESSAGES: Final = 1 << 20
@@ -42,7 +36,7 @@ class MessageTable:
         size: (n,) int64, bytes of the payload.
     """
 
-    data: Bytes
+    data: ByteArray
     headers: NDArray[np.void]
     at: NDArray[np.int64]
     size: NDArray[np.int64]
@@ -90,7 +84,7 @@ class MessageTable:
         return self.data[at : at + int(self.size[row])].data
 
 
-def table_at(data: Bytes, offsets: NDArray[np.int64]) -> MessageTable:
+def table_at(data: ByteArray, offsets: NDArray[np.int64]) -> MessageTable:
     """Build the table of the message records that begin at places of a chunk, and check them.
 
     Args:
@@ -125,7 +119,7 @@ def _check_count(messages: int) -> None:
         raise MalformedRecord(f"it holds more than {MAX_MESSAGES} messages, the limit of a chunk")
 
 
-def walked_table(raw: Bytes, *, cut: bool = False) -> tuple[MessageTable, Spans]:
+def walked_table(raw: ByteArray, *, cut: bool = False) -> tuple[MessageTable, Spans]:
     """Build the table of a chunk by walking over its records, without the broken end of a cut one.
 
     Raises:
@@ -151,7 +145,7 @@ def walked_table(raw: Bytes, *, cut: bool = False) -> tuple[MessageTable, Spans]
 
 
 def indexed_table(
-    data: Bytes, indexes: list[tuple[int, NDArray[np.uint64]]]
+    data: ByteArray, indexes: list[tuple[int, NDArray[np.uint64]]]
 ) -> tuple[MessageTable, Spans]:
     """Build the table of a chunk from its message indexes, without touching each message.
 

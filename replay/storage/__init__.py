@@ -1,8 +1,8 @@
 """Where bytes lie: a path or URL, and reading from it."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.storage.limits": "Limits limited",

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import HeadPose
 from recorder.world.icub.config import EyesConfig
 from recorder.world.icub.world import World
@@ -21,10 +22,9 @@ LUMA = (299, 587, 114)
 """Thousandths of red, green and blue in grey (ITU-R BT.601); whole numbers round exactly."""
 
 Matrix = tuple[float, ...]
-Vector = NDArray[np.float64]
 
 
-def eye_matrix(eyes: EyesConfig, neck: Vector, yaw: float, side: int) -> Matrix:
+def eye_matrix(eyes: EyesConfig, neck: FloatArray, yaw: float, side: int) -> Matrix:
     """View matrix of an eye, column by column as OpenGL has it.
 
     Args:
@@ -42,7 +42,7 @@ def eye_matrix(eyes: EyesConfig, neck: Vector, yaw: float, side: int) -> Matrix:
     return look(place, place + gaze)
 
 
-def look(place: Vector, target: Vector) -> Matrix:
+def look(place: FloatArray, target: FloatArray) -> Matrix:
     """View matrix of an upright camera at `place` that looks at `target`."""
     gaze = (target - place) / np.linalg.norm(target - place)
     right = np.cross(gaze, [0.0, 0.0, 1.0])

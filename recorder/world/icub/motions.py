@@ -10,8 +10,8 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import check_frame
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 
@@ -21,9 +21,8 @@ CHUNK = 4096
 _WORLD = 0x1C0B
 """Spawn key of the world: the learner may spawn its own generators from the same seed."""
 
-Float = NDArray[np.float64]
 
-Motion = Iterator[Float]
+Motion = Iterator[FloatArray]
 """Positions of one object, (CHUNK, 2), chunk after chunk."""
 
 
@@ -57,7 +56,7 @@ def walk(config: SphereConfig, generator: np.random.Generator) -> Motion:
         yield path
 
 
-def reflect(values: Float, limits: Range) -> Float:
+def reflect(values: FloatArray, limits: Range) -> FloatArray:
     """A free walk, (n,), as one that turns round at the limits."""
     low, high = limits
     width = high - low
@@ -91,7 +90,7 @@ class Motions:
             self._chunk += 1
         self._t = t
 
-    def take(self, n: int) -> Float:
+    def take(self, n: int) -> FloatArray:
         """(n, objects, 2) x and y in the next n frames, the paper's coordinates, metres."""
         parts = []
         while n > 0:
@@ -118,5 +117,5 @@ class Motions:
         self._chunk = -1
 
 
-def _uniform(unit: Float, limits: Range) -> Float:
+def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
     return limits[0] + (limits[1] - limits[0]) * unit

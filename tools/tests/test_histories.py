@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from tests.torture.histories import MOST, TAU, WORLDS, History
+from tools.torture.histories import MOST, TAU, WORLDS, History
 
 worlds = st.sampled_from(WORLDS)
 splits = st.sampled_from((None, "1s", "3s"))

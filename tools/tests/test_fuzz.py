@@ -8,11 +8,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import fuzz
-import fuzz_coverage
-import fuzz_decoders
-import fuzz_mutations
-import fuzz_oracle
 import pytest
 
 from cdmisfa.core.errors import LogDamagedError
@@ -20,6 +15,7 @@ from replay.mcap.chunks import Chunks
 from replay.mcap.data_section import DataSection
 from replay.mcap.reader import LogReader
 from replay.mcap.segments import Segment
+from tools.fuzz import decoders, guided, logs, mutations, oracle
 
 CASES = 10_000
 BATCHES = 20
@@ -28,30 +24,30 @@ BATCHES = 20
 @pytest.mark.parametrize("batch", range(BATCHES))
 def test_no_broken_log_breaks_a_promise(tmp_path: Path, batch: int) -> None:
     for number in range(batch, CASES, BATCHES):
-        case = fuzz_mutations.mutated(number)
+        case = mutations.mutated(number)
         try:
-            fuzz_oracle.check(case, tmp_path / "log.mcap", number)
+            oracle.check(case, tmp_path / "log.mcap", number)
         except Exception as error:
             pytest.fail(f"case {number} ({case.base}): {type(error).__name__}: {error}")
 
 
 def test_little_memory_is_asked_for(tmp_path: Path) -> None:
     for number in range(0, CASES, 500):
-        fuzz_oracle.check_memory(fuzz_mutations.mutated(number), tmp_path / "log.mcap")
+        oracle.check_memory(mutations.mutated(number), tmp_path / "log.mcap")
 
 
 def test_what_once_broke_the_reader_does_so_no_more(tmp_path: Path) -> None:
-    for path in fuzz.KEPT.glob("*.mcap"):
+    for path in logs.KEPT.glob("*.mcap"):
         for number in range(6):
-            fuzz_oracle.check(fuzz.kept(path), tmp_path / "log.mcap", number)
+            oracle.check(logs.kept(path), tmp_path / "log.mcap", number)
 
 
 def test_the_cases_reach_every_corner_of_the_reader(tmp_path: Path) -> None:
     """Neither all refused nor all whole, and never the same twice."""
     path, outcomes, files = tmp_path / "log.mcap", Counter[str](), set()
     for number in range(600):
-        case = fuzz_mutations.mutated(number)
-        assert fuzz_mutations.mutated(number).raw == case.raw
+        case = mutations.mutated(number)
+        assert mutations.mutated(number).raw == case.raw
         files.add(case.raw)
         path.write_bytes(case.raw)
         try:
@@ -79,9 +75,9 @@ def test_a_reader_that_believes_everything_is_found_out(
 
     def hunt() -> None:
         for number in range(300, 400):
-            fuzz_oracle.check(fuzz_mutations.mutated(number), tmp_path / "log.mcap")
+            oracle.check(mutations.mutated(number), tmp_path / "log.mcap")
 
-    with pytest.raises(fuzz_oracle.BrokenPromise, match="checksum"):
+    with pytest.raises(oracle.BrokenPromise, match="checksum"):
         hunt()
 
 
@@ -89,8 +85,8 @@ def test_a_job_goes_on_where_it_was_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen: list[int] = []
-    monkeypatch.setattr(fuzz, "STATE", tmp_path)
-    monkeypatch.setattr(fuzz, "EVERY", 5)
+    monkeypatch.setattr(logs, "STATE", tmp_path)
+    monkeypatch.setattr(logs, "EVERY", 5)
 
     def examine(number: int, path: Path) -> str | None:
         if number == 12 and number not in seen:
@@ -99,37 +95,37 @@ def test_a_job_goes_on_where_it_was_stopped(
         seen.append(number)
         return "wrong" if number == 3 else None
 
-    monkeypatch.setattr(fuzz, "examine", examine)
+    monkeypatch.setattr(logs, "examine", examine)
     with pytest.raises(KeyboardInterrupt):
-        fuzz.main(["--cases", "20"])
-    assert fuzz.main(["--cases", "20"]) == 1
+        logs.main(["--cases", "20"])
+    assert logs.main(["--cases", "20"]) == 1
     assert sorted(set(seen)) == list(range(20))
     assert seen.count(9) == 1
     assert "1 found" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", fuzz_decoders.available())
+@pytest.mark.parametrize("name", decoders.available())
 def test_what_is_decoded_may_be_anything(tmp_path: Path, name: str) -> None:
-    rng, whole = Random(name), fuzz_decoders.seeds(name)
+    rng, whole = Random(name), decoders.seeds(name)
     for data in whole:
-        fuzz_decoders.DECODERS[name].read(written(tmp_path, name, data))
-    text = fuzz_decoders.DECODERS[name].text
+        decoders.DECODERS[name].read(written(tmp_path, name, data))
+    text = decoders.DECODERS[name].text
     for _ in range(10 if name == "lerobot" else 60):
-        data = fuzz_decoders.mutated(rng, rng.choice(whole), rng.choice(whole), text=text)
-        fuzz_decoders.check(name, data, tmp_path / "case")
+        data = decoders.mutated(rng, rng.choice(whole), rng.choice(whole), text=text)
+        decoders.check(name, data, tmp_path / "case")
 
 
 def written(folder: Path, name: str, data: bytes) -> Path:
     place = folder / "whole"
     place.mkdir(exist_ok=True)
-    path = place / fuzz_decoders.DECODERS[name].name
+    path = place / decoders.DECODERS[name].name
     path.write_bytes(data)
     return path
 
 
 def test_what_once_broke_a_decoder_does_so_no_more(tmp_path: Path) -> None:
-    for path in fuzz.KEPT.glob("*/*"):
-        fuzz_decoders.check(path.parent.name.replace("-", " "), path.read_bytes(), tmp_path / "c")
+    for path in logs.KEPT.glob("*/*"):
+        decoders.check(path.parent.name.replace("-", " "), path.read_bytes(), tmp_path / "c")
 
 
 def test_inputs_that_go_a_new_way_lead_further() -> None:
@@ -146,7 +142,7 @@ def test_inputs_that_go_a_new_way_lead_further() -> None:
             raise KeyError("found")
 
     def broken(ours: tuple[str, ...]) -> bool:
-        cases = fuzz_coverage.guided(check, [b"." * 16], Random(4), text=False, ours=ours)
+        cases = guided.guided(check, [b"." * 16], Random(4), text=False, ours=ours)
         return any(isinstance(broke, KeyError) for _, _, broke in islice(cases, 3000))
 
     assert broken((__file__,))

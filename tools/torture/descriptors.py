@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from replay.storage.checksum import sha256
+from replay.storage.identity import file_sha256
 
 from .commands import Process, Ran, call, judge
 from .materials import camera_log, recording, run
@@ -92,7 +92,7 @@ def _judged(ran: Ran, streams: str, group: str) -> Outcome:
 
 def _files(place: Path) -> dict[str, str]:
     return {
-        str(path.relative_to(place)): sha256(path) if path.suffix in SAME_BYTES else ""
+        str(path.relative_to(place)): file_sha256(path) if path.suffix in SAME_BYTES else ""
         for path in sorted(place.rglob("*"))
         if path.is_file() and path.name != "run.mcap"  # which names its folder
     }

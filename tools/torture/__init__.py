@@ -1,10 +1,10 @@
 """Campaigns against the project: kills, damage, full disks, races, each case from its seed.
 
-    python -m tests.torture [CAMPAIGN ...] --minutes 60 --seed 0 --jobs 2 -o build/torture
+    python -m tools.torture [CAMPAIGN ...] --minutes 60 --seed 0 --jobs 2 -o build/torture
 
 A run that was stopped is gone on with by the same command. One case again, with its folder kept:
 
-    python -m tests.torture CAMPAIGN --case SEED
+    python -m tools.torture CAMPAIGN --case SEED
 
 To add a campaign, write a module here and put its name into `CAMPAIGNS` (campaigns.py). It has
 
@@ -19,12 +19,3 @@ random comes from `job.rng`; a campaign that goes through a list takes `job.seed
 and where `prepare` gave the list it ends when each was taken once.
 Groups (`Outcome.group`) are the rows of the page.
 """
-
-from __future__ import annotations
-
-import sys
-from pathlib import Path
-
-HELPERS = str(Path(__file__).resolve().parents[1])
-if HELPERS not in sys.path:  # what tests share with campaigns
-    sys.path.insert(0, HELPERS)

@@ -8,9 +8,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-from torture.calls import Call, Refusal, watched
-from torture.failing import WAYS, begin, fail
-from torture.stories import STORIES, WITH_WORKERS
+
+from tools.torture.calls import Call, Refusal, watched
+from tools.torture.failing import WAYS, begin, fail
+from tools.torture.stories import STORIES, WITH_WORKERS
 
 SAMPLED = {
     "record --resume": 4,

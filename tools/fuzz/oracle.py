@@ -14,7 +14,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from fuzz_mutations import Case, bases
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
@@ -26,6 +25,8 @@ from replay.mcap.records import MAX_CHUNK
 from replay.recordings.channel_rows import own_messages
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
+
+from .mutations import Case, bases
 
 MEMORY = MAX_CHUNK + 32 * 1024 * 1024
 """Most bytes that a small file may make us ask for: a chunk at the limit, and ourselves."""

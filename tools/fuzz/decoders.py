@@ -22,16 +22,12 @@ from pathlib import Path
 from random import Random
 from resource import RUSAGE_SELF, getpagesize, getrusage
 
-import fuzz_datasets
-import fuzz_mutations
 import numpy as np
 import video_packets
 from camera_files import HEIGHT, WIDTH, pictures
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from fuzz_oracle import BrokenPromise
 from PIL import Image
-from torture.mutations import BYTES, TEXT
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.learning import Keyframe
@@ -58,6 +54,10 @@ from replay.runs.messages import (
     encode_signals,
 )
 from replay.runs.modules import load_modules, save_modules
+from tools.torture.mutations import BYTES, TEXT
+
+from . import datasets, mutations
+from .oracle import BrokenPromise
 
 SECONDS = 5.0
 """Of processor time in which any small input must have been answered."""
@@ -274,7 +274,7 @@ def _video(suffix: str) -> Callable[[Path], None]:
 def _cameras(path: Path) -> None:
     """The first image of each topic, and the last."""
     for topic in ("/cam_left", "/cam_right") if path.suffix in (".bag", ".db3") else (None,):
-        fuzz_datasets.first_and_last(path, topic)
+        datasets.first_and_last(path, topic)
 
 
 def _presets() -> Iterator[bytes]:
@@ -365,18 +365,16 @@ DECODERS: Mapping[str, Decoder] = {
     "bag": Decoder(_cameras, _written(".bag", _bag), "a.bag", needs="rosbags"),
     "db3": Decoder(_cameras, _written(".db3", _database), "a.db3", needs="rosbags"),
     "metadata.yaml": Decoder(
-        fuzz_datasets.read_bag, fuzz_datasets.metadata, "metadata.yaml", text=True, needs="rosbags"
+        datasets.read_bag, datasets.metadata, "metadata.yaml", text=True, needs="rosbags"
     ),
-    "parquet": Decoder(
-        fuzz_datasets.read_dataset, fuzz_datasets.frames, fuzz_datasets.FRAMES, needs="pyarrow"
-    ),
+    "parquet": Decoder(datasets.read_dataset, datasets.frames, datasets.FRAMES, needs="pyarrow"),
     "parquet of episodes": Decoder(
-        fuzz_datasets.read_dataset, fuzz_datasets.episodes, "episodes.parquet", needs="pyarrow"
+        datasets.read_dataset, datasets.episodes, "episodes.parquet", needs="pyarrow"
     ),
     "mkv": Decoder(_cameras, _written(".mkv", _video(".mkv")), "a.mkv", needs="av"),
     "mp4": Decoder(_cameras, _written(".mp4", _video(".mp4")), "a.mp4", needs="av"),
     "lerobot": Decoder(
-        _lerobot, lambda: list(islice(fuzz_mutations.bases().values(), 3)), "v.mcap", needs="av"
+        _lerobot, lambda: list(islice(mutations.bases().values(), 3)), "v.mcap", needs="av"
     ),
     "npz": Decoder(load_modules, _written(".npz", _modules), "modules.npz"),
     "signals": Decoder(lambda p: decode_signals(p.read_bytes()), lambda: _of_a_run()[:1]),

@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 from waiting import wait_for
 
-from tests.torture import harness, page
-from tests.torture.campaigns import CAMPAIGNS, campaign
-from tests.torture.commands import Ran, judge
-from tests.torture.kills import check_disk
-from tests.torture.outcomes import (
+from tools.torture import harness, page
+from tools.torture.campaigns import CAMPAIGNS, campaign
+from tools.torture.commands import Ran, judge
+from tools.torture.kills import check_disk
+from tools.torture.outcomes import (
     CLEAR_ERROR,
     HANG,
     LOST,
@@ -32,7 +32,7 @@ from tests.torture.outcomes import (
     Limits,
     Outcome,
 )
-from tests.torture.witness import due
+from tools.torture.witness import due
 
 
 def made(case: Any, results: harness.Results, **limits: Any) -> harness.Campaign:
@@ -184,7 +184,7 @@ def test_the_page_counts_what_was_found() -> None:
     assert "| a | 12 | 12 | 0 | 0 |" in text
     assert "| b | 1 | 0 | 0 | 1 |" in text
     assert "lost, b: in out (" in text
-    assert f"python -m tests.torture {CAMPAIGNS[0]} --case 9" in text
+    assert f"python -m tools.torture {CAMPAIGNS[0]} --case 9" in text
 
 
 def test_a_witness_tells_what_must_have_been_flushed(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_every_campaign_is_what_the_harness_takes(name: str) -> None:
 
 def test_an_unknown_campaign_is_refused() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "tests.torture", "kittens"],
+        [sys.executable, "-m", "tools.torture", "kittens"],
         cwd=Path(__file__).parents[1],
         capture_output=True,
         text=True,

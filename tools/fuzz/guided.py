@@ -1,10 +1,10 @@
 """Change what is decoded, guided by the ways that it takes through our code.
 
-    python tests/fuzz_coverage.py --seconds 60 [DECODER ...]
+    python -m tools.fuzz.guided --seconds 60 [DECODER ...]
 
 An input that takes a way which none has taken is kept in build/fuzz/corpus, and changed further,
-in the next run, too. What breaks something is kept in tests/data/fuzz_cases, and the tests read it
-from then on. `fuzz_decoders` says what is decoded.
+in the next run, too. What breaks something is kept in tools/fuzz/cases, and the tests read it
+from then on. `decoders` says what is decoded.
 """
 
 from __future__ import annotations
@@ -25,12 +25,11 @@ from random import Random
 from types import FrameType
 from typing import Any
 
-import fuzz
-import fuzz_decoders
-from fuzz_oracle import BrokenPromise
+from . import decoders, logs
+from .oracle import BrokenPromise
 
-CORPUS = fuzz.STATE / "corpus"
-OURS = tuple(str(fuzz.ROOT / room) for room in ("cdmisfa", "recorder", "replay"))
+CORPUS = logs.STATE / "corpus"
+OURS = tuple(str(logs.ROOT / room) for room in ("cdmisfa", "recorder", "replay"))
 HANGS = 30
 """Seconds after which one that does not end is ended, while lines are counted."""
 
@@ -89,7 +88,7 @@ def guided(
         is_first = bool(data)
         if not is_first:
             recent = corpus[-8:] if rng.random() < 0.3 else corpus
-            data = fuzz_decoders.mutated(rng, rng.choice(recent), rng.choice(corpus), text=text)
+            data = decoders.mutated(rng, rng.choice(recent), rng.choice(corpus), text=text)
         ways: Ways = set()
         broke = None
         try:
@@ -113,22 +112,22 @@ def hunt(name: str, seconds: float) -> int:
     place = CORPUS / name.replace(" ", "-")
     place.mkdir(parents=True, exist_ok=True)
     kept = [path.read_bytes() for path in sorted(place.iterdir())]
-    corpus = [*fuzz_decoders.seeds(name), *kept]
+    corpus = [*decoders.seeds(name), *kept]
     signal.signal(signal.SIGALRM, _too_long)
     found, number, told = 0, 0, set[str]()
-    with tempfile.TemporaryDirectory(dir=fuzz.memory_folder()) as temporary:
+    with tempfile.TemporaryDirectory(dir=logs.memory_folder()) as temporary:
         folder = Path(temporary) / "case"
 
         def check(data: bytes) -> None:
             _now(name).write_bytes(data)
             signal.alarm(HANGS)
             try:
-                fuzz_decoders.check(name, data, folder)
+                decoders.check(name, data, folder)
             finally:
                 signal.alarm(0)
 
         rng = Random(f"{name} {len(kept)}")
-        cases = guided(check, corpus, rng, text=fuzz_decoders.DECODERS[name].text)
+        cases = guided(check, corpus, rng, text=decoders.DECODERS[name].text)
         end = time.monotonic() + seconds
         for number, (data, is_new, broke) in enumerate(cases):  # noqa: B007 - told at the end
             if is_new:
@@ -148,12 +147,12 @@ def hunt(name: str, seconds: float) -> int:
 
 def _now(name: str) -> Path:
     """The input that is being decoded, for when the process does not survive it."""
-    return fuzz.STATE / f"{name}.now"
+    return logs.STATE / f"{name}.now"
 
 
 def keep(name: str, data: bytes) -> Path:
     """Store an input that broke something for the tests to read."""
-    place = fuzz.KEPT / name.replace(" ", "-")
+    place = logs.KEPT / name.replace(" ", "-")
     place.mkdir(parents=True, exist_ok=True)
     path = place / hashlib.sha256(data).hexdigest()[:10]
     path.write_bytes(data)
@@ -184,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("decoders", nargs="*", metavar="DECODER", help="by default all")
     parser.add_argument("--seconds", type=float, default=60, help="of each")
     chosen = parser.parse_args(arguments)
-    names = chosen.decoders or fuzz_decoders.available()
+    names = chosen.decoders or decoders.available()
     found = sum(_ended(name, chosen.seconds) for name in names)
     print(f"{len(names)} decoders, {found} found")
     return 1 if found else 0

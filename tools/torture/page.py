@@ -71,7 +71,7 @@ def markdown(found: dict[str, Any]) -> str:
     lines = [
         "# What was done to it, and what came of that",
         "",
-        "Made by `make torture`, then `python -m tests.torture --minutes 0 --page "
+        "Made by `make torture`, then `python -m tools.torture --minutes 0 --page "
         "docs/reliability.md`;",
         "figures are of the runs named here, failures included. A defect is told as it was",
         "found; the command behind it repeats its case with the code of today.",
@@ -109,7 +109,7 @@ def _section(each: dict[str, Any], defects: Sequence[dict[str, Any]]) -> list[st
         lines.append(f"| {group['group']} | {sum(counts)} | {' | '.join(map(str, counts))} |")
     lines += ["", f"Most memory of one process: {each['peak_megabytes']} MB.", ""]
     for defect in defects[:MOST_SHOWN]:
-        again = f"python -m tests.torture {each['name']} --case {defect['seed']}"
+        again = f"python -m tools.torture {each['name']} --case {defect['seed']}"
         lines.append(
             f"- {defect['kind']}, {defect['group']}: {_plain(defect['detail'])} (`{again}`)"
         )

@@ -1,9 +1,9 @@
 """Read broken logs by the million, and keep those that break the reader.
 
-    python tests/fuzz.py --cases 1000000 --jobs 2
+    python tests/logs.py --cases 1000000 --jobs 2
 
 A job goes on where the one before was stopped; --restart begins again. What is found is
-kept in tests/data/fuzz_cases, and the tests read it from then on.
+kept in tools/fuzz/cases, and the tests read it from then on.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-import fuzz_mutations
-import fuzz_oracle
-from fuzz_mutations import Case
+from . import mutations, oracle
+from .mutations import Case
 
-ROOT = Path(__file__).parent.parent
-KEPT = Path(__file__).parent / "data" / "fuzz_cases"
+ROOT = Path(__file__).resolve().parents[2]
+KEPT = Path(__file__).parent / "cases"
 STATE = ROOT / "build" / "fuzz"
 EVERY = 1000
 """Cases between two notes of how far a job is."""
@@ -39,15 +38,15 @@ SLOW = 5.0
 
 def examine(number: int, path: Path) -> str | None:
     """Read one broken log; what it broke, or None. The log is kept if it did."""
-    case = fuzz_mutations.mutated(number)
+    case = mutations.mutated(number)
     before = time.process_time()
     try:
         if number % MEMORY_EVERY == 0:
-            fuzz_oracle.check_memory(case, path)
+            oracle.check_memory(case, path)
         else:
-            fuzz_oracle.check(case, path, number)
+            oracle.check(case, path, number)
         if time.process_time() - before > SLOW:
-            raise fuzz_oracle.BrokenPromise(f"it took more than {SLOW} s")
+            raise oracle.BrokenPromise(f"it took more than {SLOW} s")
     except Exception as error:
         keep(case)
         last = traceback.extract_tb(error.__traceback__)[-1]

@@ -38,7 +38,7 @@ ROOM = 2 << 30
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run campaigns; 1 when anything was found."""
-    parser = argparse.ArgumentParser(prog="python -m tests.torture", description=about)
+    parser = argparse.ArgumentParser(prog="python -m tools.torture", description=about)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("campaigns", nargs="*", metavar="CAMPAIGN", help=", ".join(CAMPAIGNS))
     parser.add_argument("--minutes", type=float, default=60, help="with preparing; 0: page only")

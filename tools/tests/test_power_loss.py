@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from torture.calls import Call
-from torture.power import (
+
+from tools.torture.calls import Call
+from tools.torture.power import (
     GONE,
     NAMES,
     OLD_NAMES,
@@ -24,7 +25,7 @@ from torture.power import (
     record,
     write_tree,
 )
-from torture.stories import FRAMES, OUT, STORIES, frames, iterations
+from tools.torture.stories import FRAMES, OUT, STORIES, frames, iterations
 
 OLDER = ("run.before.mcap.partial", "x1.mcap.partial.kept")
 """Logs that are gone on with, until the new ones hold what they do."""

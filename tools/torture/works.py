@@ -11,7 +11,7 @@ from typing import Any
 
 from camera_files import write_pictures
 
-from replay.storage.checksum import sha256
+from replay.storage.identity import file_sha256
 
 from .commands import here, must
 from .materials import EASY
@@ -46,7 +46,9 @@ class Work:
 
 def files(place: Path) -> dict[str, str]:
     """Of a recording: every byte."""
-    return {str(path.relative_to(place)): sha256(path) for path in sorted(place.rglob("*.mcap"))}
+    return {
+        str(path.relative_to(place)): file_sha256(path) for path in sorted(place.rglob("*.mcap"))
+    }
 
 
 def run(place: Path) -> dict[str, Any]:
@@ -55,7 +57,7 @@ def run(place: Path) -> dict[str, Any]:
     document = json.loads((place / "run.json").read_text())["result"]
     return {
         "whole": verified.code == 0,
-        "modules": sha256(place / "modules.npz"),
+        "modules": file_sha256(place / "modules.npz"),
         **{key: document[key] for key in ("signals_sha256", "iterations", "modules", "ended")},
     }
 
