@@ -9,8 +9,7 @@ from pathlib import Path
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.source import ForeignSource
 from replay.inputs.opening import holds_run, open_to_look
-from replay.runs.log import EVENT_TOPIC, read_header
-from replay.runs.stretches import read_columns, read_stretches
+from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
 
 ITERATION = re.compile(r"(?:iteration|iter|i)\s*(\d+)", re.IGNORECASE)
 
@@ -53,8 +52,8 @@ def _of_iteration(run: Path, iteration: int) -> int:
 def _of_event(run: Path, words: str) -> int:
     wanted = re.compile(rf"(?<!\w){re.escape(words.strip())}(?!\w)", re.IGNORECASE)
     told: list[str] = []
-    for stretch in read_stretches(run, read_header(run), topics=(EVENT_TOPIC,)):
-        for event in stretch.events:
+    for batch in read_batches(run, read_header(run), topics=(EVENT_TOPIC,)):
+        for event in batch.events:
             if wanted.search(event.text):
                 return int(event.t)
             told.append(event.text)
