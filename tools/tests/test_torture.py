@@ -179,11 +179,11 @@ def test_the_page_counts_what_was_found() -> None:
          "defect": "lost: much"},
     ]  # fmt: skip
     found = page.summary(lines)
-    text = page.markdown(json.loads(json.dumps(found)))
+    text = page.markdown(json.loads(json.dumps(found)), "found.json")
+    assert found["campaigns"][0]["groups"] == [{"group": "a", RIGHT: 12}, {"group": "b", LOST: 1}]
     assert "13 cases in 0.1 hours of work, 1 defects" in text
-    assert "| a | 12 | 12 | 0 | 0 |" in text
-    assert "| b | 1 | 0 | 0 | 1 |" in text
-    assert "lost, b: in out (" in text
+    assert "| 13 | 12 | 0 | 1 | 90 |" in text
+    assert f"lost, {CAMPAIGNS[0]}, b: in out (" in text
     assert f"python -m tools.torture {CAMPAIGNS[0]} --case 9" in text
 
 
