@@ -134,7 +134,7 @@ def _kernels() -> Iterator[Check]:
 
 
 def _vulkan() -> Iterator[Check]:
-    from replay.viewer.display import vulkan_drivers
+    from replay.viewer.program import vulkan_drivers
 
     drivers = sorted(vulkan_drivers())
     detail = ", ".join(d.stem for d in drivers) or "apt-get install mesa-vulkan-drivers"

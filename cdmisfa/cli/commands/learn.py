@@ -239,8 +239,7 @@ def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
 
 def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.display import has_display
-    from replay.viewer.program import open_privately
+    from replay.viewer.program import has_display, open_privately
 
     click.echo(f"live view {address}    look at it: rerun {address}", err=True)
     if has_display():
