@@ -15,8 +15,9 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.kernels import frames as kernels
 from recorder.images import areas, pixels
 from recorder.images.areas import averaged
-from recorder.images.framing import Fit, Framing
+from recorder.images.framing import Framing
 from recorder.images.pixels import Bytes
+from recorder.images.reading import Fit
 
 pytestmark = pytest.mark.usefixtures("both_modules", "untried")
 

@@ -121,7 +121,7 @@ def test_rooms_and_files_stay_small() -> None:
         str(init.parent.relative_to(ROOT)): n
         for package in PACKAGES
         for init in inits(package)
-        if (n := sum(f.name != "__init__.py" for f in init.parent.glob("*.py"))) > 12
+        if (n := sum(f.name != "__init__.py" for f in init.parent.glob("*.py"))) > 15
     }
     long = {
         str(file.relative_to(ROOT)): n
@@ -170,7 +170,8 @@ def test_every_folder_with_modules_is_a_package(package: str) -> None:
 
 def test_help_imports_nothing_heavy() -> None:
     code = (
-        "import sys; from cdmisfa.cli import run; run(['--help']);"
+        "import sys; from cdmisfa.cli import run; from cdmisfa.cli.app import COMMANDS;"
+        "[run([*name, '--help']) for name in ((), *zip(COMMANDS))];"
         f"print(sorted(set({HEAVY!r}) & set(sys.modules)), file=sys.stderr)"
     )
     assert python("-c", code).stderr.strip() == "[]"

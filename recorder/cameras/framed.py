@@ -9,8 +9,9 @@ from typing import Any
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.camera import Camera
 from recorder.images.fields import rounded
-from recorder.images.framing import Fit, Framing, Size, Vector, framings, size_of
+from recorder.images.framing import Framing, Vector, framings, size_of
 from recorder.images.pixels import Shown
+from recorder.images.reading import Fit, Size
 
 
 @dataclass

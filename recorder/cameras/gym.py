@@ -17,8 +17,9 @@ from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, one_line
 from recorder.cameras.stepped import Step, SteppedSource
 from recorder.images.frames import COLOR_RECIPE
-from recorder.images.framing import Fit, Size, framings
+from recorder.images.framing import framings
 from recorder.images.pixels import RECIPE, Bytes
+from recorder.images.reading import Fit, Size
 
 LARGEST_SEED: Final = 2**31 - 1
 

@@ -20,10 +20,8 @@ from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from recorder.cameras.camera import Picture
 from recorder.cameras.grid import Grid
+from recorder.cameras.options import HOLD
 from recorder.images.pixels import Shown
-
-HOLD: Final = 0.25
-"""Seconds for which a picture stands for those that are missing."""
 
 PATIENCE: Final = 0.2
 """Seconds for which a tick waits for a picture that is on its way."""

@@ -7,17 +7,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, one_line
 from recorder.cameras.camera import Camera, Picture
-
-OnLoss = Literal["reconnect", "wait", "end"]
-"""What is done about a camera that stalls or goes away."""
-
-STALL: Final = 5.0
-"""Seconds without a picture after which a camera is said to have stalled."""
+from recorder.cameras.options import STALL, OnLoss
 
 QUEUE_BYTES: Final = 64 * 1024 * 1024
 """Most bytes of pictures that wait of one camera."""

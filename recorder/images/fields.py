@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.pixels import Depth, MalformedImage
+from recorder.images.pixels import MalformedImage
+from recorder.images.reading import Depth
 
 Numbers = NDArray[np.float64]
 

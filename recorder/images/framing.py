@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from cdmisfa.core.errors import UsageError, are_for
 from recorder.images.pixels import Bytes, Shown, shrink
-
-Fit = Literal["crop", "pad", "stretch"]
-"""How an image of another ratio of the sides becomes a frame: see `fitted`."""
+from recorder.images.reading import Fit, Size
 
 FRAME_PIXELS: Final = 48 * 128
 """Most pixels of a frame where no size is given: those of the paper's."""
-
-Size = tuple[int, int]
-"""(height, width) in pixels."""
 
 
 @dataclass(frozen=True, slots=True)

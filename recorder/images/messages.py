@@ -21,12 +21,12 @@ from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.pixels import (
     DISTANCES,
     Bytes,
-    Depth,
     MalformedImage,
     compressed_image,
     compressed_words,
     raw_image,
 )
+from recorder.images.reading import Depth
 from recorder.images.videos import Packet, VideoPackets
 
 Decoder = Callable[[bytes | memoryview], Bytes]

@@ -15,6 +15,7 @@ from PIL import Image
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
 from recorder.images.areas import averaged
+from recorder.images.reading import Depth
 
 Bytes = NDArray[np.uint8]
 
@@ -76,9 +77,6 @@ DISTANCES: Final = frozenset(_DEPTHS)
 
 ENCODINGS: Final = tuple(_LAYOUTS)
 """Pixel formats that are read as they are."""
-
-Depth = tuple[float, float]
-"""Distances, in metres, that are shown black and white."""
 
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where

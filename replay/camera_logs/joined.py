@@ -10,8 +10,8 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.framing import Size
 from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.reading import Size
 from replay.camera_logs.alignment import Times, even_times, step_of
 from replay.camera_logs.formats.table import TableNumbers
 from replay.camera_logs.stream import ImagesOf, ImageStream, sorted_times

@@ -14,8 +14,8 @@ import numpy as np
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
-from recorder.images.framing import Size
 from recorder.images.pixels import compressed_image
+from recorder.images.reading import Size
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.stream import (
     ChannelFacts,

@@ -10,8 +10,8 @@ import numpy as np
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
-from recorder.images.framing import Size
 from recorder.images.pixels import compressed_image, picture_size
+from recorder.images.reading import Size
 from replay.camera_logs.stream import ImageStream
 from replay.mcap.records import Bytes
 
