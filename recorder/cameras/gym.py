@@ -16,9 +16,9 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import UsageError, one_line
 from recorder.cameras.stepped import Step, SteppedSource
-from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
 from recorder.images.pixels import RECIPE, Bytes
+from recorder.images.videos import COLOR_RECIPE
 
 LARGEST_SEED: Final = 2**31 - 1
 

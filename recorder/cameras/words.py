@@ -16,11 +16,11 @@ from recorder.cameras.framed import framed
 from recorder.cameras.live import HOLD, LiveSource
 from recorder.cameras.readers import STALL, OnLoss, Readers
 from recorder.config import view_names
+from recorder.images.decoding import Reading
 from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import RECIPE, Depth
-from recorder.images.reading import Reading
+from recorder.images.videos import COLOR_RECIPE, VIDEO_RECIPE
 
 PACKAGES: Final = "packages"
 """Key of what cameras of plugins say of themselves: the versions of their packages."""

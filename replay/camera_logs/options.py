@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Final, Literal
 
+from recorder.images.decoding import Clock, Reading
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import Depth
-from recorder.images.reading import Clock, Reading
 
 Align = Literal["index", "time"]
 Gaps = Literal["skip", "hold"]

@@ -12,11 +12,11 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.decoding import Clock, Reading
 from recorder.images.fields import rounded
-from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import Fit, Size, framings
 from recorder.images.pixels import Depth, Shown, UnknownPixels
-from recorder.images.reading import Clock, Reading
+from recorder.images.videos import COLOR_RECIPE
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
