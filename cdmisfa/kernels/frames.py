@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import UsageError
 from cdmisfa.kernels import INT64, Struct, pointer, readable
-
-Int = NDArray[np.int64]
 
 
 def _buffer(kind: str, data: Any) -> Any:
@@ -42,7 +41,7 @@ def layouts(channels: Any, least: Any, places: Any, marks: Any) -> Struct:
 
 def scan(
     data: Any, index: Any, start: int, stop: int, wanted: Struct, counts: Sequence[int]
-) -> tuple[Int, NDArray[np.uint64]] | None:
+) -> tuple[IntArray, NDArray[np.uint64]] | None:
     """Check a chunk of messages and find those of some channels.
 
     Args:
@@ -76,7 +75,9 @@ def scan(
     return None if code else (ends, times)
 
 
-def gather(data: Any, ends: Int, distances: Int, width: int, out: NDArray[np.uint8]) -> None:
+def gather(
+    data: Any, ends: IntArray, distances: IntArray, width: int, out: NDArray[np.uint8]
+) -> None:
     """Copy the values out of messages.
 
     Args:

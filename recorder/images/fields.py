@@ -7,12 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
 from recorder.images.pixels import Depth, MalformedImage
-
-Numbers = NDArray[np.float64]
 
 NUMBERS_RECIPE: Final = "numbers as they are, float64"
 """How numbers become a frame, for the record."""
@@ -98,7 +96,7 @@ def _step(found: re.Match[str]) -> _Step:
     return int(index) if index is not None else slice(int(start or 0), int(stop) if stop else None)
 
 
-def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> Numbers:
+def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> FloatArray:
     """The numbers of all fields of a message, one after the other, (I,) float64.
 
     Args:
@@ -130,14 +128,14 @@ def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> N
     return bounded(np.array(found, np.float64), bounds)
 
 
-def bounded(numbers: Numbers, bounds: Depth | None) -> Numbers:
+def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
     """Numbers within bounds; those that are not finite become the first of them."""
     if bounds is None:
         return numbers
     return np.clip(np.where(np.isfinite(numbers), numbers, bounds[0]), *bounds)
 
 
-def rounded(fields: Sequence[str], numbers: Numbers) -> str:
+def rounded(fields: Sequence[str], numbers: FloatArray) -> str:
     """What the user should know of numbers, (I,), that float64 may hold rounded; "" of others.
 
     Args:

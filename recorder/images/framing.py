@@ -8,8 +8,9 @@ from typing import Final, Literal
 
 import numpy as np
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError, are_for
-from recorder.images.pixels import Bytes, Shown, shrink
+from recorder.images.pixels import Shown, shrink
 
 Fit = Literal["crop", "pad", "stretch"]
 """How an image of another ratio of the sides becomes a frame: see `fitted`."""
@@ -37,7 +38,7 @@ class Framing:
     fit: Fit
     color: bool = False
 
-    def frame(self, image: Bytes) -> Bytes:
+    def frame(self, image: ByteArray) -> ByteArray:
         """Make an image a frame; one of another size than the first may be smaller than a frame.
 
         Args:
@@ -160,7 +161,7 @@ def default_size(image: Size) -> Size:
     return max(height // divisor, 1), max(width // divisor, 1)
 
 
-def fitted(image: Bytes, size: Size, fit: Fit, *, enlarge: bool = False) -> Bytes:
+def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> ByteArray:
     """Make an image a frame.
 
     Args:
@@ -211,6 +212,6 @@ def _largest_within(outer: Size, ratio: Size) -> Size:
     return outer[0], max(round(outer[0] * ratio[1] / ratio[0]), 1)
 
 
-def _middle(image: Bytes, size: Size) -> Bytes:
+def _middle(image: ByteArray, size: Size) -> ByteArray:
     top, left = ((have - want) // 2 for have, want in zip(image.shape, size, strict=True))
     return image[top : top + size[0], left : left + size[1]]

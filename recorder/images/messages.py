@@ -17,10 +17,10 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from recorder.images.pixels import (
     DISTANCES,
-    Bytes,
     Depth,
     MalformedImage,
     compressed_image,
@@ -29,7 +29,7 @@ from recorder.images.pixels import (
 )
 from recorder.images.videos import Packet, VideoPackets
 
-Decoder = Callable[[bytes | memoryview], Bytes]
+Decoder = Callable[[bytes | memoryview], ByteArray]
 """Turns a message into a gray image, (height, width) uint8; raises MalformedImage.
 
 One that is `VideoPackets` has to be called with the messages in their order.
@@ -49,7 +49,7 @@ class Pixels(NamedTuple):
     step: int
     big_endian: bool = False
 
-    def image(self, depth: Depth | None, *, color: bool) -> Bytes:
+    def image(self, depth: Depth | None, *, color: bool) -> ByteArray:
         """The image that they show; see `raw_image`."""
         return raw_image(*self[:5], big_endian=self.big_endian, depth=depth, color=color)
 
@@ -67,7 +67,7 @@ class Compressed(NamedTuple):
     encoding: str = ""
     packed_depth: bool = False
 
-    def image(self, depth: Depth | None, *, color: bool) -> Bytes:
+    def image(self, depth: Depth | None, *, color: bool) -> ByteArray:
         """The image that it shows; see `raw_image`."""
         if self.encoding not in DISTANCES:
             return compressed_image(self.data, color=color)

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
-
-Bytes = NDArray[np.uint8]
 
 Shown = NDArray[Any]
 """What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
@@ -89,7 +88,7 @@ def raw_image(
     big_endian: bool = False,
     depth: Depth | None = None,
     color: bool = False,
-) -> Bytes:
+) -> ByteArray:
     """The image that pixels of any supported format show, gray, (height, width) uint8.
 
     Of a Bayer pattern each two by two pixels become one, (height // 2, width // 2).
@@ -144,7 +143,7 @@ def raw_image(
     if color:
         return np.ascontiguousarray(rows[:, :, [bytes_are.index(c) for c in "rgb"]])
 
-    def gray(part: Bytes) -> Any:
+    def gray(part: ByteArray) -> Any:
         pixels = part.tobytes()  # without what is between the rows
         shape, mode = (width, len(part)), bytes_are.upper()
         colors = Image.frombuffer("RGB", shape, pixels, "raw", mode, 0, 1)
@@ -153,7 +152,7 @@ def raw_image(
     return _by_bands(rows, gray)
 
 
-def _by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> Bytes:
+def _by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> ByteArray:
     """Convert rows of pixels (height, width, ...) to gray, some rows at a time."""
     height, width = pixels.shape[:2]
     found = np.empty((height, width), np.uint8)
@@ -163,7 +162,7 @@ def _by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> B
     return found
 
 
-def _bayer(pixels: Bytes, order: str, *, color: bool) -> Bytes:
+def _bayer(pixels: ByteArray, order: str, *, color: bool) -> ByteArray:
     """The gray or the colours of each two by two pixels; green is the mean of its two."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
@@ -179,7 +178,7 @@ def _bayer(pixels: Bytes, order: str, *, color: bool) -> Bytes:
     return _by_bands(cells, lambda part: (part @ weights + 32768) >> 16)
 
 
-def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> Bytes:
+def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray:
     """Distances as gray; 0, infinity and NaN, which are none, as black."""
     near, far = depth
     if near < 0:
@@ -193,7 +192,7 @@ def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> Bytes:
     return _by_bands(values, gray)
 
 
-def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> Bytes:
+def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) -> ByteArray:
     """Average the areas of a gray image into fewer pixels.
 
     Args:
@@ -216,7 +215,7 @@ def shrink(image: Bytes, height: int, width: int, *, enlarge: bool = False) -> B
     return np.asarray(small, np.uint8)
 
 
-def compressed_image(data: bytes, *, color: bool = False) -> Bytes:
+def compressed_image(data: bytes, *, color: bool = False) -> ByteArray:
     """The image in a JPEG or PNG, gray, (height, width) uint8.
 
     Args:

@@ -12,9 +12,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.memory import BUDGET
-from recorder.images.pixels import MAX_PIXELS, RECIPE, Bytes, MalformedImage, raw_image
+from recorder.images.pixels import MAX_PIXELS, RECIPE, MalformedImage, raw_image
 
 VIDEO_RECIPE: Final = (
     f"{RECIPE}; of a video the stored luma, 16 to 235 stretched to 0 to 255 as "
@@ -49,17 +50,17 @@ _UNIT: Final = re.compile(b"\0\0\1(.)", re.DOTALL)
 """Where a unit of H.264 or H.265 begins, and the first byte of its header."""
 
 
-def frame_gray(frame: Any) -> Bytes:
+def frame_gray(frame: Any) -> ByteArray:
     """The luma of a picture of PyAV, or the gray of its colours, upright, (height, width) uint8."""
     return _upright(_luma(frame), frame)
 
 
-def frame_colors(frame: Any) -> Bytes:
+def frame_colors(frame: Any) -> ByteArray:
     """The colours of a picture of PyAV, upright, (height, width, 3) uint8; else its luma."""
     return _upright(_colors(frame), frame)
 
 
-def _upright(pixels: Bytes, frame: Any) -> Bytes:
+def _upright(pixels: ByteArray, frame: Any) -> ByteArray:
     """Pixels turned by quarters, and mirrored, as the display matrix of their picture says.
 
     Source: FFmpeg's libavutil/display.h. A point (x, y) is shown at (a x + c y, b x + d y).
@@ -81,13 +82,13 @@ def _is_full(frame: Any) -> bool:
     return bool(stated or frame.format.name.startswith(("yuvj", "gray")))
 
 
-def _colors(frame: Any) -> Bytes:
+def _colors(frame: Any) -> ByteArray:
     form = frame.format
     if form.name.startswith("gray"):
         return _luma(frame)
     luma_first = form.name.startswith("yuv") and len(form.components) >= 3
     if not luma_first or form.components[0].bits != 8 or not form.is_planar:
-        colours: Bytes = frame.to_ndarray(format="rgb24")
+        colours: ByteArray = frame.to_ndarray(format="rgb24")
         return colours
     luma = _luma(frame).astype(np.int32) << 16
     height, width = luma.shape
@@ -105,7 +106,7 @@ def _colors(frame: Any) -> Bytes:
     return np.stack([((c + 32768) >> 16).clip(0, 255).astype(np.uint8) for c in colors], axis=2)
 
 
-def _luma(frame: Any) -> Bytes:
+def _luma(frame: Any) -> ByteArray:
     form = frame.format
     if not form.name.startswith(_LUMA) or form.components[0].bits != 8 or not form.is_planar:
         colours = frame.to_ndarray(format="rgb24")
@@ -158,7 +159,7 @@ class VideoPackets:
         if self._context is not None:
             self._context.flush_buffers()
 
-    def __call__(self, message: bytes | memoryview) -> Bytes:
+    def __call__(self, message: bytes | memoryview) -> ByteArray:
         """The picture of the next message, (height, width) uint8, or its colours.
 
         Raises:

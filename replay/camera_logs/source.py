@@ -36,11 +36,11 @@ from replay.camera_logs.alignment import (
 from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
-from replay.camera_logs.opening import hashed_log, image_logs, open_images
+from replay.camera_logs.opening import identity_of, image_logs, open_images
 from replay.camera_logs.options import Align, Gaps, spelled
 from replay.camera_logs.salvaged import BROKEN, SALVAGE, WholeImages
 from replay.camera_logs.stream import ImageStream
-from replay.storage.hashing import Hashed, LoggedSource
+from replay.storage.identity import Identity, LoggedSource
 from replay.storage.location import Location, Url
 from replay.stored import Span, outside
 
@@ -190,9 +190,9 @@ class ForeignSource(LoggedSource):
         """What was recorded: nobody says."""
         return {}
 
-    def _logs(self) -> list[Hashed]:
+    def _logs(self) -> list[Identity]:
         parts = [part for stream in self._streams for part in stream.parts]
-        return [hashed_log(path, parts) for path in self._files]
+        return [identity_of(path, parts) for path in self._files]
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """The logs, the topics, and how they became frames."""
@@ -265,7 +265,6 @@ class ForeignSource(LoggedSource):
         return chosen
 
     def close(self) -> None:
-        super().close()
         for stream in self._streams:
             stream.close()
 

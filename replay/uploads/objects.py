@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError
-from replay.storage.checksum import sha256
+from replay.storage.identity import file_sha256
 from replay.storage.limits import limits
 from replay.storage.location import Url
 from replay.storage.opening import open_store
@@ -76,7 +76,7 @@ def put(file: Path, url: Url) -> None:
         _put_parts(file, url, place)
     answer = ask_s3(url, "head_object", limits().total, **place)
     stored = Stored(int(answer["ContentLength"]), str(answer.get("ETag", "")).strip('"'))
-    if not is_of(stored, file) and _sha256_behind(url, stored.size) != sha256(file):
+    if not is_of(stored, file) and _sha256_behind(url, stored.size) != file_sha256(file):
         raise CdmisfaError(f"{url}: the server has other bytes than were sent")
 
 
