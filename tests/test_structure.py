@@ -65,7 +65,6 @@ FORBIDDEN = {
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
-    "replay.uploads": ("replay.recordings.source", "replay.runs.log", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.images", "pybullet"),
     "replay.view.layouts": ("replay.viewer.window", "replay.export.figures", "recorder.recording"),
     "replay.view.world": ("replay.viewer.window", "replay.export.figures", "recorder.world.scenes"),

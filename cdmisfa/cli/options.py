@@ -126,7 +126,7 @@ def _limit(option: str, name: str, default: float, meaning: str) -> Callable[[Co
     """An option for one of the `Limits`, which hold while the command runs."""
 
     def hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
-        from replay.storage.limits import limited, limits
+        from replay.storage.location import limited, limits
 
         ctx.with_resource(limited(dataclasses.replace(limits(), **{name: value})))
 
