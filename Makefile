@@ -7,7 +7,7 @@ KERNELS := $(wildcard cdmisfa/kernels/*.[ch] cdmisfa/kernels/b*.py)
 SANITIZED := build/sanitized
 SANITIZERS := -fsanitize=address,undefined -fno-sanitize-recover=all
 
-.PHONY: demo test suite lint bench pictures fuzz torture sanitized clean install
+.PHONY: demo test suite lint bench pictures fuzz torture attacks sanitized clean install
 
 demo: $(INSTALLED)
 	$(BIN)/cdmisfa demo --jobs 2
@@ -30,14 +30,18 @@ pictures: $(INSTALLED)
 	$(BIN)/python docs/images/draw.py
 
 fuzz: $(INSTALLED)
-	$(BIN)/python tests/fuzz_coverage.py --seconds $(or $(SECONDS),60)
-	$(BIN)/python tests/fuzz.py --cases 1000000 --jobs 2
+	$(BIN)/python -m tools.fuzz.guided --seconds $(or $(SECONDS),60)
+	$(BIN)/python -m tools.fuzz.logs --cases 1000000 --jobs 2
 
 # The streams of the arena take minutes to make: they are kept.
 torture: $(INSTALLED) sanitized
 	test -e build/torture/streams || $(BIN)/cdmisfa arena small --learners progress \
 	    --seeds 0:2 --frames 2000 --jobs 2 -o build/torture/arena --streams build/torture/streams
-	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),60) --seed $(or $(SEED),0)
+	$(BIN)/python -m tools.torture --minutes $(or $(MINUTES),60) --seed $(or $(SEED),0)
+
+# Tests of what attacks the product, with some cases of each kind.
+attacks: $(INSTALLED)
+	$(BIN)/pytest -n 3 --dist loadgroup tools
 
 # The tests of the kernels, which then end where they leave an array or the range of a number.
 sanitized: $(INSTALLED)
@@ -57,4 +61,4 @@ $(INSTALLED): pyproject.toml setup.py $(KERNELS)
 
 clean:
 	rm -rf .venv build dist cdmisfa/kernels/*.so *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find cdmisfa recorder replay tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find cdmisfa recorder replay tests tools benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -130,8 +130,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "its first frame: seconds by the wall's clock, the file not in memory, and in memory. "
         "What is read is the file's end, the message index of each chunk, and one chunk. Below, "
         "all of `learn LOG -o RUN` after start-up until its first block of 40 frames is learned, "
-        "and what the learning thread has read by then; another one reads all of the log "
-        "meanwhile, for its SHA-256, and is ended with it.",
+        "and what it has read by then.",
         [
             (["log", "cold, seconds", "warm, seconds", "read of it"], rows),
             (["log", "learn: cold, seconds", "learn: warm, seconds", "read, MB"], learned),

@@ -6,18 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.kernels import image_frames
 from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa.agents.progress.config import ProgressConfig
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.features.recursive import RecursiveSFA
 
 BLOCK = 40
 """Frames learned at once."""
-
-Float = NDArray[np.float64]
 
 
 class PlainNumpy:
@@ -29,7 +27,7 @@ class PlainNumpy:
         self.differences, self.mean = np.zeros((0, 0)), np.zeros(size)
         self.last = np.zeros((0, size))
 
-    def update(self, frames: Float) -> Float:
+    def update(self, frames: FloatArray) -> FloatArray:
         """Learn from a block; the slow features, (components, I)."""
         m, seen = len(frames), self.seen
         centred, shift = frames - frames.mean(0), frames.mean(0) - self.mean
@@ -56,7 +54,7 @@ class PlainNumpy:
         return np.asarray(slow @ basis[: len(scale)])
 
 
-def products(size: int, components: int, frames: Float) -> Callable[[], int]:
+def products(size: int, components: int, frames: FloatArray) -> Callable[[], int]:
     """A call of the matrix products alone that a block cannot do without."""
     basis = np.ones((2 * components, size))
     weights = np.ones((2 * components, 2 * components + BLOCK))
@@ -70,7 +68,7 @@ def products(size: int, components: int, frames: Float) -> Callable[[], int]:
     return call
 
 
-def blocks(update: Callable[[Float], Any], frames: Float) -> Callable[[], int]:
+def blocks(update: Callable[[FloatArray], Any], frames: FloatArray) -> Callable[[], int]:
     """A call that learns a few blocks."""
 
     def call() -> int:
@@ -81,7 +79,7 @@ def blocks(update: Callable[[Float], Any], frames: Float) -> Callable[[], int]:
     return call
 
 
-def candidates(frames: Float, components: int) -> dict[str, Callable[[], int]]:
+def candidates(frames: FloatArray, components: int) -> dict[str, Callable[[], int]]:
     """What is compared, as far as it is installed and can hold so many inputs."""
     from sklearn.decomposition import IncrementalPCA
 

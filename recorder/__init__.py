@@ -1,12 +1,11 @@
 """The world: simulated and live streams, and writing what any source shows."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "recorder.cameras.gym": "GymSource",
-        "recorder.cameras.stepped": "ArraySource",
+        "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.config": "RecordConfig SceneConfig",
         "recorder.live": "RecordedWhileWatched record_watched",
         "recorder.log.split": "Split",

@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import TRUTH_TOPIC, WATCHED_TOPIC, RunHeader
 from replay.runs.modules import load_modules
 from replay.runs.outline import Outline
 from replay.runs.stretches import Frames, read_columns, read_stretches
-
-Float = NDArray[np.float64]
 
 KEPT = 20_000
 """Last frames of each module's output that are fitted."""
@@ -50,8 +49,8 @@ class Output:
     module: int
     stream: int
     t: NDArray[np.int64]
-    y: Float
-    truth: Float
+    y: FloatArray
+    truth: FloatArray
     angles: tuple[int, ...] | None = None
 
     def follows(self, names: Sequence[str]) -> Following | None:
@@ -115,15 +114,17 @@ class Following:
     column: int
     function: str
     r: float
-    weights: Float
-    terms: Callable[[Float], Float]
+    weights: FloatArray
+    terms: Callable[[FloatArray], FloatArray]
 
-    def __call__(self, truth: Float) -> Float:
+    def __call__(self, truth: FloatArray) -> FloatArray:
         """The function's values."""
         return np.asarray(self.terms(truth) @ self.weights)
 
 
-def follow(truth: Float, y: Float, column: int, name: str, *, angle: bool) -> Following | None:
+def follow(
+    truth: FloatArray, y: FloatArray, column: int, name: str, *, angle: bool
+) -> Following | None:
     """The simplest function of a true quantity that an output follows.
 
     Of an angle these are its sines, of all others a straight line or, where
@@ -150,7 +151,7 @@ def follow(truth: Float, y: Float, column: int, name: str, *, angle: bool) -> Fo
     best: Following | None = None
     for function, terms in tried:
         table = terms(truth)
-        weights: Float = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
+        weights: FloatArray = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
         fit = table @ weights
         r = float(np.corrcoef(fit, y)[0, 1]) if np.std(fit) > 0 else 0.0
         if best is None or r > best.r + BETTER:
@@ -158,15 +159,15 @@ def follow(truth: Float, y: Float, column: int, name: str, *, angle: bool) -> Fo
     return best
 
 
-def _powers(x: Float, degree: int) -> Float:
+def _powers(x: FloatArray, degree: int) -> FloatArray:
     return np.stack([x**k for k in range(degree + 1)], axis=1)
 
 
-def _sines(x: Float, frequency: int) -> Float:
+def _sines(x: FloatArray, frequency: int) -> FloatArray:
     return np.stack([np.ones_like(x), np.sin(frequency * x), np.cos(frequency * x)], axis=1)
 
 
-def _that_go_round(truth: Float) -> tuple[int, ...]:
+def _that_go_round(truth: FloatArray) -> tuple[int, ...]:
     """Columns of (n, D) truth that are angles of all around a circle, in radians."""
     if not len(truth):
         return ()
@@ -244,7 +245,7 @@ def _of_kept_modules(
     }
 
 
-def _known_at(t: NDArray[np.int64], truth: Frames | None) -> Float:
+def _known_at(t: NDArray[np.int64], truth: Frames | None) -> FloatArray:
     """(n, D) what the world knew at n frames; D is 0 where it is not known of all of them."""
     if truth is not None and len(t):
         frames, values = truth
@@ -278,7 +279,7 @@ class _OutputCollector:
     def __init__(self, module: int, stream: int, *, alone: bool) -> None:
         self.number, self.stream, self._alone = module, stream, alone
         self.is_silent = True
-        self.blocks: list[tuple[int, Float]] = []
+        self.blocks: list[tuple[int, FloatArray]] = []
 
     def add(self, columns: SignalColumns) -> None:
         own, frozen = columns["stream"] == self.stream, columns["y_frozen"]

@@ -16,7 +16,7 @@ from message_files import write_mcap
 from PIL import Image
 
 from recorder.config import view_names
-from recorder.images.reading import MessageKind
+from recorder.images.decoding import MessageKind
 
 SMALL = ("--size", "16x12")
 QUICK = ("--max-iterations", "4", "--no-rerun", "--set", "learner.tau=10")

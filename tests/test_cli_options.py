@@ -13,9 +13,9 @@ from cdmisfa.cli.app import COMMANDS, cli
 from cdmisfa.cli.making import GROUPS, GroupedCommand, Option
 from cdmisfa.core.options import given, option_name, option_words
 from recorder.cameras.options import LiveOptions
-from recorder.images.reading import ImageOptions
+from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
-from replay.storage.limits import Limits
+from replay.storage.location import Limits
 
 MADE = {
     "record": (ImageOptions, LiveOptions),

@@ -35,7 +35,7 @@ from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.video import video_camera
-from recorder.cameras.words import is_live, open_live, stream_names
+from recorder.cameras.words import is_live, live_names, open_live
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_header
 
@@ -83,7 +83,7 @@ def test_streams_are_named_after_what_they_are() -> None:
         "foxglove://robot:8765/front-2": "front-2",
         "foxglove://robot:8765/front": "front-3",
     }
-    assert stream_names(list(words)) == tuple(words.values())
+    assert live_names(list(words)) == tuple(words.values())
 
 
 class TestGym(ForwardContract):

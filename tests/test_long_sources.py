@@ -1,4 +1,4 @@
-"""Learning from long logs begins before all of them was read; what they are is known at the end."""
+"""Identity of logs: a sample when learning begins from long ones, and SHA-256 at the end."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,15 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.runs import RunResult, run
+from recorder.mcap.reader import LogReader
+from replay.camera_logs.opening import identity_of
 from replay.camera_logs.source import ForeignSource
-from replay.mcap.identity import hashed
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import told_otherwise
 from replay.runs.final import stated_source
 from replay.runs.log import read_header
-from replay.storage import hashing
+from replay.storage import identity
+from replay.storage.identity import log_identity
 from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)
@@ -39,21 +39,7 @@ ITERATIONS = 12
 @pytest.fixture(autouse=True)
 def long(monkeypatch: pytest.MonkeyPatch) -> None:
     """All logs count as long."""
-    monkeypatch.setattr(hashing, "AT_ONCE", 0)
-
-
-@pytest.fixture
-def held(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """No log is hashed before this is set."""
-    go, work = threading.Event(), hashing.Hashing._work
-
-    def wait(self: hashing.Hashing) -> None:
-        assert go.wait(60)
-        work(self)
-
-    monkeypatch.setattr(hashing.Hashing, "_work", wait)
-    yield go
-    go.set()
+    monkeypatch.setattr(identity, "AT_ONCE", 0)
 
 
 @pytest.fixture
@@ -102,23 +88,16 @@ def damage(path: Path) -> None:
     path.write_bytes(raw)
 
 
-def hashing_threads() -> list[str]:
-    return [thread.name for thread in threading.enumerate() if thread.name == "hashing"]
-
-
-def test_learning_begins_before_a_file_is_hashed_and_ends_as_ever(
-    recording: Path, tmp_path: Path, held: threading.Event, monkeypatch: pytest.MonkeyPatch
+def test_a_run_begins_with_a_sample_and_ends_with_the_sha256(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[Any] = []
 
     def look() -> None:
         seen.extend(read_header(tmp_path / "run").manifest["source"]["views"])
-        assert hashing_threads() == ["hashing"]
-        held.set()
 
     result = learn(recording, tmp_path / "run", Then(look))
-    assert hashing_threads() == []
-    monkeypatch.setattr(hashing, "AT_ONCE", 2**40)
+    monkeypatch.setattr(identity, "AT_ONCE", 2**40)
     before = learn(recording, tmp_path / "before")
     keys = {"name", "frames", "file", "bytes", "sample_sha256"}
     assert [view.keys() for view in seen] == [keys] * 3
@@ -169,13 +148,13 @@ def test_every_kind_of_log_is_known_by_a_sample_and_in_the_end_by_all_of_it(
     )
     assert first == whole
     source.close()
-    monkeypatch.setattr(hashing, "AT_ONCE", 2**40)
+    monkeypatch.setattr(identity, "AT_ONCE", 2**40)
     source = source_of(kind, oscillatory_recording, tmp_path / "b", 1)
     assert description(source, at_once=True) == description(source)
     source.close()
     if kind == "recording":
         return
-    monkeypatch.setattr(hashing, "AT_ONCE", 0)
+    monkeypatch.setattr(identity, "AT_ONCE", 0)
     source = source_of(kind, oscillatory_recording, tmp_path / "c", 2)
     other = description(source, at_once=True)["files"]
     source.close()
@@ -187,9 +166,9 @@ def test_every_kind_of_log_is_known_by_a_sample_and_in_the_end_by_all_of_it(
 
 @pytest.mark.parametrize("size", [0, 1, 4095, 4096, 4097, 65_536, 10**10])
 def test_a_sample_reaches_from_the_first_bytes_to_the_last(size: int) -> None:
-    places = hashing.sampled(size)
+    places = identity.sampled(size)
     assert places == sorted(places)
-    assert (places[0], min(places[-1] + hashing.PIECE, size)) == (0, size)
+    assert (places[0], min(places[-1] + identity.PIECE, size)) == (0, size)
 
 
 def test_a_log_without_checksums_is_told_from_one_with_the_same_index(tmp_path: Path) -> None:
@@ -205,7 +184,7 @@ def test_a_log_without_checksums_is_told_from_one_with_the_same_index(tmp_path: 
             writer.add_message(channel, 0, data, 0)
             writer.finish()  # type: ignore[no-untyped-call]
         with LogReader(tmp_path / f"{value}.mcap") as reader:
-            known.append(hashed(reader).at_once())
+            known.append(log_identity(reader).sample())
     assert known[0]["bytes"] == known[1]["bytes"]
     assert known[0]["sample_sha256"] != known[1]["sample_sha256"]
 
@@ -249,7 +228,7 @@ def test_a_finished_run_goes_on_with_all_of_its_file_compared(tmp_path: Path) ->
         "bytes",
         "sample_sha256",
     }
-    at = hashing.sampled(path.stat().st_size)[3] + hashing.PIECE + 100
+    at = identity.sampled(path.stat().st_size)[3] + identity.PIECE + 100
     raw = bytearray(path.read_bytes())
     raw[at] = ord("1") if raw[at] != ord("1") else ord("2")
     path.write_bytes(raw)
@@ -261,10 +240,10 @@ def test_a_finished_run_goes_on_with_all_of_its_file_compared(tmp_path: Path) ->
 def test_a_run_of_before_is_resumed(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hashing, "AT_ONCE", 2**40)
+    monkeypatch.setattr(identity, "AT_ONCE", 2**40)
     with pytest.raises(KilledError):
         learn(recording, tmp_path / "run", Then(killed, 7), keyframes=4)
-    monkeypatch.setattr(hashing, "AT_ONCE", 0)
+    monkeypatch.setattr(identity, "AT_ONCE", 0)
     assert learn(recording, tmp_path / "run", resume=True).iterations == ITERATIONS
 
 
@@ -284,23 +263,30 @@ def test_what_changes_meanwhile_is_damage_and_the_run_is_kept(
     assert sorted(file.name for file in out.iterdir()) == ["run.mcap.partial"]
 
 
-def test_a_file_that_was_hashed_before_it_changed_is_hashed_again(
-    tmp_path: Path, held: threading.Event
-) -> None:
-    held.set()
-    path = table(tmp_path / "t.csv", 4)
-    source = ForeignSource(path, rate=10)
-    description(source, at_once=True)
-    source.hash_meanwhile()
-    while source.wait_hashed(10) is not None:
-        pass
-    os.utime(path, ns=(1, 1))
-    assert source.describe()["files"][0]["sha256"]
-    with path.open("r+b") as file:
-        file.write(b"c")
-    with pytest.raises(LogDamagedError, match=r"t\.csv: it was changed while it was read"):
-        source.describe()
-    source.close()
+@pytest.mark.parametrize("kind", ["folder", "picture", "table"])
+def test_files_are_hashed_as_they_were_opened_or_called_changed(tmp_path: Path, kind: str) -> None:
+    folder = pictures(tmp_path / "p", 1)
+    path = {"folder": folder, "picture": folder / "0.png"}.get(kind)
+    path = path or table(tmp_path / "t.csv", 4)
+    file = folder / "0.png" if kind == "folder" else path
+    log, changed = (identity_of(path, []) for _ in range(2))
+    known = log.whole(lambda count: None)
+    (folder / "new.png").write_bytes(b"c")  # what comes into a folder does not count
+    os.utime(file, ns=(1, 1))
+    assert log.whole(lambda count: None) == known
+    with pytest.raises(LogDamagedError, match="it was changed while it was read; begin again"):
+        changed.whole(lambda count: None)  # perhaps before it was learned from
+    with file.open("r+b") as opened:
+        opened.write(b"c")
+    with pytest.raises(LogDamagedError, match="it was changed while it was read; begin again"):
+        log.whole(lambda count: None)
+    assert known["file"] == path.name
+    listed = "".join(
+        f"{one.name}\0{hashlib.sha256(one.read_bytes()).hexdigest()}\n"
+        for one in sorted(pictures(tmp_path / "again", 1).iterdir())
+    )
+    if kind == "folder":
+        assert known["sha256"] == hashlib.sha256(listed.encode()).hexdigest()
 
 
 def test_a_checksum_of_the_data_that_does_not_match_is_told_at_the_end(
@@ -310,44 +296,15 @@ def test_a_checksum_of_the_data_that_does_not_match_is_told_at_the_end(
     words = ("learn", recording, "-o", tmp_path / "run", "--no-rerun", "--max-iterations", "3")
     done = cdmisfa(*words)
     assert (done.code, "x1.mcap: data section: its CRC does not match" in done.err) == (3, True)
+    assert "waiting for the SHA-256 of what is learned from" in done.err
     assert not (tmp_path / "run" / "run.json").exists()
     assert cdmisfa("info", tmp_path / "run").code == 0
 
 
-def test_damage_that_the_hash_finds_ends_learning(
-    recording: Path, tmp_path: Path, held: threading.Event
-) -> None:
-    damage(recording / "x1.mcap")
-    learned: list[int] = []
-
-    def hashed_by_now() -> None:
-        learned.append(1)
-        held.set()
-        for thread in threading.enumerate():
-            if thread.name == "hashing":
-                thread.join(60)
-
-    sinks = [Then(hashed_by_now, iteration) for iteration in range(ITERATIONS)]
-    with pytest.raises(LogDamagedError, match=r"x1\.mcap: data section: its CRC does not match"):
-        learn(recording, tmp_path / "run", *sinks)
-    assert len(learned) == 1
-    assert [file.name for file in (tmp_path / "run").iterdir()] == ["run.mcap.partial"]
-
-
-def test_an_end_waits_for_the_hash_and_says_so(
-    cdmisfa: Cdmisfa, recording: Path, tmp_path: Path, held: threading.Event
-) -> None:
-    threading.Timer(0.3, held.set).start()
-    words = ("learn", recording, "-o", tmp_path / "run", "--no-rerun", "--max-iterations", "1")
-    done = cdmisfa(*words)
-    assert (done.code, "waiting for the SHA-256 of what is learned from" in done.err) == (0, True)
-
-
 def test_a_second_signal_ends_the_wait_and_the_run_is_resumed(
-    recording: Path, tmp_path: Path, held: threading.Event
+    recording: Path, tmp_path: Path
 ) -> None:
     def again(done: int, size: int) -> None:
-        held.set()
         raise KeyboardInterrupt
 
     out, stops = tmp_path / "run", iter([False, False, True])
@@ -357,24 +314,6 @@ def test_a_second_signal_ends_the_wait_and_the_run_is_resumed(
     whole = learn(recording, tmp_path / "whole")
     resumed = learn(recording, out, resume=True)
     assert resumed.as_json() | {"run": ""} == whole.as_json() | {"run": ""}
-
-
-def test_the_thread_ends_with_its_source(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun, told = threading.Event(), hashing.Hashing._tell
-
-    def tell(self: hashing.Hashing, count: int) -> None:
-        begun.set()
-        while not self._stopped:
-            pass
-        told(self, count)
-
-    monkeypatch.setattr(hashing.Hashing, "_tell", tell)
-    source = RecordedSource(recording)
-    source.hash_meanwhile()
-    assert begun.wait(60)
-    source.close()
-    assert hashing_threads() == []
-    source.close()
 
 
 def test_a_view_of_a_killed_run_takes_its_recording_alone(recording: Path, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz_oracle import tabled_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import frames as reference
@@ -20,13 +19,13 @@ from cdmisfa.kernels import frames as kernels
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import INDEX_HEADER, Segment
+from recorder.mcap.tables import indexed_table
 from recorder.recording import record_scene
-from replay.mcap.reader import LogReader
-from replay.mcap.records import INDEX_HEADER
-from replay.mcap.segments import Segment
-from replay.mcap.tables import indexed_table
 from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
+from tools.fuzz.oracle import tabled_rows
 
 pytestmark = pytest.mark.usefixtures("both_modules")
 

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -34,12 +34,12 @@ from waiting import wait_for
 
 from cdmisfa.cli.app import run as cdmisfa
 from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, results_command, sweep_command
+from cdmisfa.core import processes
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.experiments import engines
+from cdmisfa.core.processes import EngineError, WorkerDied, run_all
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
-from cdmisfa.experiments.engines import EngineError, WorkerDied, run_all
 from cdmisfa.experiments.runs import run
 from cdmisfa.experiments.sources import open_source
 from cdmisfa.experiments.store import ROWS, read_rows
@@ -366,7 +366,7 @@ def test_a_task_that_always_kills_its_worker_is_given_up_alone(tmp_path: Path) -
     given_up = found.pop(1)
     assert isinstance(given_up, WorkerDied)
     assert found == {n: n * n for n in (0, 2, 3, 4, 5)}
-    assert (tmp_path / "1").stat().st_size == engines.DEATHS
+    assert (tmp_path / "1").stat().st_size == processes.ATTEMPTS
 
 
 def busiest_worker() -> int:
@@ -471,38 +471,32 @@ def test_a_reproduction_on_dask_is_the_one_made_here(
 
 def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(engines, "CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr(processes, "CONNECT_SECONDS", 0.5)
     with pytest.raises(EngineError, match=r"127\.0\.0\.1:9"):
         list(run_all(trace, [("", 0, "")], engine="dask", scheduler="tcp://127.0.0.1:9"))
-
-
-class LostPool:
-    """A scheduler that goes away with everything it was given."""
-
-    died: engines.Died = ()
-    gave_up = True
-    width = 2
-
-    def submit(self, function: Callable[..., Any], task: Any) -> Future[Any]:
-        """A future that is cancelled."""
-        future: Future[Any] = Future()
-        future.cancel()
-        future.set_running_or_notify_cancel()
-        return future
-
-    def renew(self) -> None:
-        """Nothing to do."""
-
-    def close(self) -> None:
-        """Nothing to do."""
 
 
 def test_a_scheduler_that_goes_away_ends_the_sweep_in_words(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(engines, "_open", lambda *_: LostPool())
+    class LostClient:
+        def __init__(self, *_: Any, **__: Any) -> None:
+            self.ncores = lambda: {"worker": 1}
+            self.wait_for_workers = self.close = lambda *_, **__: None
+
+        def get_executor(self, **_: Any) -> Any:
+            return self
+
+        def submit(self, *_: Any) -> Future[Any]:
+            future: Future[Any] = Future()
+            future.cancel()
+            future.set_running_or_notify_cancel()
+            return future
+
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(distributed, "Client", LostClient)
     with pytest.raises(EngineError, match="went away"):
-        list(run_all(trace, [("", n, "") for n in range(3)], jobs=2))
+        list(run_all(trace, [("", n, "") for n in range(3)], engine="dask"))
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

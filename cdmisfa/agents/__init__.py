@@ -1,8 +1,8 @@
 """Where to look, and when to save what was learned."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.agents.learner": "CuriousLearner",

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import DENSE_STREAMS
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 MEMORY = np.dtype(
     [
@@ -73,23 +71,23 @@ class Agent(NamedTuple):
     """
 
     memory: NDArray[np.void]
-    eta: Float
-    eta_dot: Float
-    eta_inst: Float
-    gate_mean: Float
-    gate_variance: Float
-    derivative: Float
-    y_sum: Float
-    square_sum: Float
-    y_frames: Int
-    recent_mean: Float
-    recent_square: Float
-    stay_sum: Float
-    switch_sum: Float
-    dense: Float
-    policy: Int
-    centres: Float
-    counts: Float
+    eta: FloatArray
+    eta_dot: FloatArray
+    eta_inst: FloatArray
+    gate_mean: FloatArray
+    gate_variance: FloatArray
+    derivative: FloatArray
+    y_sum: FloatArray
+    square_sum: FloatArray
+    y_frames: IntArray
+    recent_mean: FloatArray
+    recent_square: FloatArray
+    stay_sum: FloatArray
+    switch_sum: FloatArray
+    dense: FloatArray
+    policy: IntArray
+    centres: FloatArray
+    counts: FloatArray
 
 
 class Rules(NamedTuple):

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.agents.agent import Agent
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.modules import Module
-
-Float = NDArray[np.float64]
 
 NOVEL: int = kernels.lib.NOVEL
 """Verdict: no frozen module knows the block. Positive verdicts are the module's index."""
@@ -33,12 +31,12 @@ class Frozen(NamedTuple):
         counts: (M, S, C).
     """
 
-    phi: Float
-    offset: Float
-    band_mean: Float
-    band_sd: Float
-    centres: Float
-    counts: Float
+    phi: FloatArray
+    offset: FloatArray
+    band_mean: FloatArray
+    band_sd: FloatArray
+    centres: FloatArray
+    counts: FloatArray
 
     @property
     def struct(self) -> kernels.Struct:

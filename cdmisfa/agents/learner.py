@@ -18,6 +18,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.agent import OUTCOME, as_struct, begin_abstraction, new_agent, rules
 from cdmisfa.agents.gate import NOVEL, stacked
 from cdmisfa.agents.inputs import count_inputs, rows_of
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -27,8 +28,6 @@ from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import NO_STATE, BlockSignals
 from cdmisfa.features.feature import Feature, MakeFeature
 from cdmisfa.features.incsfa import IncSFA
-
-Float = NDArray[np.float64]
 
 POLICY_KEY, WEIGHTS_KEY = 1, 2
 """Spawn keys of the learner's two random generators, beneath the run's seed."""
@@ -138,7 +137,7 @@ class CuriousLearner:
         return self.agent.policy.copy()
 
     @property
-    def phi(self) -> Float:
+    def phi(self) -> FloatArray:
         """Weights of the adaptive abstraction, (J, I), a copy."""
         return self.abstraction.phi.copy()
 
@@ -220,8 +219,8 @@ class CuriousLearner:
         return signals
 
     def _iterate(
-        self, shown: kernels.Struct, x: kernels.Struct, expanded: Any, t: int, uniforms: Float
-    ) -> tuple[Float, Float, Float, Float]:
+        self, shown: kernels.Struct, x: kernels.Struct, expanded: Any, t: int, uniforms: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """`kernels.iterate` with a feature of somebody else, which learns in Python."""
         told = kernels.recognise(self._agent, self._frozen, shown, x)
         memory, xi = self.agent.memory[0], np.full(self.tau, np.nan)
@@ -238,7 +237,7 @@ class CuriousLearner:
         self,
         shown: kernels.Struct,
         x: kernels.Struct,
-        uniforms: Float,
+        uniforms: FloatArray,
         swap_below: float = -1.0,
         kept: kernels.Struct | None = None,
     ) -> int:
@@ -275,7 +274,12 @@ class CuriousLearner:
         }
 
     def _signals(
-        self, block: Block, y: Float, y_frozen: Float, eta_frozen: Float, roc_error_frozen: Float
+        self,
+        block: Block,
+        y: FloatArray,
+        y_frozen: FloatArray,
+        eta_frozen: FloatArray,
+        roc_error_frozen: FloatArray,
     ) -> BlockSignals:
         agent = self.agent
         out: dict[str, Any] = dict(zip(OUTCOME.names or (), self.out[0].item(), strict=True))

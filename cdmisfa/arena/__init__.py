@@ -1,8 +1,8 @@
 """The arena: learners compared on sets of streams, each made anew where it is run."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.arena.contestants": "CONTESTANTS",

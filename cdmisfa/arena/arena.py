@@ -18,8 +18,8 @@ from cdmisfa.arena.streams import parse
 from cdmisfa.arena.trial import ArenaTrial, run_trial
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.experiments.documents import plain
-from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
 
 STREAMS_FOLDER: Final = "streams"

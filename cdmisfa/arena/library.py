@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.arena.pictures import Shown
 from cdmisfa.arena.streams import LEARNED_FROM, STREAMS, make, parse
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, UINT8
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
@@ -30,8 +31,6 @@ RECIPE: Final = 2
 _DAMAGED: Final = (OSError, EOFError, ValueError)
 """What is raised for files that hold no array, or less of it than they say."""
 
-Float = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True)
 class Stream:
@@ -46,7 +45,7 @@ class Stream:
 
     name: str
     frames: NDArray[Any]
-    state: Float
+    state: FloatArray
     loops: bool
 
     @property
@@ -203,7 +202,7 @@ def refer(stream: Stream, components: int, expansion: str) -> Reference:
     return Reference(eta, slowest, linear(directions.T, mean, expansion, scale))
 
 
-def linear(phi: Float, mean: Float, expansion: str, scale: float) -> Module:
+def linear(phi: FloatArray, mean: FloatArray, expansion: str, scale: float) -> Module:
     """Weights (J, I) of a centred frame as a module that was never watched for."""
     none = np.zeros(len(phi))
     return Module(

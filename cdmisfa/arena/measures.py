@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.arena.library import Reference, Stream
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.statistics import correlation
 from cdmisfa.features.sfa import slowness
@@ -29,8 +30,6 @@ THE_SAME: Final = 0.9
 
 RIDGE: Final = 1e-3
 """Penalty of the linear probe, as a share of the number of frames."""
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,7 @@ class Output:
         slowness: infinite where it does not vary.
     """
 
-    values: Float
+    values: FloatArray
     slowness: float
 
 
@@ -135,7 +134,7 @@ def doubles(saved: Sequence[Saved], output: Callable[[int, str], Output]) -> lis
     return [k for k in range(len(saved)) if any(same(k, j) for j in range(k))]
 
 
-def probe(features: Float, state: Float) -> float:
+def probe(features: FloatArray, state: FloatArray) -> float:
     """How well a linear map tells the state of the world from features.
 
     Ridge regression is fitted on the first three quarters of the frames and judged on the last.

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from cdmisfa.core.arrays import FloatArray
+
 HEIGHT, WIDTH = 48, 64
 """Of the grey pictures of all cameras."""
 
 Rng = np.random.Generator
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,7 @@ class Shown:
     """
 
     frames: NDArray[Any]
-    state: Float
+    state: FloatArray
     names: tuple[str, ...] = ()
 
 
@@ -124,7 +125,7 @@ def waves(rng: Rng, n: int) -> Shown:
     return Shown(frames, np.stack([np.cos(phase), np.sin(phase)], axis=1), ("cos", "sin"))
 
 
-def picture(rng: Rng) -> Float:
+def picture(rng: Rng) -> FloatArray:
     """A picture of soft patches, (HEIGHT, WIDTH)."""
     patches = Image.fromarray(rng.standard_normal((6, 8)).astype(np.float32))
     smooth = patches.resize((WIDTH, HEIGHT), Image.Resampling.BICUBIC)

@@ -13,9 +13,9 @@ import click
 from cdmisfa.cli.making import Command, option, option_of, options_of, together
 from cdmisfa.core.errors import CdmisfaError
 from recorder.cameras.options import LiveOptions
-from recorder.images.reading import ImageOptions
+from recorder.images.options import ImageOptions
 from replay.camera_logs.options import CameraOptions
-from replay.storage.limits import Limits, limited, limits
+from replay.storage.location import Limits, limited, limits
 
 FETCHED = "cdmisfa.fetched"
 """Where a command's context keeps the paths of copies, and what they are copies of."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.documents import plain
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
@@ -27,6 +26,8 @@ def quoted(path: str | Path) -> str:
 
 def print_json(document: Mapping[str, Any]) -> None:
     """One JSON document on stdout; see `plain`."""
+    from cdmisfa.experiments.documents import plain
+
     click.echo(json.dumps(plain(document), allow_nan=False))
 
 

@@ -99,8 +99,7 @@ def uploaded(
         CdmisfaError: it cannot be uploaded.
     """
     from replay.storage.location import Url, location
-    from replay.uploads.objects import objects_below
-    from replay.uploads.results import fetch
+    from replay.storage.uploads import fetch, objects_below
 
     url = location(address)
     assert isinstance(url, Url)
@@ -142,7 +141,7 @@ def upload_now(place: Path, url: Url, again: str) -> tuple[int, int]:
         url: where to.
         again: the command that does it again.
     """
-    from replay.uploads.results import upload
+    from replay.storage.uploads import upload
 
     try:
         with bar("uploading", "bytes") as shown:

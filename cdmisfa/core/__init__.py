@@ -1,8 +1,8 @@
 """For all: blocks, signals, modules, configuration, errors, registries, processes."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.core.blocks": "Block FrameSource HeadPose SeekableSource SourceSpec",

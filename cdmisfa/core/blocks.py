@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ PIXEL = 1.0 / 255.0
 """What one step of a uint8 pixel counts."""
 
 _TYPES = (np.dtype(np.float64), UINT8)
-
-_TICK: Final = 0.1
-"""Seconds between two looks at how much of a source's files was read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,14 +177,11 @@ class SeekableSource(FrameSource, Protocol):
 class LongSource(FrameSource, Protocol):
     """A source of files that take long to read: less is known of it until all of them were."""
 
+    def describe(self, told: Callable[[int, int], None] = ...) -> Mapping[str, Any]:
+        """See `FrameSource`; tells how many bytes were read and how many there are, if many."""
+
     def describe_at_once(self) -> Mapping[str, Any]:
         """What `describe` says, with less of each file where reading all of them takes long."""
-
-    def hash_meanwhile(self) -> None:
-        """Read the files in a thread, for what `describe` says of them; it ends with `close`."""
-
-    def wait_hashed(self, seconds: float) -> tuple[int, int] | None:
-        """Wait so long for that thread; bytes that it has read and has to read, None at its end."""
 
 
 class ForwardSource(FrameSource):
@@ -239,18 +233,25 @@ class HeadPose:
     quaternion: tuple[float, float, float, float]
 
 
-def description(source: FrameSource, *, at_once: bool = False) -> dict[str, Any]:
+def description(
+    source: FrameSource,
+    *,
+    at_once: bool = False,
+    told: Callable[[int, int], None] = lambda done, size: None,
+) -> dict[str, Any]:
     """What identifies a source, its kind at least; see `FrameSource.describe`.
 
     Args:
         source: the source.
         at_once: with less of its files where they take long to read; see `LongSource`.
+        told: of bytes that were read and that are to be read, where they take long to read.
 
     Raises:
         UsageError: it does not state its kind.
+        LogDamagedError: as for `FrameSource.describe`.
     """
-    if at_once and isinstance(source, LongSource):
-        described = dict(source.describe_at_once())
+    if isinstance(source, LongSource):
+        described = dict(source.describe_at_once() if at_once else source.describe(told))
     else:
         described = dict(source.describe())
     if not isinstance(described.get("kind"), str):
@@ -258,24 +259,6 @@ def description(source: FrameSource, *, at_once: bool = False) -> dict[str, Any]
             f"{type(source).__name__} does not state what it is: give its describe() a kind, a text"
         )
     return described
-
-
-def description_waited_for(source: FrameSource, told: Callable[[int, int], None]) -> dict[str, Any]:
-    """What `description` says of all of a source's files, which may take long to read.
-
-    Args:
-        source: the source.
-        told: of bytes that were read and that are to be read, while it is waited for.
-
-    Raises:
-        UsageError: it does not state its kind.
-        LogDamagedError: as for `FrameSource.describe`.
-    """
-    if isinstance(source, LongSource):
-        source.hash_meanwhile()
-        while (progress := source.wait_hashed(_TICK)) is not None:
-            told(*progress)
-    return description(source)
 
 
 def told_apart(names: Iterable[str]) -> tuple[str, ...]:

@@ -1,8 +1,10 @@
-"""Processes of this machine that compute for this one, and end with it."""
+"""Where work is computed: in this process, in others of this machine, or on dask."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import logging
 import multiprocessing
 import os
 import pickle
@@ -10,38 +12,63 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
-from multiprocessing.reduction import ForkingPickler
-from queue import Empty, SimpleQueue
-from typing import Any, TypeVar
+from multiprocessing.process import BaseProcess
+from typing import Any, Protocol, TypeVar
 
+from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from cdmisfa.core.registry import did_you_mean
+
+Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-Call = tuple[Callable[..., Any], tuple[Any, ...]]
+ENGINES = ("local", "dask")
 
-ENDED = "a worker process ended"
+ATTEMPTS = 3
+"""A task whose local worker died is computed so often, the last time with nothing beside it."""
+
+WENT_AWAY = "the scheduler went away: start it and say the same again, finished trials are kept"
+
+CONNECT_SECONDS = 15
+"""How long a scheduler and its first worker may take to answer."""
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+"""Environment of local workers: the processes are the parallelism."""
+
+_starting = threading.Lock()
+
+
+class EngineError(CdmisfaError):
+    """An engine is out of reach or went away; finished trials are kept."""
 
 
 class Workers:
-    """Processes that are started as they are needed.
+    """A pool of threads, each with a process of its own that computes what it is given.
 
-    They end at `close`, and when this process is killed, whatever they are doing. A terminal's
-    Ctrl-C, or its end, is for this process only. When one dies, what all of them were doing ends
-    with `concurrent.futures.process.BrokenProcessPool`.
+    A call whose process died ends with `BrokenProcessPool`, and the next call has a new process.
+    All end at `close`, and when this process is killed, whatever they are doing. A terminal's
+    Ctrl-C is for this process only.
 
-    Each has a pipe of its own, of which nobody else has an end: what one was sending when it was
-    killed neither keeps another from sending nor is waited for.
+    `ProcessPoolExecutor` shares one pipe among its processes: when one is killed while it sends a
+    result, it waits forever for the rest. So here each process has a pipe of its own.
 
     Args:
         jobs: how many.
-        start: called first in each of them; importable by name, as is all that they compute.
+        start: called first in each process; importable by name, as is all that they compute.
         arguments: of `start`.
-        environment: variables of theirs, set before they import anything.
+        environment: variables of the processes, set before they import anything.
     """
 
     def __init__(
@@ -51,108 +78,60 @@ class Workers:
         arguments: tuple[Any, ...] = (),
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        self._jobs = jobs
-        self._start: Call | None = None if start is None else (start, arguments)
-        self._environment = dict(environment or {})
-        self._lock = threading.Lock()
-        self._unfinished = 0
-        self._ended = ""
-        self._tasks: SimpleQueue[tuple[Future[Any], Call] | None] = SimpleQueue()
-        self._workers: list[tuple[SpawnProcess, threading.Thread]] = []
+        self._setup = dict(environment or {}), start, arguments
+        self._threads = ThreadPoolExecutor(jobs)
+        self._own = threading.local()
+        self._processes: list[BaseProcess] = []
+        self._closed = False
 
     def submit(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
         """Have one of them call a function."""
-        future: Future[Result] = Future()
-        with self._lock:
-            if self._ended:
-                future.set_exception(BrokenProcessPool(self._ended))
-                return future
-            self._unfinished += 1
-            if len(self._workers) < min(self._unfinished, self._jobs):
-                self._begin_one()
-            self._tasks.put((future, (function, arguments)))
-        return future
+        return self._threads.submit(self._call, function, arguments)
 
     def close(self) -> None:
         """End them all at once, whatever they are doing; harmless when called twice."""
-        self._end()
-        for process, thread in self._workers:
-            thread.join()
+        with _starting:
+            self._closed = True
+            for process in self._processes:
+                process.kill()
+        self._threads.shutdown()
+        for process in self._processes:
             process.join()
 
-    def _begin_one(self) -> None:
+    def _call(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result:
+        pipe: Connection | None = getattr(self._own, "pipe", None)
+        if pipe is None:
+            pipe = self._own.pipe = self._begin()
+        try:
+            pipe.send((function, arguments))
+            failed, value = pipe.recv()
+        except (EOFError, OSError) as error:
+            pipe.close()
+            self._own.pipe = None
+            raise BrokenProcessPool("a worker process ended") from error
+        if failed:
+            raise value
+        result: Result = value
+        return result
+
+    def _begin(self) -> Connection:
+        """Start a process; its end of the pipe is here no more, so that its death shows."""
         context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_compute, args=(theirs, self._environment), daemon=True)
-        thread = threading.Thread(target=self._serve, args=(ours,), daemon=True)
         resource_tracker.ensure_running()  # when it begins it lets Ctrl-C through again
-        with _inherited():
+        with _starting, _without_main_and_signals():
+            if self._closed:
+                raise BrokenProcessPool("the worker processes were closed")
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs, *self._setup), daemon=True)
             process.start()
-            thread.start()
+            self._processes.append(process)
         theirs.close()
-        self._workers.append((process, thread))
-
-    def _serve(self, pipe: Connection) -> None:
-        """Hand tasks to one process until it ends; the thread that belongs to it."""
-        with pipe:
-            try:
-                if self._start is not None:
-                    _ask(pipe, self._start)
-            except BaseException as error:
-                self._end(f"{ENDED}: {error}")
-            while (task := self._tasks.get()) is not None:
-                future, call = task
-                if future.set_running_or_notify_cancel():
-                    try:
-                        future.set_result(_ask(pipe, call))
-                    except _DiedError:
-                        future.set_exception(BrokenProcessPool(ENDED))
-                        self._end()
-                    except BaseException as error:
-                        future.set_exception(error)
-                with self._lock:
-                    self._unfinished -= 1
-
-    def _end(self, why: str = ENDED) -> None:
-        with self._lock:
-            self._ended = self._ended or why
-            for process, _ in self._workers:
-                process.kill()
-            with contextlib.suppress(Empty):
-                while True:
-                    task = self._tasks.get_nowait()
-                    if task is not None and task[0].set_running_or_notify_cancel():
-                        task[0].set_exception(BrokenProcessPool(self._ended))
-            for _ in self._workers:
-                self._tasks.put(None)
-
-
-class _DiedError(Exception):
-    """The process at the other end of a pipe is no more."""
-
-
-def _ask(pipe: Connection, call: Call) -> Any:
-    """What a call comes to in the process at the other end of a pipe.
-
-    Raises:
-        _DiedError: it ended before it answered.
-        BaseException: of the call, or of what cannot be sent.
-    """
-    message = ForkingPickler.dumps(call)
-    try:
-        pipe.send_bytes(message)
-        answer = pipe.recv_bytes()
-    except (EOFError, OSError) as error:
-        raise _DiedError from error
-    failed, value = pickle.loads(answer)
-    if failed:
-        raise value
-    return value
+        return ours
 
 
 @contextlib.contextmanager
-def _inherited() -> Iterator[None]:
-    """What a process that is started meanwhile inherits: no signal of a terminal, no main module.
+def _without_main_and_signals() -> Iterator[None]:
+    """Let a process that is started inherit no signal of a terminal and no main module.
 
     The main module is a command or a user's script, which would begin anew in each of them.
     """
@@ -168,32 +147,211 @@ def _inherited() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _compute(pipe: Connection, environment: Mapping[str, str]) -> None:
-    """Answer what is asked through a pipe; what a worker does."""
+def _serve(
+    pipe: Connection,
+    environment: Mapping[str, str],
+    start: Callable[..., None] | None,
+    arguments: tuple[Any, ...],
+) -> None:
+    """Answer calls from a pipe until its other end is gone; the main function of a worker."""
     os.environ.update(environment)
-    calls: SimpleQueue[bytes] = SimpleQueue()
-    threading.Thread(target=_receive, args=(pipe, calls), daemon=True).start()
-    with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-        while True:
-            pipe.send_bytes(_answer(calls.get()))
-
-
-def _receive(pipe: Connection, calls: SimpleQueue[bytes]) -> None:
-    """Take calls while others are computed, and so see at once when there is nobody to answer."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            calls.put(pipe.recv_bytes())
+            message = pipe.recv_bytes()
+            pipe.send_bytes(_answer(message, start, arguments))
+            start = None
+
+
+def _end_with_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        parent.join()
     os._exit(1)
 
 
-def _answer(message: bytes) -> memoryview:
+def _answer(message: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> bytes:
+    """The pickled pair (failed, result or exception) of a pickled call."""
     try:
-        function, arguments = pickle.loads(message)
-        return ForkingPickler.dumps((False, function(*arguments)))
+        if start is not None:
+            start(*arguments)
+        function, given = pickle.loads(message)
+        return pickle.dumps((False, function(*given)))
     except BaseException as error:
         error.add_note("".join(traceback.format_exception(error)))
         try:
-            pickle.loads(message := bytes(ForkingPickler.dumps((True, error))))
+            answer = pickle.dumps((True, error))
+            pickle.loads(answer)
         except Exception:
-            return ForkingPickler.dumps((True, RuntimeError(f"{type(error).__name__}: {error}")))
-        return memoryview(message)
+            return pickle.dumps((True, RuntimeError(f"{type(error).__name__}: {error}")))
+        return answer
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerDied:
+    """Instead of a result: every worker that tried this task died."""
+
+    what: str
+
+
+class Pool(Protocol):
+    """What an engine gives `run_all`."""
+
+    died: tuple[type[BaseException], ...]
+    """What a future raises when its worker died."""
+
+    attempts: int
+    """How often a task is handed out whose worker died."""
+
+    @property
+    def width(self) -> int:
+        """How many tasks to hand out at a time."""
+
+    def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
+        """Have a worker compute function(task)."""
+
+    def close(self) -> None:
+        """Let the workers go."""
+
+
+def run_all(
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    *,
+    jobs: int = 1,
+    engine: str = "local",
+    scheduler: str | None = None,
+) -> Iterator[tuple[int, Result | WorkerDied]]:
+    """Compute function(task) for every task, in any order.
+
+    Args:
+        function: importable by name from every worker; an exception of its own ends the loop.
+        tasks: picklable.
+        jobs: local processes; with 1 everything is computed in this one.
+        engine: one of `ENGINES`.
+        scheduler: address of a dask scheduler; without it one is started here.
+
+    Yields:
+        The task's index and its result, as they come.
+
+    Raises:
+        UsageError: no such engine, or its package is not installed.
+        EngineError: nobody answers at the scheduler's address, or it went away.
+    """
+    if engine not in ENGINES:
+        raise UsageError(f"no engine {engine!r}: {did_you_mean(engine, ENGINES)}")
+    if scheduler is not None and engine == "local":
+        raise UsageError(f"--scheduler {scheduler} needs --engine dask")
+    if not tasks:
+        return
+    if engine == "local" and jobs == 1:
+        for index, task in enumerate(tasks):
+            yield index, function(task)
+        return
+    pool: Pool = DaskPool(jobs, scheduler) if engine == "dask" else LocalPool(jobs)
+    with contextlib.closing(pool):
+        left: Iterable[int] = range(len(tasks))
+        for attempt in range(1, pool.attempts + 1):
+            died: list[int] = []
+            last = attempt == pool.attempts
+            alone = last and attempt > 1
+            for index, result in _spread(pool, function, tasks, left, alone=alone):
+                if isinstance(result, WorkerDied) and not last:
+                    died.append(index)
+                else:
+                    yield index, result
+            left = died
+
+
+def _spread(
+    pool: Pool,
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    indices: Iterable[int],
+    *,
+    alone: bool,
+) -> Iterator[tuple[int, Result | WorkerDied]]:
+    """Hand out some tasks, once each, as many at a time as keep the workers busy."""
+    waiting, running = deque(indices), dict[Future[Result], int]()
+    while waiting or running:
+        width = 1 if alone else pool.width if waiting else 0
+        while waiting and len(running) < width:
+            index = waiting.popleft()
+            running[pool.submit(function, tasks[index])] = index
+        done, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in done:
+            result: Result | WorkerDied
+            try:
+                result = future.result()
+            except pool.died as error:
+                result = WorkerDied(f"every worker that tried it died ({one_line(error)})")
+            except CancelledError as error:
+                raise EngineError(WENT_AWAY) from error
+            yield running.pop(future), result
+
+
+class LocalPool(Workers):
+    """Processes of this machine."""
+
+    died: tuple[type[BaseException], ...] = (BrokenProcessPool,)
+    attempts = ATTEMPTS
+
+    def __init__(self, jobs: int) -> None:
+        super().__init__(jobs, environment=ONE_THREAD)
+        self.width = jobs + 1
+
+
+class DaskPool:
+    """A dask cluster, or one started here for the while; it tries other workers by itself."""
+
+    attempts = 1
+
+    def __init__(self, jobs: int, scheduler: str | None) -> None:
+        try:
+            distributed: Any = importlib.import_module("distributed")
+        except ImportError as error:
+            raise UsageError(
+                "--engine dask needs a package that is not installed: pip install 'cdmisfa[dask]'"
+            ) from error
+        # It tells of every lost connection with a traceback; what matters is raised.
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        self.died: tuple[type[BaseException], ...] = (distributed.KilledWorker,)
+        how: dict[str, Any] = {"address": scheduler, "timeout": CONNECT_SECONDS}
+        if scheduler is None:
+            how = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
+        try:
+            self._client = distributed.Client(**how, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise EngineError(
+                f"no dask scheduler answers at {scheduler}: {one_line(error)}"
+            ) from error
+        try:
+            self._client.wait_for_workers(1, timeout=CONNECT_SECONDS)
+        except TimeoutError as error:
+            self._client.close()
+            raise EngineError(
+                f"the dask scheduler at {scheduler} has no workers: start some with "
+                f"dask worker {scheduler}"
+            ) from error
+        self._executor = self._client.get_executor(pure=False)
+
+    @property
+    def width(self) -> int:
+        """Two for each thread of the workers that are there now.
+
+        Raises:
+            EngineError: the scheduler went away.
+        """
+        try:
+            threads: int = sum(self._client.ncores().values())
+        except OSError as error:
+            raise EngineError(WENT_AWAY) from error
+        return max(2 * threads, 1)
+
+    def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
+        """See `Pool`."""
+        future: Future[Result] = self._executor.submit(function, task)
+        return future
+
+    def close(self) -> None:
+        """See `Pool`."""
+        self._client.close()

@@ -22,6 +22,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray, IntArray
+
 Show = Literal["line", "lane", "heat", "text", "hidden"]
 
 ACTIONS = ("stay", "switch")
@@ -93,10 +95,6 @@ def _signal(
     )
 
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-
-
 @dataclass(frozen=True, slots=True)
 class BlockSignals:
     """Every internal signal of one iteration, that is of one block of tau frames.
@@ -137,43 +135,45 @@ class BlockSignals:
     novel_blocks: int = _signal(
         "", "Novel blocks since the abstraction was created.", unit="blocks", dtype="int64"
     )
-    y: Float = _signal(
+    y: FloatArray = _signal(
         "y", "Output of the adaptive abstraction on the block.", equation="1", dims="TJ"
     )
-    y_frozen: Float = _signal(
+    y_frozen: FloatArray = _signal(
         "y_i", "Output of each frozen module on the block.", equation="1", dims="MTJ"
     )
-    eta: Float = _signal("η", "Slowness of each output.", equation="2", unit="1/frame", dims="J")
-    eta_dot: Float = _signal(
+    eta: FloatArray = _signal(
+        "η", "Slowness of each output.", equation="2", unit="1/frame", dims="J"
+    )
+    eta_dot: FloatArray = _signal(
         "η̇",
         "Running mean of the change of slowness; saved below δ.",
         equation="3",
         unit="1/frame",
         dims="J",
     )
-    variance: Float = _signal("v_r", "Recent variance of each output.", dims="J")
-    eta_inst: Float = _signal(
+    variance: FloatArray = _signal("v_r", "Recent variance of each output.", dims="J")
+    eta_inst: FloatArray = _signal(
         "η^inst",
         "Slowness of each output within the block.",
         equation="4",
         unit="1/frame",
         dims="J",
     )
-    gate_mean: Float = _signal("m", "Running mean of η^inst.", unit="1/frame", dims="J")
-    gate_sd: Float = _signal(
+    gate_mean: FloatArray = _signal("m", "Running mean of η^inst.", unit="1/frame", dims="J")
+    gate_sd: FloatArray = _signal(
         "SD", "Running standard deviation of η^inst.", unit="1/frame", dims="J"
     )
-    eta_inst_frozen: Float = _signal(
+    eta_inst_frozen: FloatArray = _signal(
         "η_i^inst",
         "Slowness of each frozen module's outputs within the block.",
         equation="4",
         unit="1/frame",
         dims="MJ",
     )
-    band_mean: Float = _signal(
+    band_mean: FloatArray = _signal(
         "m_i", "Centre of each frozen module's band.", unit="1/frame", dims="MJ"
     )
-    band_sd: Float = _signal(
+    band_sd: FloatArray = _signal(
         "SD_i",
         "Standard deviation of each frozen module; known within 2 of them.",
         unit="1/frame",
@@ -191,7 +191,7 @@ class BlockSignals:
         "CD-MISFA 1.0 only.",
         since=2,
     )
-    roc_error_frozen: Float = _signal(
+    roc_error_frozen: FloatArray = _signal(
         "",
         "Clustering error of each frozen module; known below the threshold, CD-MISFA 1.0 only.",
         dims="M",
@@ -204,9 +204,9 @@ class BlockSignals:
     curiosity: float = _signal("-⟨ξ̇⟩", "Curiosity reward.", equation="5")
     expert: float = _signal("βZ(⟨ξ⟩)", "Expert reward.", equation="5")
     reward: float = _signal("r", "Reward of the last transition.", equation="5")
-    R: Float = _signal("R", "Running reward function.", equation="6", dims="SAS", show="heat")
-    Q: Float = _signal("Q", "Action value function.", dims="SA", show="heat")
-    policy: Int = _signal(
+    R: FloatArray = _signal("R", "Running reward function.", equation="6", dims="SAS", show="heat")
+    Q: FloatArray = _signal("Q", "Action value function.", dims="SA", show="heat")
+    policy: IntArray = _signal(
         "π", "Policy: 0 stay, 1 switch, for each stream.", dims="S", dtype="int64", show="lane"
     )
     epsilon: float = _signal("ε", "Probability (above 1: certainty) of a random action.")
@@ -237,14 +237,14 @@ class BlockSignals:
         "Learning error of the candidate, c + |ln(η_test / η_fit)|; progress learner only.",
         since=3,
     )
-    interest: Float = _signal(
+    interest: FloatArray = _signal(
         "",
         "What each stream promises: the recent progress of its learning error, 0 where nothing is "
         "being learned; progress learner only.",
         dims="S",
         since=3,
     )
-    state: Int = _signal(
+    state: IntArray = _signal(
         "",
         "What has become of each stream: 0 learning, 1 learned, 2 known, 3 given up; -1 of a "
         "learner that does not say.",

@@ -1,8 +1,8 @@
 """One run, or many: sources, learners and logs put together."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.experiments.loop": "ENDINGS Digest learn",

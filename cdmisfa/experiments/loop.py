@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from cdmisfa.core.blocks import Block, FrameSource, LongSource
+from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
@@ -90,22 +90,3 @@ class Digest(SignalsHash, Sink):
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self.add(signals)
-
-
-class HashedMeanwhile(Sink):
-    """Has a source's files read beside learning, and ends that by an error if they are damaged.
-
-    Args:
-        source: what is learned from.
-    """
-
-    def __init__(self, source: LongSource) -> None:
-        source.hash_meanwhile()
-        self._source = source
-        self._waits = source.wait_hashed(0.0) is not None
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`; raises LogDamagedError as `FrameSource.describe`."""
-        if self._waits and self._source.wait_hashed(0.0) is None:
-            self._waits = False
-            self._source.describe()

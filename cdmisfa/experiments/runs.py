@@ -16,11 +16,9 @@ from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import (
     Block,
     FrameSource,
-    LongSource,
     SeekableSource,
     SourceSpec,
     description,
-    description_waited_for,
 )
 from cdmisfa.core.config import as_table
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -28,7 +26,7 @@ from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmeti
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.documents import machine, write_json
-from cdmisfa.experiments.loop import Digest, HashedMeanwhile, learn
+from cdmisfa.experiments.loop import Digest, learn
 from cdmisfa.experiments.resume import (
     COMMAND,
     FORK,
@@ -164,10 +162,7 @@ def run(
     learner = open_learner(config, source.spec, seed)
     digest = Digest()
     tables = {**(sections or {}), "learner": as_table(config)}
-    if resume and stated_whole(folder):
-        described = description_waited_for(source, hashing)
-    else:
-        described = description(source, at_once=True)
+    described = description(source, at_once=not (resume and stated_whole(folder)), told=hashing)
     versions = versions_used(config, source, described)
     manifest: dict[str, Any] = {
         "config": tables,
@@ -230,8 +225,6 @@ def run(
             take_over(log, learner, source, digest, fork)
         if log is not None and shown is not None and (resume or fork):
             shown.earlier(log.path.parent)
-        if isinstance(source, LongSource):
-            told.append(HashedMeanwhile(source))
         try:
             ended = learn(
                 source,
@@ -245,7 +238,7 @@ def run(
             ended, exhausted = "log_exhausted", error
         result = RunResult(
             run=str(folder) if folder is not None else None,
-            source=description_waited_for(source, hashing),
+            source=description(source, told=hashing),
             streams=source.spec.streams,
             seed=seed,
             iterations=learner.iteration,

@@ -15,7 +15,7 @@ from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import versions
 from recorder.config import RecordConfig, SceneConfig
-from recorder.images.reading import ImageOptions
+from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, scene_of
 from replay.camera_logs.options import CameraOptions
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from cdmisfa.core.arrays import FloatArray
 
 CHI_SQUARE_95 = 3.841458820694124
 """95 % quantile of the chi-square distribution with one degree of freedom."""
@@ -123,7 +123,7 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
         high = float(at.min()) if n > 0 and not never else math.inf
         return Midpoint(math.nan, low, high, math.nan, n)
     levels, inverse = np.unique(at, return_inverse=True)
-    total: Float = np.bincount(inverse).astype(np.float64)
+    total: FloatArray = np.bincount(inverse).astype(np.float64)
     hits = np.asarray(np.bincount(inverse, weights=answer), dtype=np.float64)
     if len(levels) == 1:
         return Midpoint(math.nan, -math.inf, math.inf, math.nan, n)
@@ -152,7 +152,9 @@ def logistic_midpoint(x: ArrayLike, yes: ArrayLike) -> Midpoint:
     return Midpoint(float(m[top]), bounds[0], bounds[1], slope, n)
 
 
-def _log_likelihood(x: Float, hits: Float, total: Float, m: Float, k: Float) -> Float:
+def _log_likelihood(
+    x: FloatArray, hits: FloatArray, total: FloatArray, m: FloatArray, k: FloatArray
+) -> FloatArray:
     """Log likelihood plus half the log determinant of the information, (M, K).
 
     Of M midpoints and K slopes, for answers at L levels of x, `total` at each and `hits` of them
@@ -167,7 +169,7 @@ def _log_likelihood(x: Float, hits: Float, total: Float, m: Float, k: Float) -> 
     return np.asarray(likelihood + 0.5 * np.log(np.maximum(determinant, 1e-300)))
 
 
-def correlation(a: Float, b: Float) -> float:
+def correlation(a: FloatArray, b: FloatArray) -> float:
     """Absolute Pearson correlation of two (n,) series; 0 where one does not vary."""
     if a.max() == a.min() or b.max() == b.min():
         return 0.0
@@ -176,7 +178,7 @@ def correlation(a: Float, b: Float) -> float:
     return abs(float(a @ b)) / lengths if lengths > 0 else 0.0
 
 
-def stays_above(values: Sequence[float] | Float, threshold: float) -> int:
+def stays_above(values: Sequence[float] | FloatArray, threshold: float) -> int:
     """First index from which on all values are above a threshold; -1 where the last is not.
 
     Example:

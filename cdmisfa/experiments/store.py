@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
+from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.untrusted.memory import BUDGET, MAX_LIST, budget, parse_json
 from cdmisfa.core.untrusted.regular import opened_regular
-from cdmisfa.experiments.engines import WorkerDied, run_all
 from recorder.log.folder import held
 from recorder.log.whole import make_folder, refuse_special, to_disk
 

@@ -17,6 +17,7 @@ from cdmisfa import kernels
 from cdmisfa.agents.agent import OUTCOME
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.agents.learners import open_learner
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import expand
@@ -24,8 +25,6 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
 from recorder.world.oscillatory import PERIOD, OscillatorySource, one_period
-
-Float = NDArray[np.float64]
 
 CHUNK = 512
 """Iterations between two returns to Python."""
@@ -148,7 +147,7 @@ def run_trial(
 
 
 def _expand(
-    config: LearnerConfig, tables: Sequence[Float]
+    config: LearnerConfig, tables: Sequence[FloatArray]
 ) -> tuple[kernels.Struct, kernels.Struct]:
     """One period of every stream and the tau frames after it, as shown and as learned from."""
     index = np.arange(PERIOD + config.tau) % PERIOD

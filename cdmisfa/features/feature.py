@@ -8,9 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
-
-Float = NDArray[np.float64]
 
 
 @runtime_checkable
@@ -20,7 +19,7 @@ class Feature(Protocol):
     One that also has `kernel`, a record of its arrays as `IncSFA` has it, is learned with in C.
     """
 
-    def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
+    def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
         """Learn from consecutive frames.
 
         Args:
@@ -32,11 +31,11 @@ class Feature(Protocol):
         """
 
     @property
-    def phi(self) -> Float:
+    def phi(self) -> FloatArray:
         """Weights of the centred input, (J, I)."""
 
     @property
-    def mean(self) -> Float:
+    def mean(self) -> FloatArray:
         """Mean of the input, (I,)."""
 
     @property

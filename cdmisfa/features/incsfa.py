@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
-
-Float = NDArray[np.float64]
 
 
 class State(NamedTuple):
@@ -37,13 +36,13 @@ class State(NamedTuple):
             `phi` is older than `v`; frames since `gram` was computed from `v`.
     """
 
-    mean: Float
-    v: Float
-    d: Float
-    gram: Float
-    w: Float
-    z_prev: Float
-    phi: Float
+    mean: FloatArray
+    v: FloatArray
+    d: FloatArray
+    gram: FloatArray
+    w: FloatArray
+    z_prev: FloatArray
+    phi: FloatArray
     counts: NDArray[np.int64]
 
 
@@ -96,7 +95,7 @@ class IncSFA:
         """Without `kernel`, whose pointers are of this process."""
         return {name: value for name, value in vars(self).items() if name != "kernel"}
 
-    def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
+    def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
         """Learn from consecutive frames.
 
         Args:
@@ -112,11 +111,11 @@ class IncSFA:
         return kernels.incsfa_update(self.kernel, frames, gap)
 
     @property
-    def phi(self) -> Float:
+    def phi(self) -> FloatArray:
         """Slow features as weights of the centred input, (J, I)."""
         return self.state.phi
 
     @property
-    def mean(self) -> Float:
+    def mean(self) -> FloatArray:
         """Running mean of the input, (I,)."""
         return self.state.mean

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
 
-Float = NDArray[np.float64]
 
-
-def project(phi: Float, offset: Float, frames: Any) -> Float:
+def project(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
     """Output y = phi x - offset of every row of phi on every frame.
 
     A row's output does not depend on which rows it is stacked with, nor a frame's on its block.

@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import UsageError
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 PIECE: int = kernels.lib.PIECE
 """Frames taken in at once; longer blocks are cut into pieces of so many."""
@@ -43,14 +41,14 @@ class State(NamedTuple):
             `differences`. The latter two stop at the window.
     """
 
-    mean: Float
-    basis: Float
-    variance: Float
-    differences: Float
-    weights: Float
-    spectrum: Float
-    last: Float
-    counts: Int
+    mean: FloatArray
+    basis: FloatArray
+    variance: FloatArray
+    differences: FloatArray
+    weights: FloatArray
+    spectrum: FloatArray
+    last: FloatArray
+    counts: IntArray
 
 
 class RecursiveSFA:
@@ -98,7 +96,7 @@ class RecursiveSFA:
             counts=np.zeros(3, np.int64),
         )
 
-    def update(self, frames: NDArray[Any], gap: bool = False) -> Float:
+    def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
         """Learn from consecutive frames.
 
         Equation: P1
@@ -131,17 +129,17 @@ class RecursiveSFA:
         return float(self.state.spectrum[0])
 
     @property
-    def phi(self) -> Float:
+    def phi(self) -> FloatArray:
         """Slow features as weights of the centred input, (J, I)."""
         rank = self.state.counts[0]
         return kernels.multiply(self.state.weights[:, :rank], self.state.basis[:rank])
 
     @property
-    def mean(self) -> Float:
+    def mean(self) -> FloatArray:
         """Mean of the input, (I,)."""
         return self.state.mean
 
-    def compare(self, phi: Float) -> tuple[Float, Float, Float]:
+    def compare(self, phi: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Other outputs on what was learned from, without its frames.
 
         Args:

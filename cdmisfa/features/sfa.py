@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import as_frames
-
-Float = NDArray[np.float64]
 
 EXTRA, ROUNDS = 8, 20
 """Directions beyond those wanted, and rounds, of the subspace iteration."""
 
 
-def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -> Float:
+def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -> FloatArray:
     """Slowest linear features of unit variance, slowest first.
 
     Directions whose variance is below `tolerance` times the largest are left out, as
@@ -48,7 +47,7 @@ def batch_sfa(frames: NDArray[Any], outputs: int, *, tolerance: float = 1e-10) -
     return np.asarray(rotation[:, :outputs].T @ whitening)
 
 
-def leading_directions(x: Float, components: int) -> Float:
+def leading_directions(x: FloatArray, components: int) -> FloatArray:
     """Orthonormal basis of the leading principal components, by subspace iteration.
 
     Args:
@@ -69,7 +68,7 @@ def leading_directions(x: Float, components: int) -> Float:
     return np.asarray(basis @ rotation[:, ::-1][:, :components])
 
 
-def slowness(y: Float) -> Float:
+def slowness(y: FloatArray) -> FloatArray:
     """Slowness of each output over a whole sequence; smaller is slower.
 
     Equation: 2

@@ -5,12 +5,8 @@ Moments are per frame, so slowness is in cycles per frame.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cdmisfa import kernels
-
-Float = NDArray[np.float64]
+from cdmisfa.core.arrays import FloatArray
 
 
 def slowness(derivative_square: float, variance: float) -> float:
@@ -18,7 +14,7 @@ def slowness(derivative_square: float, variance: float) -> float:
     return float(kernels.lib.slowness(derivative_square, variance))
 
 
-def instantaneous_slowness(y: Float) -> Float:
+def instantaneous_slowness(y: FloatArray) -> FloatArray:
     """Eta of each output from the frames of one block only, (J,).
 
     Args:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import UINT8, as_frames
 from cdmisfa.core.errors import CdmisfaError, UsageError
 
@@ -25,8 +26,6 @@ except ImportError as error:
         "pip, and run it in another folder than its sources where these are not what is installed"
     ) from error
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 FLOAT64, INT64 = np.dtype(np.float64), np.dtype(np.int64)
 _POINTERS = {FLOAT64: "double[]", INT64: "int64_t[]", UINT8: "uint8_t[]"}
@@ -140,24 +139,24 @@ def log(x: float) -> float:
     return float(lib.log_of(x))
 
 
-def sin(x: Any) -> Float:
+def sin(x: Any) -> FloatArray:
     """Sines of an array of numbers up to a million."""
     return _of_each(lib.sines, x)
 
 
-def cos(x: Any) -> Float:
+def cos(x: Any) -> FloatArray:
     """Cosines of the same."""
     return _of_each(lib.cosines, x)
 
 
-def _of_each(function: Any, x: Any) -> Float:
+def _of_each(function: Any, x: Any) -> FloatArray:
     shape = np.shape(x)
     out = np.empty(shape)
     function(readable("x", x, shape), out.size, pointer("out", out, shape))
     return out
 
 
-def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[Float]:
+def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[FloatArray]:
     """Standard normal draws of a generator, which is of no use afterwards, as arrays of shapes.
 
     They are what `rng.standard_normal` gives one after the other, but for its rounding, which
@@ -175,7 +174,7 @@ def normal(rng: np.random.Generator, *shapes: tuple[int, ...]) -> list[Float]:
     return [part.reshape(s) for part, s in zip(np.split(out, ends), shapes, strict=True)]
 
 
-def outputs(phi: Float, offset: Float, frames: Any) -> Float:
+def outputs(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
     """Output y = phi x - offset of every row of phi on every frame; see `projection.project`."""
     rows = len(phi)
     x = frames_of(frames, phi.shape[1])
@@ -191,7 +190,7 @@ def outputs(phi: Float, offset: Float, frames: Any) -> Float:
     return y
 
 
-def mean_output(phi: Float, mean: Float) -> Float:
+def mean_output(phi: FloatArray, mean: FloatArray) -> FloatArray:
     """What phi (J, I) gives out on the mean input (I,), as (J,)."""
     rows, size = phi.shape
     out = np.empty(rows)
@@ -223,7 +222,7 @@ def incsfa(state: Any, nu: float, mean_window: float) -> Struct:
     return Struct("incsfa", numbers, arrays)
 
 
-def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update") -> Float:
+def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update") -> FloatArray:
     """Learn from consecutive frames; see `IncSFA.update`.
 
     What is faster is chosen by the number of inputs; `by` is "by_frame" or "by_gram" to say which.
@@ -236,7 +235,7 @@ def incsfa_update(abstraction: Struct, frames: Any, gap: bool, by: str = "update
     return xi
 
 
-def instantaneous_slowness(y: Any) -> Float:
+def instantaneous_slowness(y: Any) -> FloatArray:
     """Slowness of each output within a block, (J,), from its values (n, J)."""
     n, J = np.shape(y)
     eta = np.empty(J)
@@ -251,8 +250,8 @@ def iterate(
     shown: Struct,
     x: Struct,
     t: int,
-    uniforms: Float,
-) -> tuple[Float, Float, Float, Float]:
+    uniforms: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """One iteration of a curious agent whose abstraction is `feature`; see `CuriousLearner.step`.
 
     Args:
@@ -282,7 +281,7 @@ def iterate(
 
 def recognise(
     agent: Struct, frozen: Struct, shown: Struct, x: Struct
-) -> tuple[Float, Float, Float]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The first part of `iterate`: the agent's outcome says what knows the block."""
     _block(agent, frozen, shown, x)
     told = _told(agent, frozen)
@@ -292,7 +291,7 @@ def recognise(
     return told
 
 
-def think(agent: Struct, xi: Any, y: Float, t: int, uniforms: Float) -> None:
+def think(agent: Struct, xi: Any, y: FloatArray, t: int, uniforms: FloatArray) -> None:
     """The last part of it, after `recognise` and an update whose weight changes were xi (n,)."""
     n, J = agent.pointer.tau, agent.pointer.outputs
     arrays = readable("xi", xi, (n,)), readable("y", y, (n, J))
@@ -306,7 +305,7 @@ def iterations(
     feature: Struct,
     shown: Struct,
     x: Struct,
-    uniforms: Float,
+    uniforms: FloatArray,
     swap_below: float,
     kept: Struct | None,
 ) -> int:
@@ -325,7 +324,7 @@ def iterations(
     return done
 
 
-def action_values(agent: Struct) -> Float:
+def action_values(agent: Struct) -> FloatArray:
     """Values of both actions in every stream under the agent's policy, (S, 2)."""
     Q = np.empty((agent.pointer.streams, 2))
     lib.action_values(agent.pointer, _buffer("double[]", Q))
@@ -347,7 +346,7 @@ def _fits(weights: Struct, agent: Struct | None, x: Struct) -> None:
         raise UsageError(f"{weights.pointer.outputs} outputs for {agent.pointer.outputs}")
 
 
-def _told(agent: Struct, frozen: Struct) -> tuple[Float, Float, Float]:
+def _told(agent: Struct, frozen: Struct) -> tuple[FloatArray, FloatArray, FloatArray]:
     M, n, J = frozen.pointer.modules, agent.pointer.tau, agent.pointer.outputs
     return np.empty((M, n, J)), np.empty((M, J)), np.empty(M)
 
@@ -371,7 +370,7 @@ def recursive_state(arrays: Mapping[str, NDArray[Any]], window: int) -> Struct:
     return Struct("recursive", {**sizes, "window": window}, held)
 
 
-def recursive_update(state: Struct, frames: Any, gap: bool) -> Float:
+def recursive_update(state: Struct, frames: Any, gap: bool) -> FloatArray:
     """Learn from consecutive frames; see `RecursiveSFA.update`."""
     x = frames_of(frames, state.pointer.inputs)
     change = np.empty(x.pointer.n)
@@ -380,7 +379,7 @@ def recursive_update(state: Struct, frames: Any, gap: bool) -> Float:
     return change
 
 
-def multiply(a: Float, b: Float) -> Float:
+def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
     """A (n, k) times B (k, m)."""
     (rows, parts), width = a.shape, b.shape[1]
     first, second = readable("a", a, (rows, parts)), readable("b", b, (parts, width))

@@ -1,8 +1,8 @@
 """The paper's own experiments, and the demonstration."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.paper.demo": "Report",

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from cdmisfa.paper.reproduce import Trial
 
-Float = NDArray[np.float64]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's colours, told apart by every kind of eye; one for each stream."""
@@ -58,7 +59,7 @@ def label(axes: Axes, letter: str, x: str, y: str) -> None:
     axes.tick_params(labelsize=7)
 
 
-def stack(curves: Sequence[NDArray[Any]]) -> Float:
+def stack(curves: Sequence[NDArray[Any]]) -> FloatArray:
     """Curves of different lengths as one array (trials, longest, ...), NaN after their ends."""
     longest = max(len(c) for c in curves)
     out = np.full((len(curves), longest, *curves[0].shape[1:]), np.nan)
@@ -67,7 +68,7 @@ def stack(curves: Sequence[NDArray[Any]]) -> Float:
     return out
 
 
-def mean_sd(stacked: Float) -> tuple[Float, Float]:
+def mean_sd(stacked: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and standard deviation over trials, of those that still run.
 
     Args:
@@ -97,8 +98,8 @@ def eta_dot(axes: Axes, trials: Sequence[Trial], delta: float, letter: str) -> N
 
 def band(
     axes: Axes,
-    mean: Float,
-    sd: Float,
+    mean: FloatArray,
+    sd: FloatArray,
     stream: int,
     *,
     x: NDArray[Any] | None = None,

@@ -23,9 +23,9 @@ from pyarrow import parquet
 
 from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.modules import Module
+from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
-from cdmisfa.experiments.engines import WorkerDied, run_all
 from cdmisfa.experiments.statistics import Summary, summary, wilson
 from cdmisfa.experiments.store import DONE, TrialStore, code, identity
 from recorder.log.whole import whole

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
 _CONTRACTS = {
     "cdmisfa.testing.cameras": "CameraContract",
@@ -15,4 +15,4 @@ _CONTRACTS = {
 
 pytest.register_assert_rewrite(*_CONTRACTS)
 
-__getattr__, __dir__, __all__ = face(__name__, _CONTRACTS)
+__getattr__, __dir__, __all__ = exports(__name__, _CONTRACTS)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from cdmisfa.core.options import setting
-from recorder.images.reading import ImageOptions
+from recorder.images.options import ImageOptions
 
 OnLoss = Literal["reconnect", "wait", "end"]
 """What is done about a camera that stalls or goes away."""

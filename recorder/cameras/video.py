@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted.memory import BUDGET, budget
-from recorder.images.frames import frame_colors, frame_gray
-from recorder.images.pixels import MAX_PIXELS, Bytes
-from recorder.images.videos import most_pixels, pyav
+from recorder.images.pixels import MAX_PIXELS
+from recorder.images.videos import frame_colors, frame_gray, most_pixels, pyav
 
 DRIFT: Final = 1e-3
 """Seconds a second by which a camera's clock may be slow."""
@@ -74,7 +74,7 @@ class VideoCamera:
         self._av = pyav(word)
         self._shown = frame_colors if color else frame_gray
 
-    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+    def pictures(self) -> Iterator[tuple[int, ByteArray]]:
         """See `Camera`."""
         with self._open() as container:
             if not container.streams.video:
@@ -130,7 +130,7 @@ class VideoCamera:
 
     def _paced(
         self, frames: Iterator[Any], codec: Any, *, timed: bool
-    ) -> Iterator[tuple[int, Bytes]]:
+    ) -> Iterator[tuple[int, ByteArray]]:
         steady = Steady()
         for frame in frames:
             self._check(frame, codec)

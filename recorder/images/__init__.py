@@ -1,8 +1,8 @@
 """Images in messages and files of others: decoded, made gray and small."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.images.messages": "image_decoder",

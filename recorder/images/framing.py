@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError, are_for
-from recorder.images.pixels import Bytes, Shown, shrink
-from recorder.images.reading import Fit, Size
+from recorder.images.options import Fit, Size
+from recorder.images.pixels import Shown, shrink
 
 FRAME_PIXELS: Final = 48 * 128
 """Most pixels of a frame where no size is given: those of the paper's."""
@@ -32,7 +33,7 @@ class Framing:
     fit: Fit
     color: bool = False
 
-    def frame(self, image: Bytes) -> Bytes:
+    def frame(self, image: ByteArray) -> ByteArray:
         """Make an image a frame; one of another size than the first may be smaller than a frame.
 
         Args:
@@ -155,7 +156,7 @@ def default_size(image: Size) -> Size:
     return max(height // divisor, 1), max(width // divisor, 1)
 
 
-def fitted(image: Bytes, size: Size, fit: Fit, *, enlarge: bool = False) -> Bytes:
+def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> ByteArray:
     """Make an image a frame.
 
     Args:
@@ -206,6 +207,6 @@ def _largest_within(outer: Size, ratio: Size) -> Size:
     return outer[0], max(round(outer[0] * ratio[1] / ratio[0]), 1)
 
 
-def _middle(image: Bytes, size: Size) -> Bytes:
+def _middle(image: ByteArray, size: Size) -> ByteArray:
     top, left = ((have - want) // 2 for have, want in zip(image.shape, size, strict=True))
     return image[top : top + size[0], left : left + size[1]]

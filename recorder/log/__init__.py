@@ -1,8 +1,8 @@
 """Recordings on disk: one MCAP file a view, written whole or not at all."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.log.logfile": "LogFile",

@@ -1,8 +1,8 @@
 """Simulated worlds: what their streams show at every t."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.world.icub.config": "IcubConfig",

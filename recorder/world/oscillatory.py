@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError
@@ -18,10 +18,8 @@ from recorder.config import SceneConfig, check_view_names
 PERIOD = 500
 """Frames after which every oscillatory stream repeats: theta_t = 2 pi t / 500."""
 
-Float = NDArray[np.float64]
 
-
-def x1(theta: Float) -> Float:
+def x1(theta: FloatArray) -> FloatArray:
     """Stream 1, (n, 2), at phases theta, (n,); its slow feature has frequency 4/500.
 
     Equation: 7
@@ -30,7 +28,7 @@ def x1(theta: Float) -> Float:
     return np.stack([sin(4 * theta - np.pi / 4) - fast**2, fast], axis=1)
 
 
-def x2(theta: Float) -> Float:
+def x2(theta: FloatArray) -> FloatArray:
     """Stream 2, (n, 2), at phases theta, (n,); its slow feature has frequency 3/500.
 
     Equation: 8
@@ -39,7 +37,7 @@ def x2(theta: Float) -> Float:
     return np.stack([sin(3 * theta) + fast**2, fast], axis=1)
 
 
-def x3(theta: Float) -> Float:
+def x3(theta: FloatArray) -> FloatArray:
     """Stream 3, (n, 2), at phases theta, (n,); its slow feature has frequency 2/500.
 
     Equation: 9
@@ -48,15 +46,20 @@ def x3(theta: Float) -> Float:
     return np.stack([fast, cos(2 * theta) + fast**2], axis=1)
 
 
-def zero(theta: Float) -> Float:
+def zero(theta: FloatArray) -> FloatArray:
     """The stream that shows nothing, (n, 2), of the non-stationary environment."""
     return np.zeros((len(theta), 2))
 
 
-STREAMS: Mapping[str, Callable[[Float], Float]] = {"x1": x1, "x2": x2, "x3": x3, "zero": zero}
+STREAMS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    "x1": x1,
+    "x2": x2,
+    "x3": x3,
+    "zero": zero,
+}
 
 
-def one_period(name: str) -> Float:
+def one_period(name: str) -> FloatArray:
     """All PERIOD frames of a stream, (500, 2).
 
     Taking frames from this table makes a block's bits independent of how it is cut.

@@ -1,8 +1,8 @@
 """Other people's logs of cameras as sources of frames."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.camera_logs.source": "ForeignSource",

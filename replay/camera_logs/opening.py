@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.reading import IMAGES, Reading
+from recorder.images.decoding import IMAGES, Reading
 from replay.camera_logs.formats.bag import BAGS, BagImages
 from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
 from replay.camera_logs.formats.mcap_log import McapImages
@@ -16,10 +16,9 @@ from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream, NothingLoggedError
 from replay.camera_logs.video_messages import in_order
-from replay.mcap.identity import hashed
-from replay.storage.hashing import Hashed, HashedFiles
-from replay.storage.listing import log_files
+from replay.storage.identity import FilesIdentity, Identity, log_identity
 from replay.storage.location import Location, Url, location
+from replay.storage.opening import log_files
 
 
 def open_images(
@@ -92,8 +91,8 @@ def only_foreign(path: Location) -> bool:
     return is_video(path) or is_dataset(path) or is_bag(path) or is_picture_folder(path)
 
 
-def hashed_log(path: Location, streams: Sequence[ImageStream]) -> Hashed:
-    """What tells a log from others: its bytes; of a folder, names and contents count.
+def identity_of(path: Location, streams: Sequence[ImageStream]) -> Identity:
+    """The identity of a log: its bytes; of a folder, names and contents count.
 
     The streams hold the log open, where it is an MCAP file.
 
@@ -102,13 +101,13 @@ def hashed_log(path: Location, streams: Sequence[ImageStream]) -> Hashed:
     """
     readers = [s.reader for s in streams if isinstance(s, McapImages) and s.path == path]
     if readers:
-        return hashed(*readers)
+        return log_identity(*readers)
     if isinstance(path, Url):
         raise ValueError(f"{path} is not open")
     if not path.is_dir():
-        return HashedFiles(path)
+        return FilesIdentity(path)
     found = path.rglob("*") if is_dataset(path) else path.iterdir()
-    return HashedFiles(path, (file for file in found if file.is_file()))
+    return FilesIdentity(path, (file for file in found if file.is_file()))
 
 
 def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cdmisfa.core.options import TIME, setting
-from recorder.images.reading import Clock, ImageOptions
+from recorder.images.options import Clock, ImageOptions
 
 Align = Literal["index", "time"]
 Gaps = Literal["skip", "hold"]

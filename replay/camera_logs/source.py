@@ -14,11 +14,12 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.options import option_words
+from recorder.images.decoding import Reading
 from recorder.images.fields import rounded
-from recorder.images.frames import COLOR_RECIPE
 from recorder.images.framing import framings
+from recorder.images.options import Clock, Depth, Fit, Size
 from recorder.images.pixels import Shown, UnknownPixels
-from recorder.images.reading import Clock, Depth, Fit, Reading, Size
+from recorder.images.videos import COLOR_RECIPE
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -38,11 +39,11 @@ from replay.camera_logs.alignment import (
 from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
-from replay.camera_logs.opening import hashed_log, image_logs, open_images
+from replay.camera_logs.opening import identity_of, image_logs, open_images
 from replay.camera_logs.options import Align, CameraOptions, Gaps
 from replay.camera_logs.salvaged import BROKEN, SALVAGE, WholeImages
 from replay.camera_logs.stream import ImageStream
-from replay.storage.hashing import Hashed, LoggedSource
+from replay.storage.identity import Identity, LoggedSource
 from replay.storage.location import Location, Url
 from replay.stored import Span, outside
 
@@ -131,14 +132,8 @@ class ForeignSource(LoggedSource):
         self._files = image_logs(named)
         self._loop = loop
         self._reading = reading = Reading(depth, tuple(fields), time, stamp, color)
-        asked: dict[str, Any] = {
-            "size": size,
-            "fit": fit,
-            "gaps": gaps,
-            "start": start,
-            "stop": stop,
-        }
-        self._asked = CameraOptions(**dataclasses.asdict(reading), **asked)
+        chosen = CameraOptions(**dataclasses.asdict(reading), size=size, fit=fit, gaps=gaps)
+        self._asked = dataclasses.replace(chosen, start=start, stop=stop)
         self._goal, self._salvage = goal, salvage
         self._streams: list[ImageStream] = []
         self.changes: dict[int, str] = {}
@@ -198,9 +193,9 @@ class ForeignSource(LoggedSource):
         """What was recorded: nobody says."""
         return {}
 
-    def _logs(self) -> list[Hashed]:
+    def _logs(self) -> list[Identity]:
         parts = [part for stream in self._streams for part in stream.parts]
-        return [hashed_log(path, parts) for path in self._files]
+        return [identity_of(path, parts) for path in self._files]
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """The logs, the topics, and how they became frames."""
@@ -273,7 +268,6 @@ class ForeignSource(LoggedSource):
         return chosen
 
     def close(self) -> None:
-        super().close()
         for stream in self._streams:
             stream.close()
 

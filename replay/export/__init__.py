@@ -1,8 +1,8 @@
 """Runs and recordings for other programs: tables, figures, videos, datasets."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.export.forms": "FORMS Form export",

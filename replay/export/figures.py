@@ -13,7 +13,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from cdmisfa.core.signals import STATES
 from recorder.log.whole import refuse_taken, whole
@@ -32,7 +31,6 @@ FOLLOWS = 0.5
 """Correlation from which on a fit says something."""
 
 Axes = Any
-Float = NDArray[np.float64]
 
 STYLE: dict[Any, Any] = {
     "font.size": 8.0,

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from replay.following import Output, read_outputs
 from replay.runs.log import WATCHED_TOPIC, RunHeader
 from replay.runs.outline import Outline, read_outline
 from replay.runs.stretches import read_columns, read_stretches
-
-Float = NDArray[np.float64]
 
 STRIP = 8
 """Pictures of each module."""
@@ -56,16 +55,16 @@ class History:
     outline: Outline
     shown: tuple[int, ...]
     stream: NDArray[np.int64]
-    eta: Float
-    eta_dot: Float
-    stay_reward: Float
+    eta: FloatArray
+    eta_dot: FloatArray
+    stay_reward: FloatArray
     policy: NDArray[np.int64]
     lanes: tuple[int, ...]
     state: NDArray[np.int64]
     known_by: NDArray[np.int64]
-    error: Float
-    tested: Float
-    fitted: Float
+    error: FloatArray
+    tested: FloatArray
+    fitted: FloatArray
     outputs: tuple[Output, ...]
     pictures: tuple[Strip, ...]
 

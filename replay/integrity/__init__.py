@@ -1,14 +1,14 @@
 """What is in a log, whether it is whole, and saving what can be saved."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.integrity.info": "LogInfo describe",
         "replay.integrity.verify": "LogCheck check_log",
         "replay.integrity.recover": "Recovery recover_log",
         "replay.integrity.survey": "kind_of",
-        "replay.mcap.segments": "Problem",
+        "recorder.mcap.records": "Problem",
     },
 )

@@ -11,15 +11,15 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Problem, Segment
 from replay.integrity.survey import said
-from replay.mcap.reader import LogReader
-from replay.mcap.segments import Problem, Segment
 from replay.runs.final import facts_sha256
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
 from replay.runs.log import SIGNALS_TOPIC, read_header
 from replay.runs.modules import load_modules
 from replay.runs.stretches import Stretch, Stretches
-from replay.storage.checksum import sha256
+from replay.storage.identity import file_sha256
 
 
 class RunPass:
@@ -119,7 +119,7 @@ def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
     try:
         if not path.is_file():
             yield Problem(str(path), "is missing")
-        elif sha256(path) != stated:
+        elif file_sha256(path) != stated:
             yield Problem(str(path), "holds something else than the run's final record states")
         else:
             load_modules(path)

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import frames as kernels
-from replay.mcap.reader import LogReader
-from replay.mcap.records import MAX_CHUNK, Bytes, Channel, MalformedRecord
-from replay.mcap.segments import Segment
-from replay.mcap.tables import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAX_CHUNK, Channel, MalformedRecord, Place, Segment
+from recorder.mcap.tables import MessageTable
 from replay.recordings.channel_rows import own_messages
-from replay.storage.location import Location
 
 Places = NDArray[np.int64]
 
@@ -43,11 +42,11 @@ class RowLayout:
     what: str
     least: int
     places: Places
-    marks: Bytes
+    marks: ByteArray
     distances: Places
     width: int
 
-    def checked_ends(self, path: Location, segment: Segment, table: MessageTable) -> Places:
+    def checked_ends(self, path: Place, segment: Segment, table: MessageTable) -> Places:
         """Place after each message of the channel in its chunk, (n,), if all are laid out so.
 
         Raises:
@@ -73,7 +72,7 @@ class ScannedChunk:
         times: (C, n) its log time.
     """
 
-    buffer: Bytes
+    buffer: ByteArray
     ends: Places
     times: NDArray[np.uint64]
 
@@ -129,7 +128,7 @@ class ChunkScanner:
         ends = chunk.ends[which, low : low + len(out)]
         kernels.gather(chunk.buffer, ends, layout.distances, layout.width, out)
 
-    def scanned(self, segment: Segment, buffer: Bytes) -> ScannedChunk | None:
+    def scanned(self, segment: Segment, buffer: ByteArray) -> ScannedChunk | None:
         """Decode a chunk by a kernel, into a buffer where it is large enough.
 
         Returns:
@@ -148,7 +147,7 @@ class ChunkScanner:
         found = kernels.scan(data, index, segment.start, segment.end, self._wanted, wanted)
         return None if found is None else ScannedChunk(buffer, *found)
 
-    def tabled(self, segment: Segment, buffer: Bytes) -> ScannedChunk:
+    def tabled(self, segment: Segment, buffer: ByteArray) -> ScannedChunk:
         """Decode a chunk by its tables, into a buffer where it is large enough."""
         tables = [own_messages(self._reader, segment, layout.channel) for layout in self._layouts]
         ends = np.zeros((len(tables), max(map(len, tables))), np.int64)
@@ -162,6 +161,6 @@ class ChunkScanner:
         return ScannedChunk(buffer, ends, times)
 
 
-def _fitting(buffer: Bytes, size: int) -> Bytes:
+def _fitting(buffer: ByteArray, size: int) -> ByteArray:
     """A buffer where it is large enough, or else a new one with room for chunks that follow."""
     return buffer if len(buffer) >= size else np.empty(size + size // 8, np.uint8)

@@ -15,13 +15,12 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.log.whole import PARTIAL
-from replay.mcap.identity import hashed
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
+from recorder.mcap.store import PARTIAL
 from replay.recordings.view_file import ViewFile, intersection
-from replay.storage.hashing import Hashed, LoggedSource
-from replay.storage.listing import log_files
+from replay.storage.identity import Identity, LoggedSource, log_identity
 from replay.storage.location import Location, Url
+from replay.storage.opening import log_files
 from replay.stored import joined
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
@@ -123,8 +122,8 @@ class RecordedSource(LoggedSource):
         """The frames that are there of each view, as ranges [start, stop)."""
         return {p[0].facts.view: [r for view in p for r in view.ranges] for p in self._views}
 
-    def _logs(self) -> list[Hashed]:
-        return [hashed(view.reader) for view in self._all()]
+    def _logs(self) -> list[Identity]:
+        return [log_identity(view.reader) for view in self._all()]
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """The recording's views with their files, and what was recorded."""
@@ -150,7 +149,6 @@ class RecordedSource(LoggedSource):
         return {name: getattr(facts, name) for name in _SCENE if name in facts.values}
 
     def close(self) -> None:
-        super().close()
         for view in self._all():
             view.close()
 

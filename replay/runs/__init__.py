@@ -1,8 +1,8 @@
 """Runs on disk: signals, modules, and what they came to."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.runs.folders": "is_run is_sweep run_log runs_in",

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from replay.runs.folders import MODULES_FILE, read_run_json
 from replay.runs.log import read_header
-from replay.storage.checksum import sha256
+from replay.storage.identity import file_sha256
 
 _FILES: Final = ("files", "views")
 """Where sources state their files, each as a table."""
@@ -34,7 +34,7 @@ def final_record(
     """
     return {
         "signals_sha256": signals,
-        "modules_sha256": sha256(folder / MODULES_FILE),
+        "modules_sha256": file_sha256(folder / MODULES_FILE),
         "facts_sha256": facts_sha256(document),
         "view": json.dumps(view),
     }

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from replay.runs.columns import Blocks, SignalColumns, told
 from replay.runs.log import RunHeader, read_header
 from replay.runs.stretches import read_columns
-
-Float = NDArray[np.float64]
 
 LINES = (
     *("eta", "eta_dot", "reward", "curiosity", "expert", "xi", "share", "epsilon"),
@@ -81,7 +80,7 @@ class Outline:
     visits: NDArray[np.int64]
     saved: tuple[Saved, ...]
     last: Phase | None
-    lines: dict[str, Float]
+    lines: dict[str, FloatArray]
     told: frozenset[str]
     states: tuple[int, ...]
 
@@ -102,7 +101,7 @@ class Tally:
         self.header = header
         self._visits = np.zeros(len(header.spec.streams), dtype=np.int64)
         self._blocks: list[Blocks] = []
-        self._lines: dict[str, list[Float]] = {name: [] for name in LINES}
+        self._lines: dict[str, list[FloatArray]] = {name: [] for name in LINES}
         self._saved: list[Saved] = []
         self._iterations = self._modules = self._tau = self._outputs = 0
         self._last: Phase | None = None

@@ -1,8 +1,8 @@
 """What Rerun shows of runs and recordings."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.view.build": "build_view",

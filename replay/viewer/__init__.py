@@ -1,8 +1,8 @@
 """The program that shows a view: its window, its page, its pictures."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.viewer.window": "open_window serve",

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.agents.agent import Agent, Rules
 from cdmisfa.agents.gate import CONSTANT, NOVEL, Frozen
-
-Float = NDArray[np.float64]
+from cdmisfa.core.arrays import FloatArray
 
 CONSTANT_VARIANCE, BAND, FORGOTTEN, TIE, IDLE_EPSILON = 1e-12, 2.0, 0.5, 1e-12, 1e-3
 STAY, SWITCH = 0, 1
@@ -24,12 +23,12 @@ def slowness(derivative_square: float, variance: float) -> float:
     return math.inf if variance <= 0 else math.sqrt(derivative_square / variance) / (2 * math.pi)
 
 
-def block_moments(y: Float) -> tuple[float, float, float]:
+def block_moments(y: FloatArray) -> tuple[float, float, float]:
     """Mean, variance and mean squared difference of (n,)."""
     return y.mean(), (y - y[0]).var(), (np.diff(y) ** 2).mean()
 
 
-def instantaneous_slowness(y: Float) -> float:
+def instantaneous_slowness(y: FloatArray) -> float:
     _, variance, derivative = block_moments(y)
     return slowness(derivative, variance)
 
@@ -43,7 +42,9 @@ def is_constant(frames: NDArray[Any], scale: float) -> bool:
     return bool(((values - values[0]).var(axis=0) <= CONSTANT_VARIANCE).all())
 
 
-def verdict(y_frozen: Float, band_mean: Float, band_sd: Float) -> tuple[int, Float]:
+def verdict(
+    y_frozen: FloatArray, band_mean: FloatArray, band_sd: FloatArray
+) -> tuple[int, FloatArray]:
     """What knows a block by slowness, and the slowness (M, J)."""
     eta = np.array([[instantaneous_slowness(y) for y in module.T] for module in y_frozen])
     eta = eta.reshape(band_mean.shape)
@@ -52,7 +53,7 @@ def verdict(y_frozen: Float, band_mean: Float, band_sd: Float) -> tuple[int, Flo
     return (int(np.argmax(inside)) + 1 if inside.any() else NOVEL), eta
 
 
-def nearest(centres: Float, counts: Float, y: Float) -> tuple[int, float]:
+def nearest(centres: FloatArray, counts: FloatArray, y: FloatArray) -> tuple[int, float]:
     """The centre (of (C, n, J)) nearest to y (n, J), or -1, and its distance."""
     distances = np.sqrt(((centres - y) ** 2).mean(axis=(1, 2)))
     distances[counts <= 0] = np.inf
@@ -62,7 +63,7 @@ def nearest(centres: Float, counts: Float, y: Float) -> tuple[int, float]:
 
 
 def cluster(
-    centres: Float, counts: Float, label: int, y: Float, radius: float, memory: float
+    centres: FloatArray, counts: FloatArray, label: int, y: FloatArray, radius: float, memory: float
 ) -> float:
     """Take y (n, J) into the node of its label, of (S, C, n, J) and (S, C)."""
     counts *= math.exp(-1 / memory)
@@ -78,8 +79,8 @@ def cluster(
 
 
 def known_to(
-    centres: Float, counts: Float, label: int, y_frozen: Float, threshold: float
-) -> tuple[int, Float]:
+    centres: FloatArray, counts: FloatArray, label: int, y_frozen: FloatArray, threshold: float
+) -> tuple[int, FloatArray]:
     """What knows a block by clusters, and the errors (M,)."""
     nodes = zip(centres[:, label], counts[:, label], y_frozen, strict=True)
     found = [nearest(*node) for node in nodes]
@@ -89,8 +90,8 @@ def known_to(
 
 
 def recognise(
-    agent: Agent, rules: Rules, frozen: Frozen, frames: NDArray[Any], x: Float, scale: float
-) -> tuple[int, Float, Float, Float]:
+    agent: Agent, rules: Rules, frozen: Frozen, frames: NDArray[Any], x: FloatArray, scale: float
+) -> tuple[int, FloatArray, FloatArray, FloatArray]:
     """What knows a block; outputs, slowness and clustering error of the modules."""
     M, J = frozen.band_mean.shape
     y = (x @ frozen.phi.T - frozen.offset).reshape(len(x), M, J).transpose(1, 0, 2)
@@ -102,11 +103,11 @@ def recognise(
     return (CONSTANT if is_constant(frames, scale) else known_by), y, eta, error
 
 
-def converged(eta_dot: Float, delta: float) -> bool:
+def converged(eta_dot: FloatArray, delta: float) -> bool:
     return bool((np.abs(eta_dot) < delta).all())
 
 
-def track_output(agent: Agent, rules: Rules, j: int, y: Float) -> None:
+def track_output(agent: Agent, rules: Rules, j: int, y: FloatArray) -> None:
     n, blocks = len(y), agent.memory[0]["novel_blocks"]
     mean, variance, derivative = block_moments(y)
     square = variance + mean**2
@@ -151,7 +152,7 @@ def curiosity_reward(xi: float, xi_previous: float) -> float:
 
 
 def add_reward(
-    stay: Float, switch: Float, dense: Float, s: int, a: int, s_next: int, r: float
+    stay: FloatArray, switch: FloatArray, dense: FloatArray, s: int, a: int, s_next: int, r: float
 ) -> None:
     (switch if a == SWITCH else stay)[s] += r
     if len(dense):
@@ -159,21 +160,30 @@ def add_reward(
 
 
 def add_reward_locally(
-    stay: Float, switch: Float, dense: Float, s: int, a: int, s_next: int, r: float, alpha: float
+    stay: FloatArray,
+    switch: FloatArray,
+    dense: FloatArray,
+    s: int,
+    a: int,
+    s_next: int,
+    r: float,
+    alpha: float,
 ) -> float:
     dense[s, a, s_next] += alpha * (r - dense[s, a, s_next])
     stay[s], switch[s] = dense[s, STAY, s], dense[s, SWITCH].sum()
     return float(np.linalg.norm(dense))
 
 
-def value_sum(stay: Float, switch: Float, policy: NDArray[np.int64], gamma: float) -> float:
+def value_sum(
+    stay: FloatArray, switch: FloatArray, policy: NDArray[np.int64], gamma: float
+) -> float:
     n, leavers = len(stay), int(policy.sum())
     values = np.where(policy == SWITCH, switch, stay * ((n - 1 + gamma) / (1 - gamma)))
     return float(values.sum() / (n - leavers + (leavers - 1) * (1 - gamma)))
 
 
 def policy_iteration(
-    stay: Float, switch: Float, gamma: float, policy: NDArray[np.int64], sweeps: int = 100
+    stay: FloatArray, switch: FloatArray, gamma: float, policy: NDArray[np.int64], sweeps: int = 100
 ) -> None:
     """Make a policy optimal, in place."""
     n = len(stay)
@@ -190,8 +200,8 @@ def policy_iteration(
 
 
 def action_values(
-    stay: Float, switch: Float, count: float, gamma: float, policy: NDArray[np.int64]
-) -> Float:
+    stay: FloatArray, switch: FloatArray, count: float, gamma: float, policy: NDArray[np.int64]
+) -> FloatArray:
     """Values of both actions under a policy, (S, 2)."""
     n = len(stay)
     if not count > 0:
@@ -218,7 +228,7 @@ def other_stream(stream: int, n_streams: int, draw: float) -> int:
     return (stream + 1 + min(int(draw * (n_streams - 1)), n_streams - 2)) % n_streams
 
 
-def mean_change(xi: Float) -> float:
+def mean_change(xi: FloatArray) -> float:
     told = xi[~np.isnan(xi)]
     return float(told.mean()) if len(told) else math.nan
 
@@ -243,7 +253,13 @@ def estimate_reward(agent: Agent, rules: Rules, reward: float) -> None:
 
 
 def think(
-    agent: Agent, rules: Rules, known_by: int, xi: Float, y: Float, t: int, uniforms: Float
+    agent: Agent,
+    rules: Rules,
+    known_by: int,
+    xi: FloatArray,
+    y: FloatArray,
+    t: int,
+    uniforms: FloatArray,
 ) -> dict[str, Any]:
     """One iteration after the gate and the update; what `OUTCOME` tells of it."""
     m = agent.memory[0]

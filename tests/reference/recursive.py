@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.features.recursive import PIECE, State
 
-Float = NDArray[np.float64]
 
-
-def most_different(rows: Float, most: int, least: float) -> Float:
+def most_different(rows: FloatArray, most: int, least: float) -> FloatArray:
     """An orthonormal basis of the rows that differ most from those chosen before, (P, I)."""
     left, span = rows.copy(), np.zeros((0, rows.shape[1]))
     least = max(least, 1e-10 * (rows**2).sum(axis=1).max())
@@ -25,13 +23,13 @@ def most_different(rows: Float, most: int, least: float) -> Float:
     return span
 
 
-def eigen(matrix: Float) -> tuple[Float, Float]:
+def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues, the largest first, and eigenvectors as rows."""
     values, vectors = np.linalg.eigh(matrix)
     return values[::-1], vectors.T[::-1]
 
 
-def learn_piece(state: State, x: Float, gap: bool, window: int) -> float:
+def learn_piece(state: State, x: FloatArray, gap: bool, window: int) -> float:
     """Take in a piece of a block (m, I) of values; the change of the outputs."""
     rank, seen, pairs = state.counts.tolist()
     size, (m, _) = len(state.variance), x.shape
@@ -73,7 +71,7 @@ def solve(state: State, rank: int) -> None:
     state.weights[: len(shown), :k] = shown
 
 
-def change(weights: Float, before: Float, variance: Float) -> float:
+def change(weights: FloatArray, before: FloatArray, variance: FloatArray) -> float:
     """Change of the outputs, from the singular values of their correlations with those before."""
     power = (before**2 * variance).sum(axis=1)
     if not power.all():
@@ -82,7 +80,7 @@ def change(weights: Float, before: Float, variance: Float) -> float:
     return float(np.sqrt(max(0.0, 2 - 2 * np.linalg.svd(alike, compute_uv=False).mean())))
 
 
-def update(state: State, frames: Float, gap: bool, window: int) -> Float:
+def update(state: State, frames: FloatArray, gap: bool, window: int) -> FloatArray:
     """Learn from consecutive frames of values; what `RecursiveSFA.update` returns."""
     out = np.full(len(frames), np.nan)
     for start in range(0, len(frames), PIECE):

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-
-Float = NDArray[np.float64]
+from cdmisfa.core.arrays import FloatArray
 
 HALF = 8
 """Blocks of each half of the errors that progress is told from."""
@@ -38,9 +37,9 @@ class Situation:
 
     stream: int
     learning: NDArray[np.bool_]
-    errors: Mapping[int, Float]
+    errors: Mapping[int, FloatArray]
     visits: NDArray[np.int64]
-    draws: Float
+    draws: FloatArray
     explore: float
 
     @property
@@ -54,7 +53,7 @@ Rule = Callable[[Situation], tuple[int, bool]]
 """The next stream, and whether it was drawn at random."""
 
 
-def relative_progress(errors: Float) -> float:
+def relative_progress(errors: FloatArray) -> float:
     """Fall of the learning error over the last blocks, weighted towards what is nearly done.
 
     That is (max(0, before - now) / before + .001) / now, with before and now the means of the
@@ -73,12 +72,14 @@ def relative_progress(errors: Float) -> float:
     return (fall + 1e-3) / max(now, 1e-3)
 
 
-def interest(situation: Situation) -> Float:
+def interest(situation: Situation) -> FloatArray:
     """(S,) `relative_progress` of each stream, 0 of those that are not being learned."""
     return _of_each(situation, lambda errors, _: relative_progress(errors), 0.0)
 
 
-def _of_each(s: Situation, value: Callable[[Float, int], float], otherwise: float) -> Float:
+def _of_each(
+    s: Situation, value: Callable[[FloatArray, int], float], otherwise: float
+) -> FloatArray:
     """(S,) the value of each stream by its errors and visits, another where it is not learned."""
     values = np.where(s.learning, value(np.zeros(0), 0), otherwise)  # without a candidate
     for stream, errors in s.errors.items():
@@ -87,7 +88,7 @@ def _of_each(s: Situation, value: Callable[[Float, int], float], otherwise: floa
     return values
 
 
-def _exploring(value: Callable[[Situation], Float]) -> Rule:
+def _exploring(value: Callable[[Situation], FloatArray]) -> Rule:
     """The stream of the largest value; with a probability, or where all is learned, any."""
 
     def choose(s: Situation) -> tuple[int, bool]:
@@ -98,10 +99,10 @@ def _exploring(value: Callable[[Situation], Float]) -> Rule:
     return choose
 
 
-def _gamma_progress(s: Situation) -> Float:
+def _gamma_progress(s: Situation) -> FloatArray:
     """Slow mean of the learning error less its fast mean (Kim et al. 2020)."""
 
-    def value(errors: Float, _: int) -> float:
+    def value(errors: FloatArray, _: int) -> float:
         if len(errors) < RECENT:
             return 1e3
         slow, fast = fading(0.95, len(errors)), fading(0.7, len(errors))
@@ -110,16 +111,16 @@ def _gamma_progress(s: Situation) -> Float:
     return _of_each(s, value, -1e3)
 
 
-def fading(base: float, n: int) -> Float:
+def fading(base: float, n: int) -> FloatArray:
     """N >= 1 weights, from base^(n-1) to 1."""
     return np.asarray(np.multiply.accumulate(np.append(1.0, np.full(n - 1, base)))[::-1])
 
 
-def _upper_bound(s: Situation) -> Float:
+def _upper_bound(s: Situation) -> FloatArray:
     """Upper confidence bound on the relative fall of the learning error (UCB1)."""
     total = kernels.log(max(int(s.visits.sum()), 2))
 
-    def value(errors: Float, visits: int) -> float:
+    def value(errors: FloatArray, visits: int) -> float:
         if len(errors) < RECENT:
             return 1e3
         before, now = float(errors[-RECENT:-HALF].mean()), float(errors[-HALF:].mean())

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import overwrite
 from cdmisfa.features.recursive import RecursiveSFA, State
 from cdmisfa.features.slowness import slowness, window_rate
-
-Float = NDArray[np.float64]
 
 WHITE_NOISE = math.sqrt(2.0) / (2.0 * math.pi)
 """Slowness of white noise."""
@@ -149,7 +148,7 @@ class Candidate:
         return self.sfa.slowness
 
     @property
-    def tested(self) -> Float:
+    def tested(self) -> FloatArray:
         """(J,) slowness of each output on frames not yet learned from; NaN before any."""
         return np.array(
             [
@@ -159,7 +158,7 @@ class Candidate:
         )
 
     @property
-    def variance(self) -> Float:
+    def variance(self) -> FloatArray:
         """(J,) variance of each output on frames not yet learned from."""
         mean, square, _ = self._moments
         return np.asarray(square - mean * mean)
@@ -171,7 +170,7 @@ class Candidate:
             return UNTESTED
         return learning_error(self.change, float(self.tested[0]), self.fitted)
 
-    def recent_errors(self, most: int) -> Float:
+    def recent_errors(self, most: int) -> FloatArray:
         """The last learning errors, (n,) with n at most `most`, the newest last."""
         recent = self.errors[-most:]
         return np.asarray(recent[np.isfinite(recent)])

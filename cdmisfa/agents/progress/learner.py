@@ -42,14 +42,13 @@ from cdmisfa.agents.progress.streams import (
     outcomes,
     watch,
 )
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
 from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.features.slowness import instantaneous_slowness
-
-Float = NDArray[np.float64]
 
 FEWEST_BLOCKS = 20
 """Of a window of tests, however long a block is."""
@@ -113,7 +112,7 @@ class ProgressLearner:
         return int(self._counts["iteration"][0])
 
     @property
-    def phi(self) -> Float:
+    def phi(self) -> FloatArray:
         """Weights of the candidate of the stream to watch next, (J, I), a copy."""
         held = self._candidates.get(self.stream)
         return np.zeros((self._n_outputs, self._n_inputs)) if held is None else held.sfa.phi
@@ -349,7 +348,7 @@ class ProgressLearner:
         offsets = [kernels.mean_output(m.phi, m.mean) for m in self.modules]
         self._offset = np.array(offsets).reshape(-1)
 
-    def _choose(self, draws: Float) -> tuple[Float, bool]:
+    def _choose(self, draws: FloatArray) -> tuple[FloatArray, bool]:
         """Choose the next stream; what each promises, and whether one was drawn at random."""
         counts, learning = self._counts[0], self._streams["state"] == LEARNING
         held = np.zeros(len(learning), dtype=bool)

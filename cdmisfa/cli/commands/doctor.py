@@ -16,8 +16,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.printing import SCHEMA, print_json, print_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from cdmisfa.core.plugins import GROUPS, find, plugins
-from cdmisfa.core.registry import Registry
+from cdmisfa.core.registry import GROUPS, Registry, find, plugins
 
 PACKAGES = ("numpy", "cffi", "mcap", "protobuf", "rerun-sdk", "pyarrow", "matplotlib")
 """Packages that no command can do without for long."""

@@ -29,7 +29,7 @@ from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
-    from recorder.images.reading import ImageOptions
+    from recorder.images.options import ImageOptions
     from recorder.log.begun import Begun
     from recorder.recording import ViewRecording
     from replay.camera_logs.options import CameraOptions

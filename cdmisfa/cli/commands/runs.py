@@ -12,7 +12,6 @@ from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import option
 from cdmisfa.cli.printing import SCHEMA, print_json, print_table, quoted, say_about
 from cdmisfa.core.errors import NotReproducedError
-from cdmisfa.experiments.documents import markdown
 
 if TYPE_CHECKING:
     from replay.camera_logs.options import CameraOptions
@@ -185,6 +184,8 @@ def signals_command(as_page: bool, as_json: bool) -> None:
 
 
 def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
+    from cdmisfa.experiments.documents import markdown
+
     return "\n".join(
         [
             "# Signals",

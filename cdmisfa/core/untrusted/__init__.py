@@ -1,8 +1,8 @@
 """Reading what others may have written: which files, how long, and with how much memory."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.core.untrusted.memory": "budget parse_json",

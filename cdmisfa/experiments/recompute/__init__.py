@@ -1,8 +1,8 @@
 """Any moment of a run again: its learner's state, another future from there, and the proof."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "cdmisfa.experiments.recompute.again": "Again",

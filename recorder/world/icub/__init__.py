@@ -1,8 +1,8 @@
 """The iCub scene: a robot that watches three objects move on a table."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.world.icub.config": "IcubConfig",

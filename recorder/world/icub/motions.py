@@ -10,8 +10,8 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import check_frame
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 
@@ -21,13 +21,12 @@ CHUNK = 4096
 _WORLD = 0x1C0B
 """Spawn key of the world: the learner may spawn its own generators from the same seed."""
 
-Float = NDArray[np.float64]
 
-Motion = Iterator[Float]
+Motion = Iterator[FloatArray]
 """Positions of one object, (CHUNK, 2), chunk after chunk."""
 
 
-def toggling(config: BoxConfig, generator: np.random.Generator) -> Motion:
+def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Motion:
     """X uniform and independent; y one of two places, changing every so many frames."""
     for t in itertools.count(0, CHUNK):
         x = _uniform(generator.random(CHUNK), config.x)
@@ -35,14 +34,14 @@ def toggling(config: BoxConfig, generator: np.random.Generator) -> Motion:
         yield np.stack([x, np.asarray(config.y)[phase]], axis=1)
 
 
-def uniform(config: CylinderConfig, generator: np.random.Generator) -> Motion:
+def uniform_motion(config: CylinderConfig, generator: np.random.Generator) -> Motion:
     """X and y uniform and independent of the frame before."""
     while True:
         units = generator.random((CHUNK, 2))
         yield np.stack([_uniform(units[:, 0], config.x), _uniform(units[:, 1], config.y)], axis=1)
 
 
-def walk(config: SphereConfig, generator: np.random.Generator) -> Motion:
+def walking_motion(config: SphereConfig, generator: np.random.Generator) -> Motion:
     """A Gaussian random walk, reflected at the borders; starts anywhere within them."""
     borders = (config.x, config.y)
     last = np.stack([_uniform(generator.random(1), limits) for limits in borders], axis=1)
@@ -57,7 +56,7 @@ def walk(config: SphereConfig, generator: np.random.Generator) -> Motion:
         yield path
 
 
-def reflect(values: Float, limits: Range) -> Float:
+def reflect(values: FloatArray, limits: Range) -> FloatArray:
     """A free walk, (n,), as one that turns round at the limits."""
     low, high = limits
     width = high - low
@@ -91,7 +90,7 @@ class Motions:
             self._chunk += 1
         self._t = t
 
-    def take(self, n: int) -> Float:
+    def take(self, n: int) -> FloatArray:
         """(n, objects, 2) x and y in the next n frames, the paper's coordinates, metres."""
         parts = []
         while n > 0:
@@ -111,12 +110,12 @@ class Motions:
             for i in range(3)
         )
         self._motions = (
-            toggling(self._scene.object1, box),
-            uniform(self._scene.object2, cylinder),
-            walk(self._scene.object3, sphere),
+            toggling_motion(self._scene.object1, box),
+            uniform_motion(self._scene.object2, cylinder),
+            walking_motion(self._scene.object3, sphere),
         )
         self._chunk = -1
 
 
-def _uniform(unit: Float, limits: Range) -> Float:
+def _uniform(unit: FloatArray, limits: Range) -> FloatArray:
     return limits[0] + (limits[1] - limits[0]) * unit

@@ -1,8 +1,8 @@
 """Each kind of file that holds images or numbers as a stream of them."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.camera_logs.formats.bag": "BagImages",

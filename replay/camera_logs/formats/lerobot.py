@@ -11,11 +11,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
+from recorder.images.options import Size
 from recorder.images.pixels import compressed_image
-from recorder.images.reading import Size
+from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -24,7 +26,6 @@ from replay.camera_logs.stream import (
     explained,
     in_one_line,
 )
-from replay.mcap.records import MAX_CHUNK, Bytes, MalformedRecord
 
 INFO: Final = "meta/info.json"
 PAUSE: Final = 20
@@ -72,7 +73,7 @@ class LeRobotImages(ImageStream):
         if self._video:
             self.recipe = VideoImages.recipe
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> ByteArray:
         episode = int(np.searchsorted(self._starts, row, side="right")) - 1
         place = self._first[episode] + row - int(self._starts[episode])
         chunk, number = self._files[episode]
@@ -94,7 +95,7 @@ class LeRobotImages(ImageStream):
             and abs(int(images.times[place]) / NANOSECONDS * self._fps - place) < 0.5
         ):
             raise MalformedRecord(f"{name} has no frame at {place / self._fps:g} s")
-        found: Bytes = images.image(place)
+        found: ByteArray = images.image(place)
         return found
 
     def stated_size(self, row: int) -> Size | None:
@@ -117,7 +118,7 @@ class LeRobotImages(ImageStream):
         with arrow_explained(file, held=MAX_CHUNK):
             return pq.read_table(file, columns=["index", self.topic], use_threads=False)
 
-    def _picture(self, table: Any, index: int) -> Bytes:
+    def _picture(self, table: Any, index: int) -> ByteArray:
         # without the budget: what is copied is a part of the table, and PyArrow aborts where a
         # small allocation fails
         with in_one_line(self.path, "LeRobot's layout"):

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
+from recorder.images.options import Size
 from recorder.images.pixels import compressed_image, picture_size
-from recorder.images.reading import Size
 from replay.camera_logs.stream import ImageStream
-from replay.mcap.records import Bytes
 
 PICTURES: Final = (".jpeg", ".jpg", ".png")
 
@@ -41,7 +41,7 @@ class FolderImages(ImageStream):
     def count(self) -> int:
         return len(self._files)
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> ByteArray:
         return compressed_image(read_regular(self._files[row], MAX_BYTES), color=self._color)
 
     def stated_size(self, row: int) -> Size | None:

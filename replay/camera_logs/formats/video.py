@@ -15,14 +15,14 @@ from typing import Any, Final
 
 import numpy as np
 
+from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import data_bytes
-from recorder.images.frames import VIDEO_RECIPE, frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS
-from recorder.images.videos import pyav
+from recorder.images.videos import VIDEO_RECIPE, frame_colors, frame_gray, pyav
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
-from replay.mcap.records import Bytes, MalformedRecord
 
 VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 _NOWHERE: Final = 2**62
@@ -64,7 +64,7 @@ class VideoImages(ImageStream):
         short = f"{path}: it states {stated:g} s, its last frame is at {last:g} s"
         self.warnings = [unsure, short] if stated > last + 1 else [unsure]
 
-    def image(self, row: int) -> Bytes:
+    def image(self, row: int) -> ByteArray:
         stamp = int(self._stamps[row])
         with explained(self.path, "FFmpeg", held=self._held):
             found, at, self._next = None, self._next, _NOWHERE

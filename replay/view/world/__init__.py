@@ -1,8 +1,8 @@
 """The world that a run was in, as the first tab of its view shows it."""
 
-from cdmisfa.core.faces import face
+from cdmisfa.core.exports import exports
 
-__getattr__, __dir__, __all__ = face(
+__getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.view.world.first": "WorldView",

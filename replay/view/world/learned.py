@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from replay.following import Following, Heard, read_outputs
 from replay.palette import GREY, colour
 from replay.runs.outline import Outline
@@ -27,8 +28,6 @@ MOST_FRAMES = 1_000_000
 
 BROAD, NARROW = 4.0, 1.5
 """Widths of the line that is followed, and of the one that follows."""
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +107,7 @@ def _title(module: int, stream: str, found: Following) -> str:
     )
 
 
-def _everywhere(frames: NDArray[np.int64], t: NDArray[np.int64], y: Float) -> Float:
+def _everywhere(frames: NDArray[np.int64], t: NDArray[np.int64], y: FloatArray) -> FloatArray:
     """An output at all frames: NaN where its stream was not watched."""
     line = np.full(len(frames), np.nan)
     at = np.searchsorted(frames, t)

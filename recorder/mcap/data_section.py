@@ -1,0 +1,103 @@
+"""The checksum over all of a log's data, checked once, wherever all of it is read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from cdmisfa.core.errors import LogDamagedError
+from recorder.mcap.records import MAGIC, crc32
+from recorder.mcap.store import Store
+from recorder.mcap.summary import FOOTER_BYTES
+from recorder.mcap.walk import DATA_END_BYTES, LogStructure
+
+_BEGINNING: Final = 64 * 1024
+"""Bytes that are read of a log behind a URL before its end is known."""
+
+
+class DataSection:
+    """The bytes of a log before its data's end record.
+
+    Args:
+        file: the log.
+        structure: of the log.
+        damaged: called where the checksum does not match.
+    """
+
+    def __init__(self, file: Store, structure: LogStructure, damaged: Callable[[], None]) -> None:
+        self._file = file
+        self._structure = structure
+        self._damaged = damaged
+        self._checked = 0
+        self._remote = file.remote and structure.complete
+        self._marks_then = self._marks() if self._remote else []
+
+    def check(self, crc: int | None = None) -> None:
+        """Compare the checksum that the log states with that of its data, once.
+
+        Args:
+            crc: of its data, where that was read; by default it is read now.
+        """
+        stated, end = self._structure.data_crc, self._structure.data_end
+        if not stated or self._checked == end:
+            return
+        self._checked = end
+        if (self._file.crc(0, end) if crc is None else crc) != stated:
+            self._damaged()
+
+    def check_unproven(self) -> None:
+        """Check it for a chunk that has no checksum of its own; of a URL not all is read for it."""
+        if self._structure.by_index and not self._remote:
+            self.check()
+
+    def confirm(self) -> None:
+        """Ask again for the beginning of a log behind a URL, and the checksums it states.
+
+        Raises:
+            LogDamagedError: it was replaced while it was read.
+        """
+        if self._remote:
+            self._file.forget()
+            if self._marks() != self._marks_then:
+                raise LogDamagedError(
+                    f"{self._file.path}: it was replaced while it was read; begin again"
+                )
+
+    def _marks(self) -> list[int]:
+        """CRCs of what another log would not have: the beginning, and those that it states."""
+        end, size = self._structure.data_end, self._file.size
+        last = size - FOOTER_BYTES - len(MAGIC)
+        spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, size))
+        return [self._file.crc(start, stop) for start, stop in spans]
+
+    def sha256(self, start: int, counted: Callable[[int], None] = lambda count: None) -> str:
+        """SHA-256 of the file from a place on, with its checksum checked where that is 0.
+
+        Args:
+            start: the place.
+            counted: told of bytes that were hashed.
+        """
+        sha256, crc, at = hashlib.sha256(), 0, start
+        end = self._structure.data_end if self._structure.data_crc else 0
+        for block in self._file.blocks(start, self._file.size):
+            sha256.update(block)
+            crc = crc32(block[: max(end - at, 0)], crc)
+            at += len(block)
+            counted(len(block))
+        if start == 0:
+            self.check(crc)
+        return sha256.hexdigest()
+
+    def changed(self) -> bool:
+        """Whether the file may hold something else than when it was opened."""
+        return self._file.changed()
+
+    def read(self, offset: int, count: int) -> bytes:
+        """`count` bytes of the file, fewer only where it ends."""
+        return self._file.read(offset, count)
+
+    def tail(self) -> Iterator[bytes]:
+        """The bytes from its data end record on, where the file was opened by its index."""
+        if self._structure.by_index:
+            yield from self._file.blocks(self._structure.data_end, self._file.size)

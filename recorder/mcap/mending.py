@@ -1,0 +1,156 @@
+"""What stands twice in a log, made right again where one of the two is damaged.
+
+The head of a chunk also stands in the summary, and its message indexes follow from its messages.
+The checksum over all data says whether that is all that was wrong.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right
+from typing import Final
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from cdmisfa.core.arrays import ByteArray
+from recorder.mcap.compression import Decompressor, check_size
+from recorder.mcap.records import (
+    MESSAGE_HEADER,
+    RECORD_HEADER,
+    MalformedRecord,
+    Problem,
+    Segment,
+    crc32,
+)
+from recorder.mcap.store import Store
+from recorder.mcap.summary import stated_chunks
+from recorder.mcap.tables import MessageTable, walked_table
+from recorder.mcap.walk import LogStructure
+
+_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
+_INDEX: Final = struct.Struct("<BQHI")
+_MOST_CHANNELS: Final = 64
+"""Message indexes of a chunk that are compared with one another."""
+_ALIKE: Final = 0.5
+"""Share of an index's bytes by which one is known to stand at a place."""
+_MOST_BYTES: Final = 64 * 1024 * 1024
+"""Of what is made right again."""
+
+
+class MendedStore(Store):
+    """A log of which some bytes are others; its `mended` says what was wrong."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store.path)
+        self.size, self.remote = store.size, store.remote
+        self.mended: list[Problem] = []
+        self._store = store
+        self._places: list[int] = []
+        self._parts: list[bytes] = []
+        self._bytes = 0
+
+    def put(self, at: int, right: bytes, where: str, what: str) -> None:
+        """Have other bytes at a place behind those of the last call, where it has not got them."""
+        there = self._store.read(at, len(right))
+        if self._places and at < self._places[-1] + len(self._parts[-1]):
+            return
+        if there == right or len(there) < len(right) or self._bytes + len(right) > _MOST_BYTES:
+            return
+        self._places.append(at)
+        self._parts.append(right)
+        self._bytes += len(right)
+        self.mended.append(Problem(where, what))
+        self.forget()
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        found = bytearray(self._store.read_at(offset, count))
+        stop = offset + len(found)
+        first = max(bisect_right(self._places, offset) - 1, 0)
+        last = bisect_right(self._places, stop)
+        for place, part in zip(self._places[first:last], self._parts[first:last], strict=True):
+            low, high = max(place, offset), min(place + len(part), stop)
+            if low < high:
+                found[low - offset : high - offset] = part[low - place : high - place]
+        return bytes(found)
+
+    def close(self) -> None:
+        self._store.close()
+
+
+def mended(file: Store) -> MendedStore:
+    """A damaged log with its chunks' heads and message indexes as they must have been."""
+    store = MendedStore(file)
+    structure = LogStructure(file, lambda *_: None, resync=True)
+    stated = stated_chunks(structure.summary) if structure.summary else []
+    chunks = stated or [segment for segment in structure.segments if segment.chunked]
+    ends = [chunk.offset for chunk in chunks[1:]] + [structure.data_end or file.size]
+    decompressor = Decompressor()
+    for chunk, end in zip(chunks, ends, strict=False):
+        try:
+            crc = _mend_head(store, chunk) if chunk.stated else chunk.crc
+            table = _checked_table(store, chunk, crc, decompressor)
+        except MalformedRecord:
+            continue
+        at = chunk.data_offset + chunk.stored
+        put = "its message index was damaged, and is made again from its messages"
+        store.put(at, _indexes(store, at, end, table, chunk.stated), chunk.name, put)
+    return store
+
+
+def _mend_head(store: MendedStore, chunk: Segment) -> int:
+    """Have the head of a chunk as the summary states it; its CRC, which stands there alone."""
+    times = _TIMES_AND_SIZE.pack(chunk.start, chunk.end, chunk.size)
+    at = chunk.offset + RECORD_HEADER.size + len(times)
+    crc = store.read(at, 4)
+    name = chunk.compression.encode()
+    end = struct.pack("<I", len(name)) + name + struct.pack("<Q", chunk.stored)
+    length = len(times) + len(crc) + len(end) + chunk.stored
+    head = RECORD_HEADER.pack(Opcode.CHUNK, length) + times + crc + end
+    put = "its first bytes were damaged, and are made again from the summary"
+    store.put(chunk.offset, head, chunk.name, put)
+    return int.from_bytes(crc, "little")
+
+
+def _checked_table(
+    store: Store, chunk: Segment, crc: int, decompressor: Decompressor
+) -> MessageTable:
+    """The messages of a chunk whose CRC matches."""
+    check_size(chunk.compression, chunk.size)
+    raw: ByteArray = np.empty(chunk.size, np.uint8)
+    stored = memoryview(store.read(chunk.data_offset, chunk.stored))
+    decompressor.decompress(stored, chunk.compression, raw)
+    if not crc or crc32(raw.data) != crc:
+        raise MalformedRecord("no CRC that matches")
+    return walked_table(raw)[0]
+
+
+def _indexes(store: Store, at: int, end: int, table: MessageTable, stated: bool) -> bytes:
+    """The message indexes of a chunk as they must stand in [at, end), none where it has none."""
+    left = [_index(table, number) for number in np.unique(table.channel).tolist()]
+    if len(left) > _MOST_CHANNELS or sum(map(len, left)) > end - at:
+        return b""
+    found = b""
+    while left:
+        alike, place = max((_alike(store, at + len(found), x), -i) for i, x in enumerate(left))
+        if alike < _ALIKE and not stated:
+            return b""
+        best = left.pop(-place)
+        found += best
+    return found
+
+
+def _index(table: MessageTable, number: int) -> bytes:
+    """The message index of a channel: log time and place of each message, in file order."""
+    own = table.channel == number
+    pairs = np.empty((int(own.sum()), 2), "<u8")
+    pairs[:, 0] = table.log_time[own]
+    pairs[:, 1] = table.at[own] - MESSAGE_HEADER.itemsize
+    size = pairs.nbytes
+    return _INDEX.pack(Opcode.MESSAGE_INDEX, size + 6, number, size) + pairs.tobytes()
+
+
+def _alike(store: Store, at: int, index: bytes) -> float:
+    """The share of the bytes of an index that stand at a place."""
+    there = np.frombuffer(store.read(at, len(index)), np.uint8)
+    return float((there == np.frombuffer(index, np.uint8)[: len(there)]).mean())

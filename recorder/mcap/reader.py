@@ -1,0 +1,400 @@
+"""Reading any MCAP file, strictly: whole or cut, with or without an index.
+
+It gives every message that is there, in the order of log time (ties in file
+order), and never one whose checksum does not match. Memory holds a few chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.errors import LogDamagedError
+from recorder.mcap.chunks import CACHE_BYTES, Chunks
+from recorder.mcap.data_section import DataSection
+from recorder.mcap.records import (
+    MAX_CHUNK,
+    Attachment,
+    Channel,
+    MalformedRecord,
+    Message,
+    Problem,
+    Schema,
+    Segment,
+)
+from recorder.mcap.store import FileStore, Store
+from recorder.mcap.tables import MessageTable, in_order, within
+from recorder.mcap.walk import LogStructure
+
+Check = Literal["chunks", "data", "pass"]
+
+_SENT_LESS = (
+    "the server sends less than the log, or the log was cut (cdmisfa recover saves what is there)"
+)
+
+
+class LogReader:
+    """An MCAP file, read by its content and not by what its index claims.
+
+    Damage is an error that names the file, the chunk and its time range. With
+    `salvage` the damaged chunk is left out and noted in `problems` instead, and the
+    unverifiable part of a chunk in which the file ends is read too. Where its summary accounts
+    for every message, only what is asked for is read: each chunk is checked when it is, and the
+    checksum over all data where all of it is read (`check`, `digest`) or a chunk has none of its
+    own. A URL that lacks its end is damaged, as nothing tells whether the server sent all of it.
+
+    Attributes:
+        path: the file.
+        problems: what was found damaged and left out (with `salvage`), and an index that
+            contradicts its chunk.
+        by_index: only the summary was read, and no chunk before it is asked for.
+        profile: the writer's profile, as "ros2".
+        library: what wrote the file.
+        complete: the file has its end.
+        data_complete: every message is there, if not the summary behind them.
+        metadata: the metadata records.
+        statistics: what the summary says the file holds, or None.
+        data: all of its bytes.
+    """
+
+    def __init__(
+        self,
+        log: str | Path | Store,
+        *,
+        salvage: bool = False,
+        cache_bytes: int = CACHE_BYTES,
+        check: Check | None = None,
+    ) -> None:
+        """Open a log.
+
+        Args:
+            log: path of a file, or what has its bytes, which is closed with the reader.
+            salvage: leave out what is damaged.
+            cache_bytes: of decoded chunks that are kept.
+            check: "chunks" believes a summary that accounts for every message; "data" looks at
+                every record of a file and at the checksum over its data, "pass" leaves the latter
+                to `one_pass`. By default "chunks", with `salvage` "data"; of a URL "chunks".
+
+        Raises:
+            UsageError: it cannot be opened.
+            LogDamagedError: not an MCAP file, or its structure is damaged.
+        """
+        self.salvage = salvage
+        self.problems: list[Problem] = []
+        self._failed: set[int] = set()
+        self._defined, self._searched = 0, False
+        self._file = log if isinstance(log, Store) else FileStore(Path(log))
+        self.path = self._file.path
+        try:
+            remote = self._file.remote
+            check = check or ("data" if salvage else "chunks")
+            by_index = remote or check == "chunks"
+            found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
+            self._structure = found
+            self.data = DataSection(self._file, found, self._refuse_data)
+            known, unproven = found.definitions, self.data.check_unproven
+            self._chunks = Chunks(self._file, known, self._note, cache_bytes, unproven)
+            self._settle()
+            if not self.by_index and check != "pass":
+                self.data.check()
+            if remote and not (self.complete or salvage):
+                raise LogDamagedError(f"{self.path}: {self.missing}: {_SENT_LESS}")
+        except BaseException as error:
+            self._file.close()
+            if isinstance(error, MalformedRecord):
+                raise LogDamagedError(f"{self.path}: {error}") from None
+            raise
+
+    # What the file holds
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._file.size
+
+    @property
+    def missing(self) -> str:
+        """What a file that was cut lacks, in words; "" for a whole one."""
+        structure = self._structure
+        if structure.tail is not None and not self.salvage and structure.tail.crc:
+            return f"{structure.missing}; recover can save part of the last chunk, unverified"
+        return structure.missing
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is missing and what was left out, a line each that names the file."""
+        problems = [f"{p.where}: {p.what}" for p in self.problems]
+        return [f"{self.path}: {text}" for text in (self.missing, *problems) if text]
+
+    @property
+    def segments(self) -> list[Segment]:
+        """Chunks, and messages outside chunks, in file order."""
+        tail = self._structure.tail
+        if tail is None or (tail.crc and not self.salvage):
+            return self._structure.segments
+        return [*self._structure.segments, tail]
+
+    @property
+    def attachments(self) -> list[Attachment]:
+        """The attachments; their CRCs were checked."""
+        try:
+            self._structure.load_attachments()
+        except MalformedRecord as error:
+            self._refuse("attachments", str(error))
+        return self._structure.attachments
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Every channel of the file; reads the chunks where nothing else names them."""
+        self._define()
+        return self._structure.definitions.channels
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Every schema of the file; reads the chunks where nothing else names them."""
+        self._define()
+        return self._structure.definitions.schemas
+
+    def attachment_data(self, attachment: Attachment) -> bytes:
+        """Read an attachment's bytes.
+
+        Raises LogDamagedError where it is larger than is read at once.
+        """
+        if attachment.size > MAX_CHUNK:
+            raise LogDamagedError(
+                f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
+                f"above the limit of {MAX_CHUNK}"
+            )
+        return self._file.read(attachment.offset, attachment.size)
+
+    def digest(self) -> str:
+        """SHA-256 of the file, checked as it is read; of a URL opened by index of its end."""
+        remote = self.by_index and self._file.remote
+        return self.data.sha256(self._structure.data_end if remote else 0)
+
+    def confirm(self) -> None:
+        """See that a log behind a URL was not replaced; see `DataSection.confirm`."""
+        self.data.confirm()
+
+    def crc_absent(self) -> int:
+        """Count the segments that no CRC protects."""
+        alone = [] if self._structure.data_crc else self.segments
+        return sum(1 for s in alone if s.crc == 0 and s.size)
+
+    # Messages
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        start: int | None = None,
+        stop: int | None = None,
+        ordered: bool = True,
+    ) -> Iterator[Message]:
+        """Give the messages by log time, ties in file order.
+
+        Args:
+            topics: only these; None for all.
+            start: only with log times in [start, stop), in nanoseconds; None for all.
+            stop: see start.
+            ordered: by log time; otherwise in file order.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        for segment, table in self.tables(start=start, stop=stop, ordered=ordered, topics=topics):
+            known = {c: self._channel(c, segment) for c in np.unique(table.channel).tolist()}
+            own = {c: k for c, k in known.items() if k and (topics is None or k.topic in topics)}
+            if len(own) < len(known):
+                table = table.select(np.isin(table.channel, list(own)))
+            for number, sequence, log_time, published, data in table.rows():
+                yield Message(own[number], sequence, log_time, published, data)
+
+    def tables(
+        self,
+        *,
+        start: int | None = None,
+        stop: int | None = None,
+        ordered: bool = True,
+        topics: Collection[str] | None = None,
+    ) -> Iterator[tuple[Segment, MessageTable]]:
+        """Give the messages chunk by chunk as columns, in the order of `messages`.
+
+        Chunks whose times overlap come in pieces. Of a log that was opened by its index, chunks
+        without any of `topics` are left out.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        low, high = start or 0, 2**64 if stop is None else stop
+        chosen = [(i, s) for i, s in enumerate(self.segments) if s.end >= low and s.start < high]
+        if self.by_index:
+            numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
+            chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
+        self.expect([s for _, s in chosen])
+        in_file = ((s, t) for _, s in chosen if (t := self.table(s)) is not None)
+        for segment, table in in_order(chosen, self.table) if ordered else in_file:
+            yield segment, within(table, low, high)
+
+    def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
+        """Give every chunk in file order, None for one that is damaged and left out.
+
+        The file is read once, and the checksum over all of its data is checked at the end.
+
+        Raises:
+            LogDamagedError: at the first damage, without `salvage`.
+        """
+        with self._chunks.passing() as store:
+            for segment in self.segments:
+                store.pass_to(segment.offset)
+                yield segment, self.table(segment)
+            store.pass_to(self._structure.data_end)
+        self.data.check(store.crc(0, self._structure.data_end))
+
+    def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
+        """Say which chunks, or only `indexes` of them, will be read one after the other."""
+        self._chunks.expect(() if indexes else segments)
+        spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
+        self._file.expect(list(spans))
+
+    def table(self, segment: Segment) -> MessageTable | None:
+        """Decode a chunk and check it; the last few are kept.
+
+        Returns:
+            Its messages in file order, or None where it is damaged and `salvage` is on.
+
+        Raises:
+            LogDamagedError: it is damaged, without `salvage`.
+        """
+        if segment.offset in self._failed:
+            return None
+        try:
+            return self._chunks.table(segment)
+        except MalformedRecord as error:
+            self._failed.add(segment.offset)
+            self._refuse(segment.name, str(error))
+            return None
+
+    def index(self, segment: Segment) -> list[tuple[int, NDArray[np.uint64]]]:
+        """Read a chunk's message indexes; see `Chunks.index`."""
+        return self._chunks.index(segment)
+
+    def unpack(self, segment: Segment, out: ByteArray) -> memoryview:
+        """Decompress the records of a chunk with message indexes; see `Chunks.unpack`."""
+        return self._chunks.unpack(segment, out)
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return self._file.is_at(path)
+
+    def moved(self, path: Path) -> None:
+        """Hear that the very file that was opened has another name now."""
+        self.path = self._file.path = path
+
+    def refresh(self) -> bool:
+        """Look for what a recorder wrote since; whether the file grew.
+
+        What was read before is not read again, but for one pass over a file that got its end,
+        whose checksum says whether all of it is as it was.
+
+        Raises:
+            LogDamagedError: what was written is damaged.
+        """
+        if self.complete or not self._file.grow():
+            return False
+        try:
+            kept = self._structure.resume()
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self.path}: {error}") from None
+        same = {segment.offset for segment in self._structure.segments[:kept]}
+        self._chunks.forget(same)
+        self._failed &= same
+        self._defined, self._searched = min(self._defined, kept), False
+        self._settle()
+        self.data.check()
+        return True
+
+    def close(self) -> None:
+        """Let go of the file; harmless when called twice."""
+        self._chunks.close()
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Inside
+
+    def _refuse(self, where: str, what: str) -> None:
+        if not self.salvage:
+            raise LogDamagedError(
+                f"{self.path}: {where}: {what}; save the rest with cdmisfa recover (from a "
+                "recording, cdmisfa learn --salvage learns without it)"
+            )
+        self._note(where, what)
+
+    def _note(self, where: str, what: str) -> None:
+        problem = Problem(where, what)
+        self.problems += [problem] if problem not in self.problems else []
+
+    def _settle(self) -> None:
+        """Take over what the walk found, with the times of a chunk whose header states none yet."""
+        structure = self._structure
+        self.by_index, self.complete = structure.by_index, structure.complete
+        self.profile, self.library = structure.profile, structure.library
+        self.data_complete, self.metadata = structure.data_crc is not None, structure.metadata
+        self.statistics = structure.summary.statistics if structure.summary else None
+        tail = structure.tail
+        if tail is not None and tail in self.segments:
+            table = self.table(tail)
+            if table is not None and len(table):
+                tail.start, tail.end = int(table.log_time.min()), int(table.log_time.max())
+
+    def _refuse_data(self) -> None:
+        if not self.salvage:
+            self._search()  # an error that names the chunk says more
+        self._refuse("data section", "its CRC does not match: damaged")
+
+    def _channel(self, number: int, segment: Segment) -> Channel | None:
+        known = self._structure.definitions
+        looks: list[Callable[[], None]] = [lambda: None, self._define, self._search]
+        for look in looks:
+            look()
+            channel = known.channels.get(number)
+            if channel and (not channel.schema_id or channel.schema_id in known.schemas):
+                return channel
+        what = f"it holds messages of channel {number}, never defined"
+        if channel is not None:
+            what = f"schema {channel.schema_id} of {channel.topic!r} is never defined"
+        self._refuse(segment.name, what)
+        return channel
+
+    def _define(self) -> None:
+        """Decode chunks until every channel that has messages is known."""
+        definitions, segments = self._structure.definitions, self.segments
+        known, counted = definitions.channels, set[int]()
+        if self._defined == len(segments):
+            return
+        for segment in segments[self._defined :]:
+            counts = segment.channel_counts()
+            if counts is None or not counts.keys() <= known.keys():
+                self.table(segment)
+            counted.update(counts or ())
+        self._defined = len(segments)
+        schemas = {0, *definitions.schemas}
+        if not (counted <= known.keys() and {c.schema_id for c in known.values()} <= schemas):
+            self._search()
+
+    def _search(self) -> None:
+        """Decode every chunk: a definition may stand in one that holds no message of it."""
+        if not self._searched:
+            self._searched = True
+            for segment in self.segments:
+                self.table(segment)

@@ -1,0 +1,370 @@
+"""MCAP's records as bytes: what a log may contain, with every length checked.
+
+Nothing here trusts a length, count or text of the file. Whoever reads a file turns
+`MalformedRecord` into an error that names it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+
+try:  # the same number, several times faster
+    from isal.isal_zlib import crc32 as _crc32
+except ImportError:
+    from zlib import crc32 as _crc32
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+"""What a file begins and ends with."""
+RECORD_HEADER: Final = struct.Struct("<BQ")
+MAX_CHUNK: Final = 144 * 1024 * 1024
+"""Largest decompressed chunk, in bytes, that is read; asked for before decompressing."""
+MAX_DEFINITION: Final = 64 * 1024 * 1024
+"""Largest schema, channel or metadata record, in bytes, that is read."""
+
+MESSAGE_HEADER: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+INDEX_HEADER: Final = RECORD_HEADER.size + 6
+"""Bytes before the pairs of a message index."""
+MESSAGE_FIELDS: Final = MESSAGE_HEADER.itemsize - RECORD_HEADER.size
+
+
+class Place(Protocol):
+    """Where a log is: a path, or a URL."""
+
+    @property
+    def name(self) -> str:
+        """Its last part."""
+
+    @property
+    def suffix(self) -> str:
+        """See `Path.suffix`."""
+
+
+class MalformedRecord(LogDamagedError):  # noqa: N818 - says what is wrong with a record, not where
+    """Bytes that are not what MCAP says they are; the reader adds file and place."""
+
+
+def no_log(path: Place) -> CdmisfaError:
+    """What is wrong with a file that begins otherwise: damage, where its name is that of a log."""
+    if ".mcap" in path.name:
+        return LogDamagedError(f"{path}: not an MCAP file (its first bytes are not MCAP's)")
+    return UsageError(f"{path} is no MCAP file: name a recording, a run, or logs of cameras")
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """How messages of a channel are to be decoded."""
+
+    id: int
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A stream of messages on a topic; `schema_id` 0 has no schema."""
+
+    id: int
+    schema_id: int
+    topic: str
+    encoding: str
+    metadata: dict[str, str] = field(hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """How much the writer says the file holds."""
+
+    messages: int
+    attachments: int
+    metadata: int
+    chunks: int
+    per_channel: dict[int, int] = field(hash=False)
+
+
+class Fields:
+    """The fields of one record, taken one after the other within its bounds."""
+
+    def __init__(self, data: bytes | memoryview, what: str) -> None:
+        self.data = memoryview(data)
+        self.what = what
+        self.at = 0
+
+    def take(self, count: int) -> memoryview:
+        """Take the next `count` bytes.
+
+        Raises:
+            MalformedRecord: there are fewer left.
+        """
+        if count > len(self.data) - self.at:
+            raise MalformedRecord(
+                f"{self.what} is cut short or lies about a length ({count} bytes wanted, "
+                f"{len(self.data) - self.at} there)"
+            )
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def integer(self, width: int) -> int:
+        """Take an unsigned little-endian number of `width` bytes."""
+        return int.from_bytes(self.take(width), "little")
+
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Take what a layout describes."""
+        return layout.unpack(self.take(layout.size))
+
+    def text(self) -> str:
+        """Take a text with its length in front.
+
+        Raises:
+            MalformedRecord: it is not UTF-8.
+        """
+        raw = self.take(self.integer(4))
+        try:
+            return str(raw, "utf-8")
+        except UnicodeDecodeError:
+            raise MalformedRecord(f"{self.what} holds a text that is not UTF-8") from None
+
+    def texts(self) -> dict[str, str]:
+        """Take a map of texts, where no key may stand twice: readers would disagree.
+
+        Raises:
+            MalformedRecord: one does.
+        """
+        inner = Fields(self.take(self.integer(4)), self.what)
+        result: dict[str, str] = {}
+        while inner.at < len(inner.data):
+            key = inner.text()
+            if key in result:
+                raise MalformedRecord(f"{self.what} holds the key {key[:80]!r} twice")
+            result[key] = inner.text()
+        return result
+
+
+def schema(content: bytes | memoryview) -> Schema:
+    """A Schema record; raises MalformedRecord."""
+    fields = Fields(content, "a schema")
+    number = fields.integer(2)
+    if number == 0:
+        raise MalformedRecord("a schema has the id 0, which stands for none")
+    return Schema(number, fields.text(), fields.text(), bytes(fields.take(fields.integer(4))))
+
+
+def channel(content: bytes | memoryview) -> Channel:
+    """A Channel record; raises MalformedRecord."""
+    fields = Fields(content, "a channel")
+    return Channel(
+        fields.integer(2), fields.integer(2), fields.text(), fields.text(), fields.texts()
+    )
+
+
+def statistics(content: bytes | memoryview) -> Statistics:
+    """A Statistics record; raises MalformedRecord."""
+    fields = Fields(content, "the statistics")
+    messages = fields.integer(8)
+    fields.take(2 + 4)  # schemas and channels
+    attachments, metadata, chunks = fields.integer(4), fields.integer(4), fields.integer(4)
+    fields.take(8 + 8)  # first and last log time
+    raw = fields.take(fields.integer(4))
+    if len(raw) % 10:
+        raise MalformedRecord("the statistics hold a broken count per channel")
+    counts = np.frombuffer(raw, np.dtype([("channel", "<u2"), ("messages", "<u8")]))
+    per_channel = {int(row["channel"]): int(row["messages"]) for row in counts}
+    return Statistics(messages, attachments, metadata, chunks, per_channel)
+
+
+def walk(data: memoryview, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
+    """Each record within a chunk as (opcode, place of its first byte, place after its last).
+
+    Raises:
+        MalformedRecord: bytes are left over, a record runs over the end, or is none.
+    """
+    unpack = RECORD_HEADER.unpack_from
+    while at < stop:
+        if stop - at < RECORD_HEADER.size:
+            raise MalformedRecord(f"{stop - at} bytes at its end are no record")
+        opcode, length = unpack(data, at)
+        end = at + RECORD_HEADER.size + length
+        if end > stop:
+            raise MalformedRecord(f"a record at {at} runs {end - stop} bytes over its end")
+        if opcode == 0:
+            raise MalformedRecord(f"no record at {at} (opcode 0)")
+        yield opcode, at, end
+        at = end
+
+
+def crc32(data: bytes | memoryview, value: int = 0) -> int:
+    """CRC-32 of bytes, continued from the `value` of those before."""
+    return int(_crc32(data, value))
+
+
+Refuse = Callable[[str, str], None]
+"""Takes (where, what) of a damage: raises, or notes it where damage is left out."""
+
+
+@dataclass(slots=True)
+class IndexPart:
+    """The message index of one channel in one chunk: `count` pairs at `offset` in the file."""
+
+    channel: int
+    offset: int
+    count: int
+
+
+@dataclass(slots=True)
+class Segment:
+    """A chunk, or messages outside chunks that follow one another.
+
+    Attributes:
+        offset: place in the file of its first record.
+        data_offset: place in the file of its (compressed) records.
+        stored: bytes there.
+        size: bytes once decompressed.
+        crc: CRC-32 of the decompressed bytes, 0 where the writer gave none.
+        start: log time of its earliest message.
+        end: log time of its latest message.
+        indexes: the chunk's message indexes, in file order.
+        counts: messages of each channel where a walk counted them.
+        cut: the file ends within it.
+        stated: only the summary speaks of it, its own header was not read.
+    """
+
+    offset: int
+    data_offset: int
+    stored: int
+    size: int
+    compression: str
+    crc: int
+    start: int
+    end: int
+    chunked: bool
+    indexes: list[IndexPart] = field(default_factory=list)
+    counts: dict[int, int] | None = None
+    cut: bool = False
+    stated: bool = False
+
+    @classmethod
+    def of_chunk(cls, offset: int, content: bytes | memoryview) -> Segment:
+        """A chunk whose record stands at a place in the file, by what it says of itself."""
+        fields = Fields(content, "a chunk")
+        start, end, size = fields.integer(8), fields.integer(8), fields.integer(8)
+        crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
+        data = offset + RECORD_HEADER.size + fields.at
+        return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
+
+    @property
+    def data_end(self) -> int:
+        """Place in the file after its records."""
+        return self.data_offset + self.stored
+
+    @property
+    def stop(self) -> int:
+        """Place in the file after its message indexes."""
+        if not self.indexes:
+            return self.data_end
+        last = self.indexes[-1]
+        return last.offset + 16 * last.count
+
+    @property
+    def name(self) -> str:
+        """How an error names it."""
+        kind = "chunk" if self.chunked else "messages"
+        return f"{kind} at byte {self.offset} (log time {self.start} to {self.end} ns)"
+
+    def channel_counts(self) -> dict[int, int] | None:
+        """Messages of each channel, or None where only decoding can tell."""
+        if self.counts is not None:
+            return self.counts
+        if not self.indexes:
+            return {} if self.size == 0 else None
+        counts: dict[int, int] = {}
+        for part in self.indexes:
+            counts[part.channel] = counts.get(part.channel, 0) + part.count
+        return counts
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """A named map of texts."""
+
+    name: str
+    values: dict[str, str] = field(hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A file within the log; `offset` and `size` are those of its bytes."""
+
+    name: str
+    media_type: str
+    log_time: int
+    create_time: int
+    offset: int
+    size: int
+    crc: int
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something that is wrong with a log, or was lost of it."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a log; times in nanoseconds."""
+
+    channel: Channel
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: bytes
+
+
+class Definitions:
+    """The schemas and channels of a log; an id has one meaning."""
+
+    def __init__(self, refuse: Refuse) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._refuse = refuse
+        self._seen: set[tuple[int, bytes]] = set()
+        self._bytes = 0
+
+    def add(self, opcode: int, content: bytes, where: str) -> None:
+        """Take a Schema or Channel record in; one whose id means something else is refused.
+
+        Raises:
+            MalformedRecord: it is no such record, or all of them take too much memory.
+        """
+        key = (opcode, content)
+        if key in self._seen:
+            return
+        self._bytes += len(content)
+        if self._bytes > MAX_DEFINITION:
+            raise MalformedRecord(f"schemas and channels take more than {MAX_DEFINITION} bytes")
+        is_schema = opcode == Opcode.SCHEMA
+        new = schema(content) if is_schema else channel(content)
+        known: dict[int, Any] = self.schemas if is_schema else self.channels
+        if known.setdefault(new.id, new) != new:
+            kind = "schema" if is_schema else "channel"
+            self._refuse(where, f"{kind} {new.id} is defined twice with different content")
+        self._seen.add(key)

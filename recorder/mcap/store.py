@@ -1,0 +1,360 @@
+"""Where the bytes of a log lie: a file, or what else can be read at any place."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import sys
+import threading
+from abc import ABC, abstractmethod
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.mcap.records import Place, crc32
+
+MAX_HELD: Final = 512 * 1024 * 1024
+"""Most bytes that a pass holds; what lies farther ahead is read without it."""
+PARTIAL: Final = ".partial"
+"""Ending of what is being written, or whose writing was cut short."""
+OPEN_FILES = 24
+"""Files of recordings that are open at once; a recording in parts has thousands."""
+
+_MARK: Final = 4096
+"""Bytes at both ends of a file by which one that grows is known again."""
+
+_PEEK: Final = 4096
+_PEEK_FAR: Final = 256
+"""Bytes read ahead at a place that is far from the last."""
+_AHEAD: Final = 16 * 1024 * 1024
+"""Most bytes of a file that are read ahead at once."""
+
+
+class Store(ABC):
+    """`size` bytes at a path or URL, read at any place, short pieces through one small window."""
+
+    size: int
+    remote: bool = False
+    """Whether it is behind a URL, so that it costs time, and all of it much."""
+
+    def __init__(self, path: Place) -> None:
+        self.path = path
+        self._window = b""
+        self._window_at = 0
+
+    @abstractmethod
+    def read_at(self, offset: int, count: int) -> bytes:
+        """Up to `count` bytes from `offset` on; none where the file ends by now.
+
+        Raises:
+            LogDamagedError: they cannot be read.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go; harmless when called twice."""
+
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:  # noqa: B027 - a hint
+        """Hear which spans [start, stop) will be read, one after the other."""
+
+    def forget(self) -> None:
+        """Let go of what was read, so that it is read again."""
+        self._window = b""
+
+    def grow(self) -> bool:
+        """Look at the size again; whether it grew.
+
+        Raises:
+            LogDamagedError: it is smaller.
+        """
+        return False
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the very file that was opened."""
+        return False
+
+    def changed(self) -> bool:
+        """Whether it was written to since it was opened, but to go on with it."""
+        return False
+
+    def peek(self, offset: int, count: int) -> bytes:
+        """Up to `count` (few) bytes, read ahead for the peeks that follow."""
+        at = offset - self._window_at
+        if at < 0 or at + count > len(self._window):
+            near = 0 <= at - len(self._window) < _PEEK_FAR
+            self._window = self.read(offset, max(count, _PEEK if near else _PEEK_FAR))
+            self._window_at, at = offset, 0
+        return self._window[at : at + count]
+
+    def read(self, offset: int, count: int) -> bytes:
+        """`count` bytes, fewer only where the `size` bytes end.
+
+        Raises:
+            LogDamagedError: they cannot be read, or are not there any more.
+        """
+        count = max(min(count, self.size - offset), 0)
+        parts: list[bytes] = []
+        while count:
+            part = self.read_at(offset, count)
+            if not part:
+                raise self._was_cut()
+            parts.append(part)
+            offset, count = offset + len(part), count - len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def read_into(self, offset: int, out: memoryview) -> int:
+        """Fill memory with the bytes from `offset` on; how many, fewer only at the end.
+
+        Raises:
+            LogDamagedError: they cannot be read, or are not there any more.
+        """
+        data = self.read(offset, len(out))
+        out[: len(data)] = data
+        return len(data)
+
+    def blocks(self, offset: int, stop: int) -> Iterator[bytes]:
+        """Give the bytes [offset, stop), 1 MiB at a time."""
+        while offset < stop and (part := self.read(offset, min(1 << 20, stop - offset))):
+            yield part
+            offset += len(part)
+
+    def pieces(self, offset: int, stop: int, memory: memoryview) -> Iterator[memoryview]:
+        """Give the bytes [offset, stop) in the same memory, one piece after the other."""
+        while offset < stop:
+            count = self.read_into(offset, memory[: stop - offset])
+            if not count:
+                raise self._was_cut()
+            yield memory[:count]
+            offset += count
+
+    def crc(self, offset: int, stop: int) -> int:
+        """CRC-32 of the bytes [offset, stop)."""
+        value = 0
+        for block in self.blocks(offset, stop):
+            value = crc32(block, value)
+        return value
+
+    def _was_cut(self) -> LogDamagedError:
+        return LogDamagedError(f"{self.path}: it was cut while it was read")
+
+
+class FileStore(Store):
+    """A file of this machine, closed and opened again where many others are open."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises:
+            UsageError: it cannot be opened.
+        """
+        super().__init__(path)
+        self._closed = False
+        self._mark = b""
+        try:
+            self._seen = _regular(path)
+            self._keep(_Descriptor(path))
+        except OSError as error:
+            raise UsageError(f"{path}: {error.strerror}") from None
+        self.size = self._seen.st_size
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        file = self._open()
+        try:
+            return os.pread(file.number, min(count, 1 << 30), offset)
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+
+    def read_into(self, offset: int, out: memoryview) -> int:
+        file, done = self._open(), 0
+        most = max(min(len(out), self.size - offset), 0)
+        try:
+            while done < most and (n := os.preadv(file.number, [out[done:most]], offset + done)):
+                done += n
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+        if done < most:
+            raise self._was_cut()
+        return done
+
+    def expect(self, spans: Sequence[tuple[int, int]]) -> None:
+        """Let the system read spans, if they are few bytes, all at once and not one by one."""
+        if sys.platform == "linux" and sum(stop - start for start, stop in spans) <= _AHEAD:
+            number = self._open().number
+            for start, stop in spans:
+                os.posix_fadvise(number, start, stop - start, os.POSIX_FADV_WILLNEED)
+
+    def is_at(self, path: Path) -> bool:
+        try:
+            now = os.stat(path)
+            if not os.path.samestat(now, self._seen):
+                return False
+            return self in _OPEN or self._unchanged(now) or self._is_grown(_Descriptor(path))
+        except OSError:
+            return False
+
+    def changed(self) -> bool:
+        with _LOCK:
+            file = _OPEN.get(self)
+        try:
+            now = os.stat(str(self.path)) if file is None else os.fstat(file.number)
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror}") from None
+        same = os.path.samestat(now, self._seen) and self._unchanged(now)
+        return not same and self.path.suffix != PARTIAL
+
+    def grow(self) -> bool:
+        now = os.fstat(self._open().number)
+        if now.st_size < self.size:
+            raise self._was_cut()
+        self._seen, before, self.size = now, self.size, now.st_size
+        self.forget()
+        return self.size > before
+
+    def close(self) -> None:
+        self._closed = True
+        with _LOCK:
+            _OPEN.pop(self, None)
+
+    def _open(self) -> _Descriptor:
+        if self._closed:
+            raise ValueError(f"{self.path} is closed")
+        with _LOCK:
+            file = _OPEN.get(self)
+            if file is not None:
+                _OPEN.move_to_end(self)
+                return file
+        return self._opened_again()
+
+    def _opened_again(self) -> _Descriptor:
+        """Open the very file that was opened before."""
+        try:
+            file = _Descriptor(Path(str(self.path)))
+            now = os.fstat(file.number)
+            known = self._unchanged(now) or self._is_grown(file)
+        except OSError as error:
+            raise LogDamagedError(f"{self.path}: {error.strerror} while it was read") from None
+        if not (os.path.samestat(now, self._seen) and known):
+            raise LogDamagedError(f"{self.path}: it was replaced while it was read")
+        self._keep(file)
+        return file
+
+    def _unchanged(self, now: os.stat_result) -> bool:
+        return (now.st_size, now.st_mtime_ns) == (self.size, self._seen.st_mtime_ns)
+
+    def _is_grown(self, file: _Descriptor) -> bool:
+        """Whether a file is this one, which was still written when it was closed, and is longer."""
+        longer = os.fstat(file.number).st_size >= self.size
+        return self._mark != b"" and longer and self._marks(file) == self._mark
+
+    def _marks(self, file: _Descriptor) -> bytes:
+        """The first and the last bytes of what is known of a file."""
+        count = min(_MARK, self.size)
+        return os.pread(file.number, count, 0) + os.pread(file.number, count, self.size - count)
+
+    def _keep(self, file: _Descriptor) -> None:
+        """Hold a file open, and close others; of those that still grow a mark is kept."""
+        with _LOCK:
+            _OPEN[self] = file
+            if (above := len(_OPEN) - OPEN_FILES) > 0:
+                for one in [f for f in _OPEN if f is not self][:above]:
+                    closed = _OPEN.pop(one)
+                    if one.path.suffix == PARTIAL:
+                        with contextlib.suppress(OSError):  # then it is not opened again
+                            one._mark = one._marks(closed)
+
+
+class _Descriptor:
+    """An open file; closed once nobody reads from it."""
+
+    number = -1
+
+    def __init__(self, path: Path) -> None:
+        self.number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+
+    def __del__(self, close: Callable[[int], None] = os.close) -> None:
+        if self.number >= 0:
+            close(self.number)
+
+
+def _regular(path: Path) -> os.stat_result:
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        raise UsageError(f"{path}: not a file")
+    return found
+
+
+_LOCK: Final = threading.RLock()
+_OPEN: Final[OrderedDict[FileStore, _Descriptor]] = OrderedDict()
+
+
+class Excerpt(Store):
+    """A store of which the bytes [start, stop) are in memory."""
+
+    def __init__(self, store: Store, start: int, stop: int) -> None:
+        super().__init__(store.path)
+        self.size, self.remote = store.size, store.remote
+        self._store, self._start = store, start
+        self._data = store.read(start, stop - start)
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        at = offset - self._start
+        if 0 <= at < len(self._data):
+            return self._data[at : at + count]
+        return self._store.read_at(offset, count)
+
+    def close(self) -> None:
+        """Nothing: the store stays open."""
+
+
+class OnePass(Store):
+    """A store that is read from its beginning on, with the checksum of every byte passed.
+
+    What was read is held until it is passed; what lies between is read for the checksum.
+    """
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store.path)
+        self.size, self.remote = store.size, store.remote
+        self._store = store
+        self._at = 0
+        self._crc = 0
+        self._held: deque[bytes] = deque()
+        self._end = 0
+
+    def read_at(self, offset: int, count: int) -> bytes:
+        if offset < self._at or offset + count - self._at > MAX_HELD:
+            return self._store.read_at(offset, count)
+        for place in (offset, offset + count):
+            if place > self._end and (part := self._store.read(self._end, place - self._end)):
+                self._held.append(part)
+                self._end += len(part)
+        at = self._at
+        for part in self._held:
+            if offset < at + len(part):
+                return part[offset - at : offset - at + count]
+            at += len(part)
+        return b""
+
+    def pass_to(self, place: int) -> None:
+        """Go on to a place: nothing before it is asked for any more."""
+        while self._held and self._at < place:
+            part = self._held.popleft()
+            if self._at + len(part) > place:
+                self._held.appendleft(part[place - self._at :])
+                part = part[: place - self._at]
+            self._crc = crc32(part, self._crc)
+            self._at += len(part)
+        for block in self._store.blocks(self._at, place if not self._held else self._at):
+            self._crc = crc32(block, self._crc)
+            self._at += len(block)
+        self._end = max(self._end, self._at)
+
+    def crc(self, offset: int, stop: int) -> int:
+        """CRC-32 of the bytes [offset, stop); from 0 up to where the pass is, it is known."""
+        return self._crc if (offset, stop) == (0, self._at) else super().crc(offset, stop)
+
+    def close(self) -> None:
+        """Nothing: the store stays open."""

@@ -1,0 +1,183 @@
+"""What must hold of any bytes that are given as a log.
+
+Only our errors escape, in one line each. Nothing is given out that a checksum contradicts.
+Two ways of reading the same thing give the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tracemalloc
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from cdmisfa.core.blocks import Block
+from cdmisfa.core.errors import CdmisfaError
+from recorder.mcap.reader import LogReader, Message
+from recorder.mcap.records import MAX_CHUNK
+from replay.integrity.info import describe
+from replay.integrity.recover import recover_log
+from replay.integrity.verify import check_log
+from replay.recordings.channel_rows import own_messages
+from replay.recordings.source import RecordedSource
+from replay.recordings.view_file import ViewFile
+
+from .mutations import Case, bases
+
+MEMORY = MAX_CHUNK + 32 * 1024 * 1024
+"""Most bytes that a small file may make us ask for: a chunk at the limit, and ourselves."""
+_BLOCK = 7
+
+
+class BrokenPromise(AssertionError):  # noqa: N818 - it names what happened
+    """Something that must not happen to a log of any kind."""
+
+
+@contextlib.contextmanager
+def _only_our_errors() -> Iterator[None]:
+    try:
+        yield
+    except CdmisfaError as error:
+        if "\n" in str(error) or not str(error):
+            raise BrokenPromise(f"not one line: {error}") from error
+
+
+def check(case: Case, path: Path, number: int = 0) -> None:
+    """Read a broken log in every way; the rarer and slower ones by its number.
+
+    Raises:
+        BrokenPromise: what was read cannot be.
+        Exception: whatever else escaped.
+    """
+    path.write_bytes(case.raw)
+    with _only_our_errors():
+        _read(case, path, salvage=False)
+    if number % 2 == 0:
+        with _only_our_errors():
+            _read(case, path, salvage=True)
+    if case.base.startswith("recording"):
+        with _only_our_errors():
+            _play(case, path, salvage=number % 3 == 0)
+    if number % 25 == 0:
+        with _only_our_errors():
+            describe(path)
+        with _only_our_errors():
+            check_log(path)
+        _recover(path)
+
+
+def check_memory(case: Case, path: Path) -> None:
+    """Read a broken log, and see how much memory it makes us ask for at once.
+
+    Raises:
+        BrokenPromise: more than it may.
+    """
+    tracemalloc.start()
+    try:
+        check(case, path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    if peak > MEMORY:
+        raise BrokenPromise(f"{len(case.raw)} bytes made us ask for {peak}")
+
+
+def _key(message: Message) -> tuple[str, int, bytes]:
+    return message.channel.topic, message.log_time, message.data
+
+
+@cache
+def _truth(base: str) -> frozenset[tuple[int, bytes]]:
+    """Log times and messages of the log that was broken."""
+    import tempfile
+
+    with tempfile.NamedTemporaryFile(suffix=".mcap") as file:
+        file.write(bases()[base])
+        file.flush()
+        with LogReader(file.name) as reader:
+            return frozenset((m.log_time, m.data) for m in reader.messages())
+
+
+def _read(case: Case, path: Path, *, salvage: bool) -> None:
+    with LogReader(path, salvage=salvage) as reader:
+        found = list(reader.messages())
+        for attachment in reader.attachments:
+            reader.attachment_data(attachment)
+        if [m.log_time for m in found] != sorted(m.log_time for m in found):
+            raise BrokenPromise("messages out of order")
+        if salvage:
+            in_file_order = Counter(map(_key, reader.messages(ordered=False)))
+            if in_file_order != Counter(map(_key, found)):
+                raise BrokenPromise("one order has other messages than the other")
+        told = reader.problems or reader.crc_absent() or (salvage and reader.missing)
+        if case.base and case.trusted and not told:
+            true = _truth(case.base)
+            if not all((m.log_time, m.data) in true for m in found):
+                raise BrokenPromise("a message was changed, its checksum does not say so")
+
+
+def _play(case: Case, path: Path, *, salvage: bool) -> None:
+    with contextlib.closing(RecordedSource([path], salvage=salvage)) as source:
+        if source.frames > 1000:
+            raise BrokenPromise(f"{source.frames} frames in {len(case.raw)} bytes")
+        blocks: list[Block] = []
+        try:
+            while (left := source.first_frame + source.frames - _played(blocks, source)) > 0:
+                blocks.append(source.take(0, min(left, _BLOCK)))
+        finally:
+            _same_slowly(path, blocks, salvage=salvage)
+
+
+def _played(blocks: list[Block], source: RecordedSource) -> int:
+    return source.first_frame + sum(map(len, blocks))
+
+
+def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
+    """Compare the blocks that were played with what the reader in Python decodes."""
+    if not blocks:
+        return
+    with contextlib.closing(ViewFile(path, salvage=salvage)) as view:
+        all_frames = np.concatenate([b.frames for b in blocks])
+        all_truth = np.concatenate([b.truth for b in blocks])
+        at = 0
+        for start, stop in view.ranges:
+            n = min(stop - start, len(all_frames) - at)
+            if n == 0:
+                break
+            frames = np.empty((n, *view.facts.frame_shape), view.facts.dtype)
+            truth = np.empty((n, len(view.facts.truth)))
+            tabled_rows(view, start, frames, truth)
+            if frames.tobytes() != all_frames[at : at + n].tobytes():
+                raise BrokenPromise("the reader in C gives other frames")
+            if truth.tobytes() != all_truth[at : at + n].tobytes():
+                raise BrokenPromise("the reader in C gives other ground truth")
+            at += n
+
+
+def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarray) -> None:
+    """As `ViewFile.take`, by the tables of chunks alone and with nothing in C."""
+    outs = (frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8))
+    channels = zip(view._channels, view._layouts, outs, strict=False)
+    for which, (rows, layout, out) in enumerate(channels):
+        for piece in rows.pieces(start, len(out), which):
+            own = own_messages(view.reader, piece.segment, rows.channel)
+            ends = layout.checked_ends(view.path, piece.segment, own)
+            ends = ends[piece.low : piece.low + piece.n]
+            places = ends[:, None, None] - layout.distances[:, None] + np.arange(layout.width)
+            out[piece.at : piece.at + piece.n] = own.data[places].reshape(len(ends), -1)
+
+
+def _recover(path: Path) -> None:
+    saved = path.with_name("saved.mcap")
+    with _only_our_errors():
+        try:
+            recover_log(path, saved, force=True)
+        finally:
+            saved.with_name("saved.mcap.partial").unlink(missing_ok=True)
+        with LogReader(saved) as reader:
+            if not reader.complete or reader.problems:
+                raise BrokenPromise("a recovered log is not whole")
