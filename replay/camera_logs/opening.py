@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.reading import IMAGES, Reading
+from recorder.images.decoding import IMAGES, Reading
 from replay.camera_logs.formats.bag import BAGS, BagImages
 from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
 from replay.camera_logs.formats.mcap_log import McapImages
