@@ -29,7 +29,7 @@ from replay.runs.compare import told_otherwise
 from replay.runs.log import read_header
 from replay.runs.run import stated_source
 from replay.storage import identity
-from replay.storage.log_identity import log_identity
+from replay.storage.identity import log_identity
 from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)

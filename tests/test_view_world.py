@@ -21,8 +21,7 @@ from cdmisfa.core.signals import STATES
 from recorder.log.scenery import NECK, scenery_of, turned
 from recorder.mcap.reader import LogReader
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.eyes import eye_matrix
-from recorder.world.icub.source import TRUTH
+from recorder.world.icub.source import TRUTH, eye_matrix
 from replay.following import read_outputs
 from replay.palette import colour, packed
 from replay.runs.modules import save_modules

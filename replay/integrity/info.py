@@ -19,9 +19,8 @@ from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
-from replay.storage.listing import log_files
 from replay.storage.location import Location
-from replay.storage.opening import open_store
+from replay.storage.opening import log_files, open_store
 
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""

@@ -34,8 +34,8 @@ from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.store import DONE, ROWS
+from recorder.images.decoding import MessageKind
 from recorder.images.messages import image_decoder
-from recorder.images.reading import MessageKind
 from recorder.images.videos import VideoPackets
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
