@@ -38,9 +38,8 @@ from replay.viewer.catalogue import (
     serve_catalogue,
     set_layout,
 )
-from replay.viewer.display import missing_driver
 from replay.viewer.headless import draw_table, headless_viewer
-from replay.viewer.program import free_port, running
+from replay.viewer.program import free_port, missing_driver, running
 
 
 @pytest.fixture

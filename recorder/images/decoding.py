@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
@@ -17,7 +17,8 @@ from cdmisfa.core.errors import CdmisfaError, one_line
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.images.fields import Field, field_value, members, numbers_of
 from recorder.images.messages import SCHEMAS, foxglove_image, image_decoder, ros_stamp
-from recorder.images.pixels import Depth, MalformedImage, Shown
+from recorder.images.options import Clock, Depth
+from recorder.images.pixels import MalformedImage, Shown
 
 Taken = Callable[[bytes | memoryview], Shown]
 """Turns a message into what is taken of it; raises MalformedImage."""
@@ -27,8 +28,6 @@ Opened = Callable[[bytes], Any]
 
 Stamp = Callable[[bytes | memoryview], int]
 """Gives a message's own time in nanoseconds; raises MalformedImage."""
-
-Clock = Literal["log", "header"]
 
 _SECONDS: Final = ("sec", "secs", "seconds")
 _REST: Final = ("nsec", "nsecs", "nanosec", "nanos")
