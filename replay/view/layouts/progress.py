@@ -13,7 +13,7 @@ from replay.view.labels import label
 from replay.view.lanes import ATTENDS, MOSTLY
 from replay.view.layouts.panels import Panels
 from replay.view.layouts.plots import heights, holding, stacked
-from replay.view.streams import HARDLY_WATCHED
+from replay.view.run import HARDLY_WATCHED
 
 MOST_WEIGHTS = 3
 """Modules whose weights stand beside one another."""

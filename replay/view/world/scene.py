@@ -34,13 +34,9 @@ LIGHT = 0.25
 """What is added to the greys of objects: the viewer's background is as dark as they are."""
 
 
-class PlacesColumn(Column):
-    """Where something is, (n, 3), in its parent's frame."""
-
-    def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand n places over, (n, 3)."""
-        moved = rr.Transform3D.columns(translation=np.array(values, dtype=np.float32))
-        self._recording.send_columns(self.path, times, moved)
+def _places(values: NDArray[Any]) -> Any:
+    """(n, 3) places in their parent's frame."""
+    return rr.Transform3D.columns(translation=np.array(values, dtype=np.float32))
 
 
 class SceneView:
@@ -59,7 +55,7 @@ class SceneView:
         recording.log(SCENE, rr.ViewCoordinates.BRU, static=True)
         _write_thing(recording, f"{SCENE}/table", scenery.table, at_rest=True)
         self._objects = [
-            (thing, PlacesColumn(recording, spec, f"{SCENE}/{thing.name}"))
+            (thing, Column(recording, spec, f"{SCENE}/{thing.name}", encode=_places))
             for thing in scenery.objects
             if set(thing.truth) <= set(spec.truth)
         ]

@@ -12,7 +12,7 @@ from cdmisfa.core.signals import STATES
 from replay.palette import colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
-from replay.view.columns import ImageColumn, time_columns
+from replay.view.columns import Column, image_column, time_columns
 from replay.view.labels import label, part
 
 Bounds = tuple[tuple[float, float], tuple[float, float]]
@@ -46,12 +46,12 @@ class WallView:
         self._by_progress = header.by_progress
         height, width = self._spec.frame_shape
         self._places = places(len(self._streams), width, height)
-        self._pictures: dict[int, ImageColumn] = {}
+        self._pictures: dict[int, Column] = {}
         self._last, self._said = -1, dict.fromkeys(self._streams, "")
         for s, (x, y) in zip(self._streams, self._places, strict=True):
             path = f"{WALL}/{part(self._spec.streams, s)}"
             recording.log(path, rr.Transform3D(translation=[x, y, 0.0]), static=True)
-            self._pictures[s] = ImageColumn(recording, self._spec, path)
+            self._pictures[s] = image_column(recording, self._spec, path)
 
     def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
