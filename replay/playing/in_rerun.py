@@ -17,10 +17,10 @@ from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged
 from replay.playing.feed import frames_of, opened_source
 from replay.playing.pace import Played, paced, rounds
+from replay.view.build import recording_layout, view_entities
 from replay.view.columns import frames_column, line_column
 from replay.view.labels import label
 from replay.view.properties import APPLICATION
-from replay.view.recording import recording_layout, view_entities
 from replay.viewer.broadcast import Broadcast
 
 NAME: Final = "played.rrd"

@@ -32,6 +32,9 @@ LOG_TIME = "message_log_time"
 TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 """Signals that are not lines but the timelines themselves."""
 
+MOST_STREAMS = 16
+"""Streams with lines and lanes of their own: the most watched ones."""
+
 AGGREGATION = rr.components.AggregationPolicy.MinMax
 """How a line of more values than the screen has columns is drawn: from the least to the most.
 

@@ -2,8 +2,7 @@
 
 `/signals/<name>` holds each signal's values for every iteration, those of run.mcap; a signal that
 the run never has gets no entity. Where frames are missing, lines with a value per frame have a row
-of NaN. `/world`, `/lanes`, `/decision`, `/gate`, `/abstraction`, `/streams` and `/modules` show the
-same for a person.
+of NaN.
 """
 
 from __future__ import annotations
@@ -149,12 +148,7 @@ class RunView:
             self.event(event.t, event.iteration, event.text, event.level)
 
     def finish(self, outline: Outline, modules: Sequence[Module]) -> None:
-        """Write what is known at the end, and hand over everything that waits.
-
-        Args:
-            outline: the run in short.
-            modules: the frozen modules, for their weights.
-        """
+        """Write weights of the frozen modules and thresholds, and hand over what waits."""
         saved = {save.module: save.t for save in outline.saved}
         for module in modules:
             t = saved.get(module.index, outline.end)
@@ -359,10 +353,9 @@ class RunView:
             self._recording.log(WATCHED_NAME, frame, static=True)
         streams = columns["stream"][turns].tolist()
         self._named = streams[-1]
-        names = rr.Boxes2D.columns(
-            labels=[label(self._spec.streams[s]) for s in streams],
-            colors=packed_all([colour(s) for s in streams]),
-        )
+        labels = [label(self._spec.streams[s]) for s in streams]
+        colours = packed_all([colour(s) for s in streams])
+        names = rr.Boxes2D.columns(labels=labels, colors=colours)
         self._send(columns, turns, WATCHED_NAME, names)
 
     def _saved(self, columns: SignalColumns, saved: IntArray) -> None:

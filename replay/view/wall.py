@@ -14,8 +14,7 @@ from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
 from replay.view.columns import Column, image_column, time_columns
 from replay.view.labels import label, part
-
-Bounds = tuple[tuple[float, float], tuple[float, float]]
+from replay.view.layouts import Bounds
 
 WALL = "wall"
 FRAME = f"{WALL}/frame"
@@ -45,7 +44,7 @@ class WallView:
         self._recording, self._spec, self._streams = recording, header.spec, list(streams)
         self._by_progress = header.by_progress
         height, width = self._spec.frame_shape
-        self._places = places(len(self._streams), width, height)
+        self._places = places_of(len(self._streams), width, height)
         self._pictures: dict[int, Column] = {}
         self._last, self._said = -1, dict.fromkeys(self._streams, "")
         for s, (x, y) in zip(self._streams, self._places, strict=True):
@@ -132,12 +131,12 @@ class WallView:
 
 def bounds(count: int, height: int, width: int) -> Bounds:
     """Ranges of x and y that hold a wall of so many pictures of a size."""
-    x, y = (max(place[i] for place in places(count, width, height)) for i in (0, 1))
+    x, y = (max(place[i] for place in places_of(count, width, height)) for i in (0, 1))
     margin = BETWEEN * height
     return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
 
-def places(count: int, width: int, height: int) -> list[tuple[float, float]]:
+def places_of(count: int, width: int, height: int) -> list[tuple[float, float]]:
     """Where on a wall so many pictures of a size hang, in rows: x and y of their corners."""
     across, down = width + BETWEEN * height, (1 + ROOM) * height
 
