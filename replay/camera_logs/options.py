@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Final, Literal
 
+from cdmisfa.core.clock import RECORDED_FPS
+from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import Clock, Reading
 from recorder.images.framing import Fit, Size
 from recorder.images.pixels import Depth
@@ -30,8 +32,9 @@ class CameraOptions:
     Attributes:
         topics: the topics, a stream each; patterns as of file names mean all that match.
         size: (height, width) of a frame, or None for one from the images' own.
-        align: how streams of unequal length, start or rate are put on one clock: "index",
-            "time", or None to refuse them.
+        align: how streams of unequal length, start or rate are put on one clock: "index" takes
+            the i-th image of each, "time" the last image at or before each tick, None refuses
+            them.
         rate: frames a second; None for the rate of the first stream.
         fit: how images of another aspect ratio become frames: see `fitted`.
         gaps: what frames show in which a stream pauses: "skip" for nothing, so that no block
@@ -42,8 +45,8 @@ class CameraOptions:
             are kept in; None for none.
         fields: the numbers that are taken of messages or of a table instead of images, one after
             the other; see `Field`.
-        stamp: when a message is taken to be of: when it was logged, or as its header says.
-        color: whether frames show red, green and blue beside one another.
+        stamp: the times of messages: those of the log, or those in their headers.
+        color: whether frames show red, green and blue beside one another, (height, 3 width).
         time: the column of a table's times; see `TableNumbers`.
     """
 
@@ -61,6 +64,11 @@ class CameraOptions:
     stamp: Clock = "log"
     color: bool = False
 
+    @property
+    def reading(self) -> Reading:
+        """What is taken of messages and files."""
+        return Reading(self.depth, tuple(self.fields), self.time, self.stamp, self.color)
+
     def given(self) -> tuple[str, ...]:
         """The options of the command line that say other than the defaults."""
         return tuple(
@@ -69,19 +77,29 @@ class CameraOptions:
             if getattr(self, field.name) != field.default
         )
 
+    def check(self) -> None:
+        """Refuse what no log can be read with; raises UsageError."""
+        slowest, fastest = RECORDED_FPS
+        if self.rate is not None and not slowest <= self.rate <= fastest:
+            raise UsageError(f"--rate is {self.rate}: it must be in [{slowest:g}, {fastest:.0f}]")
+        if self.size is not None and min(self.size) < 1:
+            raise UsageError(f"--size is {self.size[1]}x{self.size[0]}: it must be above 0")
+        if self.stop is not None and not self.start < self.stop:
+            raise UsageError(
+                f"--from {self.start:g} is no earlier than --to {self.stop:g}, both in seconds "
+                "after the first image: no image lies between them"
+            )
 
-def spelled(
-    reading: Reading, size: Size | None, fit: Fit, start: float, stop: float | None, gaps: Gaps
-) -> list[str]:
-    """The options of the command line that choose what is taken; of defaults, none."""
-    words = ["--size", f"{size[1]}x{size[0]}"] if size is not None else []
-    words += ["--fit", fit] if fit != "crop" else []
-    for field in reading.fields:
-        words += ["--field", field]
-    words += ["--time", reading.time] if reading.time is not None else []
-    words += ["--stamp", reading.stamp] if reading.stamp != "log" else []
-    words += ["--color"] if reading.color else []
-    words += ["--range", "{:g}:{:g}".format(*reading.depth)] if reading.depth is not None else []
-    words += ["--from", f"{start:g}"] if start else []
-    words += ["--to", f"{stop:g}"] if stop is not None else []
-    return words + (["--gaps", "hold"] if gaps == "hold" else [])
+    def words(self) -> list[str]:
+        """The words of a command line that say what is taken, but for topics, align and rate."""
+        words = ["--size", f"{self.size[1]}x{self.size[0]}"] if self.size is not None else []
+        words += ["--fit", self.fit] if self.fit != "crop" else []
+        for field in self.fields:
+            words += ["--field", field]
+        words += ["--time", self.time] if self.time is not None else []
+        words += ["--stamp", self.stamp] if self.stamp != "log" else []
+        words += ["--color"] if self.color else []
+        words += ["--range", "{:g}:{:g}".format(*self.depth)] if self.depth is not None else []
+        words += ["--from", f"{self.start:g}"] if self.start else []
+        words += ["--to", f"{self.stop:g}"] if self.stop is not None else []
+        return words + (["--gaps", "hold"] if self.gaps == "hold" else [])

@@ -11,7 +11,7 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block, freeze
 from cdmisfa.core.errors import UsageError
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.recordings.view_file import intersection
 from replay.stored import Span, StoredSource
 

@@ -17,7 +17,7 @@ from replay.export.images import write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
 from replay.export.videos import write_film, write_films
-from replay.inputs.opening import Logged, holds_run, open_to_look
+from replay.inputs import Logged, holds_run, open_to_look
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.stored import StoredSource
 
 PIECE = 1000

@@ -21,7 +21,7 @@ from cdmisfa.core.errors import UsageError
 from replay.export.episodes import Stitched, shared_spans
 from replay.export.images import file_names, pieces
 from replay.export.videos import pixel_format, write_film
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.stored import StoredSource
 
 VERSION = "v3.0"

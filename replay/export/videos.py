@@ -19,7 +19,7 @@ from cdmisfa.core.errors import CdmisfaError
 from recorder.images.videos import pyav
 from replay.export.episodes import Stitched
 from replay.export.images import count, file_names, pieces
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.stored import StoredSource
 
 LOSSY = {"crf": "18", "preset": "medium"}

@@ -17,7 +17,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, whole
 from replay.camera_logs.options import CameraOptions
 from replay.following import Heard
-from replay.inputs.opening import holds_run
+from replay.inputs import holds_run
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import read_header
 from replay.runs.modules import load_modules

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.source import ForeignSource
-from replay.inputs.opening import holds_run, open_to_look
+from replay.inputs import holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_header
 from replay.runs.stretches import read_columns, read_stretches
 

@@ -69,8 +69,7 @@ def convert_command(
     from recorder.cameras.words import is_live
     from recorder.log.folder import refuse_existing
     from replay.camera_logs.options import CameraOptions
-    from replay.inputs.opening import open_cameras, refuse_what_is_no_log
-    from replay.inputs.words import places
+    from replay.inputs import open_cameras, places, refuse_what_is_no_log
 
     if out is None:
         if not dry_run:
