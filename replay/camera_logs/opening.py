@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.decoding import IMAGES, Reading
+from recorder.images.options import IMAGES, Reading
 from recorder.images.videos import VideoPackets
 from replay.camera_logs.bag import BAGS, BagImages, bag_channels, bag_topics
 from replay.camera_logs.lerobot import (

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
+from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
 from recorder.images.framing import framings
 from recorder.images.pixels import Shown, UnknownPixels
@@ -36,7 +38,14 @@ from replay.camera_logs.alignment import (
 )
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
 from replay.camera_logs.options import Align, CameraOptions
-from replay.camera_logs.selected import BROKEN, SALVAGE, WholeImages, excerpts, join_parts
+from replay.camera_logs.selected import (
+    BROKEN,
+    SALVAGE,
+    WholeImages,
+    excerpts,
+    join_parts,
+    unique_names,
+)
 from replay.camera_logs.stream import ImageStream
 from replay.storage.identity import Identity, LoggedSource
 from replay.storage.location import Location, Url
@@ -88,8 +97,8 @@ class ForeignSource(LoggedSource):
                 need `align`.
             LogDamagedError: a log is damaged.
         """
-        self._options = options = CameraOptions(tuple(topics), **chosen)
-        options.check()
+        self._options = options = CameraOptions(topics=tuple(topics), **chosen)
+        _check(options)
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
@@ -354,35 +363,20 @@ class ForeignSource(LoggedSource):
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        words += [*self._options.words(), "--align", align, "--rate", f"{self._fps:g}"]
+        words += option_words(replace(self._options, topics=(), align=None, rate=None))
+        words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
 
 
-def unique_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
-    """Topics as names of streams, with the file's and folders' where topics are shared.
-
-    Raises:
-        UsageError: a topic of a log is named twice.
-    """
-    topics = [s.topic for s in streams]
-    if len(set(topics)) == len(topics):
-        return tuple(topics)
-    paths = [s.path.address if isinstance(s.path, Url) else str(s.path.resolve()) for s in streams]
-    places = list(zip(paths, topics, strict=True))
-    for i, place in enumerate(places):
-        if place in places[:i]:
-            raise UsageError(f"{topics[i]} of {streams[i].path} is named twice: leave one out")
-    for folders in range(max(len(Path(path).parts) for path in paths)):
-        names = [_in_folders(stream, folders) for stream in streams]
-        if len(set(names)) == len(names):
-            return tuple(names)
-    return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
-
-
-def _in_folders(stream: ImageStream, folders: int) -> str:
-    """A stream's name with those of its file, and of some of the folders this is in."""
-    path, topic = stream.path, stream.topic
-    of_file = topic == path.stem or (isinstance(path, Path) and topic == path.resolve().name)
-    own = topic if of_file else path.stem + topic
-    above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
-    return "/".join([*above[max(len(above) - folders, 0) :], own]).removeprefix("//")
+def _check(options: CameraOptions) -> None:
+    """Refuse what no log can be read with."""
+    slowest, fastest = RECORDED_FPS
+    if options.rate is not None and not slowest <= options.rate <= fastest:
+        raise UsageError(f"--rate is {options.rate}: it must be in [{slowest:g}, {fastest:.0f}]")
+    if options.size is not None and min(options.size) < 1:
+        raise UsageError(f"--size is {options.size[1]}x{options.size[0]}: it must be above 0")
+    if options.stop is not None and not options.start < options.stop:
+        raise UsageError(
+            f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in seconds "
+            "after the first image: no image lies between them"
+        )
