@@ -17,7 +17,22 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import DENSE_STREAMS
 
-MEMORY = kernels.record_type("memory")
+
+def _record_type(kind: str) -> np.dtype[np.void]:
+    """The type of arrays of records, as C has them."""
+    types = {"int64_t": "i8", "double": "f8", "_Bool": "?"}
+    fields = dict(kernels.ffi.typeof(kind).fields)
+    layout: Any = {
+        "names": list(fields),
+        "formats": [types[field.type.cname] for field in fields.values()],
+        "offsets": [field.offset for field in fields.values()],
+        "itemsize": kernels.ffi.sizeof(kind),
+    }
+    made: np.dtype[np.void] = np.dtype(layout)
+    return made
+
+
+MEMORY = _record_type("memory")
 """Numbers that the agent remembers.
 
 iteration: iterations so far. module: abstraction being learned, from 1. stream: to watch next.
@@ -29,7 +44,7 @@ the weights in the last novel block. share: running share of novel blocks of the
 before. epsilon. idle: iterations with epsilon practically 0.
 """
 
-OUTCOME = kernels.record_type("outcome")
+OUTCOME = _record_type("outcome")
 """What an iteration came to: signals of `BlockSignals` by their names."""
 
 NOVEL: int = kernels.lib.NOVEL

@@ -70,20 +70,6 @@ def pointer(name: str, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any] 
     return _buffer(_POINTERS[dtype], array, True)
 
 
-def record_type(kind: str) -> np.dtype[np.void]:
-    """The type of arrays of records, as C has them."""
-    types = {"int64_t": "i8", "double": "f8", "_Bool": "?"}
-    fields = dict(ffi.typeof(kind).fields)
-    layout: Any = {
-        "names": list(fields),
-        "formats": [types[field.type.cname] for field in fields.values()],
-        "offsets": [field.offset for field in fields.values()],
-        "itemsize": ffi.sizeof(kind),
-    }
-    made: np.dtype[np.void] = np.dtype(layout)
-    return made
-
-
 def records(kind: str, array: NDArray[np.void]) -> Any:
     """Where an array of records lies, which are those of C by that name; it keeps it alive."""
     return _buffer(f"{kind}[]", array, True)
