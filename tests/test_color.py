@@ -16,7 +16,8 @@ from PIL import Image
 
 from cdmisfa import GymSource
 from cdmisfa.core.errors import UsageError
-from recorder.cameras.words import CAMERAS, CameraKind, LiveOptions, open_live
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.words import CAMERAS, CameraKind, open_live
 from recorder.images.decoding import MessageKind
 from recorder.images.framing import Framing
 from recorder.images.messages import image_decoder

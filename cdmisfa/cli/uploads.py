@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.options import Command
+from cdmisfa.cli.making import Command
+from cdmisfa.cli.printing import quoted
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 
@@ -115,7 +116,7 @@ def uploaded(
             fetch(url, place, there, shown.update)
         click.echo(f"{place} was fetched from {url}", err=True)
     click.echo(f"written to {place}, and uploaded to {url} when it is finished", err=True)
-    again = f"cdmisfa upload {options.quoted(place)} {options.quoted(str(url))}"
+    again = f"cdmisfa upload {quoted(place)} {quoted(str(url))}"
     try:
         yield place
     except UsageError:

@@ -10,7 +10,8 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
-from recorder.images.pixels import Depth, MalformedImage
+from recorder.images.options import Depth
+from recorder.images.pixels import MalformedImage
 
 NUMBERS_RECIPE: Final = "numbers as they are, float64"
 """How numbers become a frame, for the record."""

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
+from recorder.images.options import Depth
 from recorder.images.pixels import (
     DISTANCES,
-    Depth,
     MalformedImage,
     compressed_image,
     compressed_words,

@@ -15,13 +15,11 @@ from PIL import Image
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
+from recorder.images.options import Depth
 
 Shown = NDArray[Any]
 """What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
 3), or numbers, (I,) float64."""
-
-Depth = tuple[float, float]
-"""Distances, in metres, that are shown black and white."""
 
 MAX_PIXELS: Final = 36_000_000
 """Largest image that is decoded, more than one of 7680x4320."""

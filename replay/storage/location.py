@@ -12,6 +12,7 @@ from typing import Final
 from urllib.parse import unquote, urlsplit
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.options import setting
 
 SCHEMES: Final = ("s3", "http", "https")
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
@@ -101,15 +102,24 @@ _PART: Final = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Time limits for servers, in seconds.
+    """Time limits for servers, in seconds; `total` is for tries and waits together."""
 
-    Attributes:
-        total: for a part of a log, tries and waits together; of a part above 1 MiB for each MiB.
-        read: without a byte, after which the server is asked again.
-    """
-
-    total: float = 60.0
-    read: float = 20.0
+    total: float = setting(
+        60.0,
+        "Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
+        unit="SECONDS",
+        name="timeout",
+        least=0.1,
+        most=1e6,
+    )
+    read: float = setting(
+        20.0,
+        "Ask a server again that sends nothing for so long.",
+        unit="SECONDS",
+        name="read-timeout",
+        least=0.1,
+        most=1e6,
+    )
 
     def of(self, count: int) -> float:
         """Seconds for `count` bytes."""
