@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from folders import contents
 from foxglove_schemas_protobuf import RawImage_pb2
@@ -423,10 +424,9 @@ def recorder(tmp_path):
     wait_for(
         lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60, process
     )
-    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    commands = {int(w): Path(f"/proc/{w}/cmdline").read_text() for w in listed.read_text().split()}
+    children = psutil.Process(process.pid).children()
     with process:
-        yield process, [pid for pid, command in commands.items() if "spawn_main" in command]
+        yield process, [c.pid for c in children if "spawn_main" in " ".join(c.cmdline())]
         process.kill()
 
 
@@ -468,8 +468,7 @@ def test_rendering_processes_end_with_their_killed_parent(tmp_path):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     process.stdout.readline()
-    listed = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    children = [int(word) for word in listed.read_text().split()]
+    children = [child.pid for child in psutil.Process(process.pid).children()]
     assert len(children) >= 2
     process.kill()
     process.communicate()
