@@ -27,8 +27,8 @@ from benchmarks.report import interleaved, middle, ratio, save
 from recorder.images.decoding import decoder_of
 from recorder.images.framing import default_size, fitted, size_of
 from recorder.images.reading import IMAGES, MessageKind
+from recorder.mcap.reader import LogReader
 from replay.camera_logs.source import ForeignSource
-from replay.mcap.reader import LogReader
 
 TAU = 40
 STEP_NS = 33_333_333

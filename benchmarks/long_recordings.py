@@ -61,7 +61,7 @@ def play(path: Path) -> None:
 
 def messages(path: Path) -> None:
     """Go over every message of a log."""
-    from replay.mcap.reader import LogReader
+    from recorder.mcap.reader import LogReader
 
     with LogReader(path) as reader:
         for _ in reader.messages():

@@ -20,7 +20,7 @@ from cdmisfa.experiments import runs
 from cdmisfa.experiments.recompute.check import learner_after
 from cdmisfa.experiments.resume import Keyframes, command_of
 from cdmisfa.experiments.sources import open_source
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.runs.folders import run_log
 from replay.runs.log import KEYFRAME_TOPIC
 

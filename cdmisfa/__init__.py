@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from cdmisfa.core.signals import BlockSignals as BlockSignals
     from cdmisfa.experiments.loop import learn as learn
     from cdmisfa.experiments.recompute.run import Run as Run
-    from recorder.cameras.gym import GymSource as GymSource
     from recorder.cameras.stepped import ArraySource as ArraySource
+    from recorder.cameras.stepped import GymSource as GymSource
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
 
     __version__: str
@@ -46,8 +46,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.core.modules": "Module",
         "cdmisfa.core.signals": "SIGNALS BlockSignals",
         "cdmisfa.experiments.loop": "learn",
-        "recorder.cameras.gym": "GymSource",
-        "recorder.cameras.stepped": "ArraySource",
+        "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.world.oscillatory": "OscillatorySource",
         "cdmisfa.experiments.recompute.run": "Run",
     },

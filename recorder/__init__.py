@@ -5,8 +5,7 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "recorder.cameras.gym": "GymSource",
-        "recorder.cameras.stepped": "ArraySource",
+        "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.config": "RecordConfig SceneConfig",
         "recorder.live": "RecordedWhileWatched record_watched",
         "recorder.log.split": "Split",

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS
-from recorder.cameras.camera import Picture
+from recorder.cameras.readers import Picture, Readers
 
 SHAPE = (12, 16)
 BEGIN = 10**18
@@ -26,7 +26,7 @@ class Arrival(NamedTuple):
     taken: float | None = None
 
 
-class ScriptedInbox:
+class ScriptedReaders(Readers):
     """Pictures that come by a script; time passes only while they are waited for.
 
     A camera whose script is over has ended.

@@ -28,8 +28,8 @@ from recorder.images.videos import most_pixels
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
 from recorder.log.logfile import LogFile
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
-from replay.mcap.records import MalformedRecord
 from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
 from replay.runs.log import read_header
 from replay.runs.messages import decode_keyframe, encode_keyframe

@@ -16,12 +16,11 @@ from cdmisfa.experiments.runs import run
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
+from recorder.mcap.reader import LogReader
+from recorder.mcap.store import FileStore, OnePass
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import check_log
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
-from replay.storage.once import OnePass
-from replay.storage.store import FileStore
 
 FRAMES = 2000
 
@@ -46,7 +45,7 @@ def share_read(path: Path, work: str) -> float:
         "from replay.integrity.info import describe\n"
         "from replay.integrity.verify import check_log\n"
         "from replay.recordings.source import RecordedSource\n"
-        "from replay.mcap.reader import LogReader\n"
+        "from recorder.mcap.reader import LogReader\n"
         f"def work(path): {work}\n"
         "def read(): return int(Path('/proc/self/io').read_text().split()[1])\n"
         "work(sys.argv[2])\n"  # imports what it needs

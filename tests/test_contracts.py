@@ -22,7 +22,7 @@ from cdmisfa.core.signals import SIGNALS, values
 from cdmisfa.features.feature import Feature
 from cdmisfa.features.incsfa import IncSFA
 from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
-from recorder.cameras.camera import Camera
+from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS
 from recorder.images.pixels import Shown
 from recorder.world.oscillatory import OscillatorySource

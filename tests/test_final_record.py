@@ -14,9 +14,9 @@ from conftest import Cdmisfa
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.runs import run
 from recorder.log.logfile import LogFile
+from recorder.mcap.reader import LogReader
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import check_log
-from replay.mcap.reader import LogReader
 from replay.runs.folders import FINAL_METADATA
 
 EASY = LearnerConfig(delta=1.0, eta_dot_window=3, min_variance=0.0, warm_up=0, tau=20)

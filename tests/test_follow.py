@@ -25,10 +25,10 @@ from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import RunResult, run
 from cdmisfa.testing.sources import SourceContract, same
 from recorder.log.split import Split
+from recorder.mcap.store import FileStore
 from recorder.recording import record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
 from replay.recordings.followed import FollowedSource, ReplacedError
-from replay.storage.store import FileStore
 
 FRAMES = 600
 RECORDER = """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from conftest import Cdmisfa
 from folders import coverage
-from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedInbox, bar
+from live_cameras import BEGIN, SHAPE, Arrival, Hand, ScriptedReaders, bar
 from waiting import wait_for
 
 from cdmisfa.agents.progress.config import ProgressConfig
@@ -22,9 +22,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
 from cdmisfa.testing.sources import same
-from recorder.cameras.framed import framed
 from recorder.cameras.live import LiveSource
-from recorder.cameras.readers import Readers
+from recorder.cameras.readers import CameraFrames, Readers
 from recorder.cameras.video import Steady
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
 from recorder.log.split import Split
@@ -48,7 +47,7 @@ def steady(stream: int, start: float, count: int, fps: float = FPS) -> list[Arri
 def opened(script: Sequence[Arrival], streams: int = 1, **options: Any) -> LiveSource:
     names = ("left", "right", "third")[:streams]
     rate = options.pop("states", FPS)
-    return LiveSource(ScriptedInbox(script, streams, rate), names, {}, **options)
+    return LiveSource(ScriptedReaders(script, streams, rate), names, {}, **options)
 
 
 def values(source: FrameSource, n: int) -> list[tuple[int, int, list[int]]]:
@@ -135,10 +134,10 @@ def test_the_rate_is_stated_or_measured_or_asked_for() -> None:
 
 
 def test_a_camera_that_shows_nothing_is_named() -> None:
-    inbox = ScriptedInbox([*steady(0, 0, 3000), Arrival(99, 1, flat(0))], 2)
+    readers = ScriptedReaders([*steady(0, 0, 3000), Arrival(99, 1, flat(0))], 2)
     with pytest.raises(UsageError, match="right shows no picture"):
-        LiveSource(inbox, ("left", "right"), {})
-    assert inbox.closed
+        LiveSource(readers, ("left", "right"), {})
+    assert readers.closed
 
 
 def test_it_ends_with_the_first_camera_that_ends() -> None:
@@ -276,13 +275,13 @@ class Cameras:
     def __init__(self, count: int = 2, **options: Any) -> None:
         self.said: list[str] = []
         self.hands = [Hand(name) for name in ("left", "right")[:count]]
-        self.inbox = Readers(self.hands, say=self.said.append, **options)
+        self.readers = Readers(self.hands, say=self.said.append, **options)
 
     def source(self) -> LiveSource:
         for hand in self.hands:
             hand.give(flat(0))
         names = [hand.name for hand in self.hands]
-        return LiveSource(self.inbox, names, {})
+        return LiveSource(self.readers, names, {})
 
     def close(self, source: LiveSource) -> None:
         for hand in self.hands:
@@ -372,45 +371,41 @@ def test_a_camera_that_cannot_be_opened_is_no_loss_but_an_error() -> None:
     cameras = Cameras(1)
     cameras.hands[0].give(CdmisfaError("rtsp://nowhere cannot be opened"))
     with pytest.raises(UsageError, match="rtsp://nowhere cannot be opened"):
-        LiveSource(cameras.inbox, ["left"], {})
+        LiveSource(cameras.readers, ["left"], {})
 
 
 def test_images_of_all_cameras_become_frames_of_the_first_ones_size() -> None:
-    hands, said = [Hand("left"), Hand("right")], list[str]()
-    left, right = (camera.pictures() for camera in framed(hands, None, "crop", say=said.append))
+    said = list[str]()
+    frames = CameraFrames(["left", "right"], None, "crop", say=said.append)
     image = np.arange(96 * 128).reshape(96, 128).astype(np.uint8)
     half = image[::2, ::2]
-    hands[0].give(image, half)
-    frames = [next(left)[1] for _ in range(2)]
-    assert [frame.shape for frame in frames] == [(48, 64)] * 2
-    np.testing.assert_array_equal(frames[1], half)
-    hands[1].give(image[24:72])
-    np.testing.assert_array_equal(next(right)[1], image[24:72, 32:96])
-    hands[1].give(half[:24, :32])  # of another size than its first, it may be smaller
-    assert next(right)[1].shape == (48, 64)
+    assert frames.frame(1, half) is None  # the size is not known yet
+    assert [shape_of(frames.frame(0, shown)) for shown in (image, half)] == [(48, 64)] * 2
+    np.testing.assert_array_equal(frames.frame(0, half), half)
+    np.testing.assert_array_equal(frames.frame(1, image[24:72]), image[24:72, 32:96])
+    # of another size than its first, it may be smaller
+    assert shape_of(frames.frame(1, half[:24, :32])) == (48, 64)
     assert said == [
         "left: 128x96, shown as 64x48",
         "left: images change from 128x96 to 64x48; each is made a frame of 64x48",
         "right: 128x48, cropped to 64x48, shown as 64x48",
         "right: images change from 128x48 to 32x24; each is made a frame of 64x48",
     ]
-    hands[0].give(half[:24, :32])
     with pytest.raises(UsageError, match="left: an image of 32x24 is smaller than 64x48"):
-        next(framed(hands, (48, 64), "crop")[0].pictures())
+        CameraFrames(["left"], (48, 64), "crop").frame(0, half[:24, :32])
+
+
+def shape_of(frame: Any) -> tuple[int, ...]:
+    return tuple(frame.shape)
 
 
 def test_images_before_the_size_is_known_are_passed_over() -> None:
-    first = Hand("first")
-    first.give(flat(0))
-
-    class Early(Hand):
-        def pictures(self) -> Iterator[tuple[int, Any]]:
-            yield 0, flat(1)
-            next(cameras[0].pictures())
-            yield 0, flat(2)
-
-    cameras = framed([first, Early("early")], None, "crop")
-    np.testing.assert_array_equal([image for _, image in cameras[1].pictures()], [flat(2)])
+    hand, taken = Hand("left"), list[Any]()
+    hand.give(flat(0), flat(2), None)
+    readers = Readers([hand], lambda camera, image: image if image.any() else None)
+    wait_for(lambda: taken.append(readers.take(0)) or taken[-1], seconds=20)
+    readers.close()
+    np.testing.assert_array_equal(taken[-1].image, flat(2))
 
 
 def test_a_full_queue_is_emptied_and_says_so() -> None:

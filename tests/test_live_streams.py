@@ -34,7 +34,7 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.video import video_camera
-from recorder.cameras.words import LiveOptions, is_live, open_live, stream_names
+from recorder.cameras.words import LiveOptions, is_live, live_names, open_live
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_header
 
@@ -82,7 +82,7 @@ def test_streams_are_named_after_what_they_are() -> None:
         "foxglove://robot:8765/front-2": "front-2",
         "foxglove://robot:8765/front": "front-3",
     }
-    assert stream_names(list(words)) == tuple(words.values())
+    assert live_names(list(words)) == tuple(words.values())
 
 
 class TestGym(ForwardContract):

@@ -13,7 +13,8 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.log.logfile import LogFile
-from recorder.log.whole import PARTIAL, partial_path
+from recorder.log.whole import partial_path
+from recorder.mcap.store import PARTIAL
 
 SECOND = 1_000_000_000
 

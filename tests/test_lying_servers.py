@@ -14,7 +14,7 @@ from server_cases import CAMERAS, CASES, Case, Given, check, prepare
 from server_lies import LIES
 
 from cdmisfa.core.errors import CdmisfaError
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.storage import tries
 from replay.storage.limits import Limits, limited, limits
 from replay.storage.location import Url

@@ -23,7 +23,7 @@ from cdmisfa.core.signals import ACTIONS
 from cdmisfa.experiments.recompute.check import check_run, learner_after
 from cdmisfa.experiments.recompute.forks import fork_run
 from cdmisfa.experiments.sources import open_source
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.runs.compare import first_difference
 from replay.runs.log import read_header, read_keyframe
 from replay.runs.messages import encode_keyframe

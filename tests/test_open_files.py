@@ -25,14 +25,13 @@ from recorder.log.logfile import LogFile
 from recorder.log.messages import RECORDING_METADATA
 from recorder.log.split import Split
 from recorder.log.viewfacts import MOST_NAMED
+from recorder.mcap import store
+from recorder.mcap.mending import MendedStore
+from recorder.mcap.reader import LogReader
+from recorder.mcap.store import Excerpt, FileStore, OnePass
 from recorder.recording import RecordingStoppedError, record, record_scene, recorded
 from replay.integrity.verify import check_log
-from replay.mcap.mending import MendedStore
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
-from replay.storage import store
-from replay.storage.once import Excerpt, OnePass
-from replay.storage.store import FileStore
 
 HERE = Path(__file__).parent
 LIMIT = 64

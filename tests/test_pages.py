@@ -24,7 +24,9 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_files_that_a_page_names_are_there(page: Path) -> None:
     text = page.read_text("utf-8")
-    named = re.findall(r"\b(?:cdmisfa|recorder|replay|benchmarks|tests|docs)/[\w/.-]*\w", text)
+    named = re.findall(
+        r"\b(?:cdmisfa|recorder|replay|benchmarks|tests|tools|docs)/[\w/.-]*\w", text
+    )
     assert [file for file in named if not (ROOT / file).exists()] == []
 
 

@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from cdmisfa.experiments.convert import convert
+from recorder.mcap.reader import LogReader
 from replay.camera_logs.source import ForeignSource
-from replay.mcap.reader import LogReader
 
 COUNT = 200
 SIZE = (HEIGHT, WIDTH)

@@ -13,11 +13,11 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap import summary
-from replay.mcap.compression import Decompressor
-from replay.mcap.reader import LogReader
-from replay.mcap.records import RECORD_HEADER, MalformedRecord
-from replay.storage.store import FileStore, Store
+from recorder.mcap import summary
+from recorder.mcap.compression import Decompressor
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import RECORD_HEADER, MalformedRecord
+from recorder.mcap.store import FileStore, Store
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])

@@ -15,7 +15,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 
 
 def written(

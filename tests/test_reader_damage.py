@@ -20,9 +20,9 @@ import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAX_CHUNK
 from replay.integrity.recover import recover_log
-from replay.mcap.reader import LogReader
-from replay.mcap.records import MAX_CHUNK
 from replay.recordings.source import RecordedSource
 
 MESSAGES = 40
@@ -307,7 +307,7 @@ BOMBS: dict[str, Callable[[], bytes]] = {
 READ = """
 import pathlib, sys
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 try:
     with LogReader(sys.argv[1]) as reader:
         list(reader.messages())

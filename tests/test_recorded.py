@@ -14,12 +14,12 @@ from cdmisfa.testing.sources import SourceContract, same
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
+from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 
 FRAMES = 330

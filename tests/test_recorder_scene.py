@@ -15,9 +15,9 @@ from rerun.chunk import McapReader
 
 from cdmisfa.core.config import as_table
 from recorder.log.scenery import scenery_of, times, turned
+from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "icub"

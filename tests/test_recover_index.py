@@ -11,9 +11,9 @@ import pytest
 from conftest import Cdmisfa
 from mcap.writer import CompressionType, Writer
 
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Segment
 from replay.integrity.recover import recover_log
-from replay.mcap.reader import LogReader
-from replay.mcap.segments import Segment
 
 MESSAGES = 60
 CRC = range(33, 37)

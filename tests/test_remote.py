@@ -28,10 +28,11 @@ from mcap_files import (
 from web_server import Fault, WebServer, serving
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from recorder.mcap.reader import LogReader
 from replay.camera_logs.source import ForeignSource
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.storage.location import Url, location
+from replay.storage.opening import open_store
 from replay.storage.remote import RemoteStore
 from replay.storage.servers import RemoteError
 
@@ -125,7 +126,7 @@ def test_what_is_in_a_log_is_said_from_few_bytes(
 def test_the_chunks_of_other_topics_are_left_where_they_are(web: WebServer, tmp_path: Path) -> None:
     write_noise(tmp_path / "a.mcap", ("/left", "/right"), 100, 5000)
     web.files["/a.mcap"] = (tmp_path / "a.mcap").read_bytes()
-    with LogReader(web.url("/a.mcap")) as reader:
+    with LogReader(open_store(web.url("/a.mcap"))) as reader:
         assert reader.by_index
         edges, _ = web.sent, web.reset()
         taken = [m.data for m in reader.messages({"/left"})]
@@ -158,7 +159,8 @@ def test_every_variant_of_the_format_gives_the_same_messages(
         data = variant(kind, features, "zstd")
         (tmp_path / "a.mcap").write_bytes(data)
         web.files["/a.mcap"] = data
-        with LogReader(tmp_path / "a.mcap") as near, LogReader(web.url("/a.mcap")) as far:
+        far_store = open_store(web.url("/a.mcap"))
+        with LogReader(tmp_path / "a.mcap") as near, LogReader(far_store) as far:
             assert list(far.messages()) == list(near.messages()), (kind, features)
             assert far.metadata == near.metadata
             assert far.attachments == near.attachments
@@ -188,7 +190,7 @@ def test_cut_logs_are_said_to_be_cut_and_saved(
 def test_damage_in_a_chunk_is_found_when_it_is_read(
     cdmisfa: Cdmisfa, web: WebServer, views: list[str]
 ) -> None:
-    with LogReader(views[0]) as reader:
+    with LogReader(open_store(views[0])) as reader:
         segment = reader.segments[len(reader.segments) // 2]
     broken = bytearray(web.files["/rec/x1.mcap"])
     broken[segment.data_offset + segment.stored // 2] ^= 1
@@ -213,7 +215,7 @@ def test_a_summary_that_lies_about_a_chunk_is_caught(web: WebServer, tmp_path: P
     data[-12:-8] = bytes(4)  # no checksum of the summary
     web.files["/a.mcap"] = bytes(data)
     with (
-        LogReader(web.url("/a.mcap")) as reader,
+        LogReader(open_store(web.url("/a.mcap"))) as reader,
         pytest.raises(LogDamagedError, match="not the chunk that the summary names"),
     ):
         list(reader.messages())
@@ -274,7 +276,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(web: WebServer, tmp_pat
     data = (tmp_path / "a.mcap").read_bytes()
     for changed in (data[:-1] + b"?", data + b"?"):
         web.files["/a.mcap"] = data
-        with LogReader(web.url("/a.mcap")) as reader:
+        with LogReader(open_store(web.url("/a.mcap"))) as reader:
             web.files["/a.mcap"] = changed
             with pytest.raises(RemoteError, match="it changed while it was read"):
                 list(reader.messages())
@@ -373,13 +375,13 @@ def test_a_port_that_cannot_be_is_one_line(cdmisfa: Cdmisfa) -> None:
 def test_without_the_packages_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(CdmisfaError, match=r"pip install 'cdmisfa\[cloud\]'"):
-        LogReader("https://127.0.0.1/a.mcap")
+        LogReader(open_store("https://127.0.0.1/a.mcap"))
 
 
 def test_messages_outside_chunks_are_found_by_a_walk(web: WebServer) -> None:
     data = MAGIC + record(HEADER, text("") + text("tests")) + record(CHANNEL, channel(schema_id=0))
     data += record(MESSAGE, message(1, 0, 7, 7, b"x"))
     web.files["/a.mcap"] = finish(data)
-    with LogReader(web.url("/a.mcap")) as reader:
+    with LogReader(open_store(web.url("/a.mcap"))) as reader:
         assert not reader.by_index
         assert [m.data for m in reader.messages()] == [b"x"]

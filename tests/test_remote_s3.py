@@ -10,6 +10,8 @@ import pytest
 from conftest import Cdmisfa
 from s3_server import buckets, forget, s3_files, serving_s3
 
+from replay.storage.opening import open_store
+
 QUICK = ("--max-iterations", "4", "--json")
 
 
@@ -61,12 +63,12 @@ def test_what_is_not_there_is_one_line(cdmisfa: Cdmisfa, s3: Any) -> None:
 
 
 def test_an_object_that_changes_is_refused(s3: Any, oscillatory_recording: Path) -> None:
-    from replay.mcap.reader import LogReader
+    from recorder.mcap.reader import LogReader
     from replay.storage.servers import RemoteError
 
     data = (oscillatory_recording / "x1.mcap").read_bytes()
     s3.pipe("logs/changing.mcap", data)
-    with LogReader("s3://logs/changing.mcap") as reader:
+    with LogReader(open_store("s3://logs/changing.mcap")) as reader:
         assert reader.by_index
         s3.pipe("logs/changing.mcap", data[:-1] + b"?")
         with pytest.raises(RemoteError, match="it changed while it was read"):

@@ -29,10 +29,10 @@ from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.resume import SET_ASIDE, Keyframes
 from cdmisfa.experiments.runs import RunResult, run
 from recorder.config import RecordConfig
+from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
 from replay.runs.folders import run_log

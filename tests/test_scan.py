@@ -19,11 +19,10 @@ from cdmisfa.kernels import frames as kernels
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import INDEX_HEADER, Segment
+from recorder.mcap.tables import indexed_table
 from recorder.recording import record_scene
-from replay.mcap.reader import LogReader
-from replay.mcap.records import INDEX_HEADER
-from replay.mcap.segments import Segment
-from replay.mcap.tables import indexed_table
 from replay.recordings.scanner import ChunkScanner
 from replay.recordings.view_file import ViewFile
 from tools.fuzz.oracle import tabled_rows

@@ -10,7 +10,7 @@ from run_data import IMAGE, VECTOR, run_of, write_run
 
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS
-from replay.mcap.records import MalformedRecord
+from recorder.mcap.records import MalformedRecord
 from replay.runs import messages as codec
 from replay.runs import stretches as stretch
 from replay.runs.columns import columns_of_messages, columns_of_records

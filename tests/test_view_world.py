@@ -19,11 +19,11 @@ from cdmisfa.core.config import as_table
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import STATES
 from recorder.log.scenery import NECK, scenery_of, turned
+from recorder.mcap.reader import LogReader
 from recorder.world.icub.config import IcubConfig
 from recorder.world.icub.eyes import eye_matrix
 from recorder.world.icub.source import TRUTH
 from replay.following import read_outputs
-from replay.mcap.reader import LogReader
 from replay.palette import colour, packed
 from replay.runs.modules import save_modules
 from replay.runs.outline import read_outline

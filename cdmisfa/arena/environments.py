@@ -18,7 +18,7 @@ import numpy as np
 
 from cdmisfa.arena.pictures import HEIGHT, WIDTH, Rng, Shown, stateless
 from cdmisfa.core.errors import UsageError
-from recorder.cameras.gym import make, picture, play
+from recorder.cameras.stepped import gray_picture, make_environment, play
 from recorder.images.pixels import shrink
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "icub"
@@ -35,7 +35,7 @@ def classic(name: str, hold: int, state: tuple[str, ...]) -> Callable[[Rng, int]
     """A classic control task, each random action held for some frames."""
 
     def make_stream(rng: Rng, n: int) -> Shown:
-        environment = make(name)
+        environment = make_environment(name)
         return _play(environment, rng, n, hold, state, lambda seen: (environment.render(), seen))
 
     return make_stream
@@ -45,7 +45,7 @@ def atari(game: str, memory: Mapping[str, int]) -> Callable[[Rng, int], Shown]:
     """An Atari game and, of its memory, the bytes at some addresses."""
 
     def make_stream(rng: Rng, n: int) -> Shown:
-        environment = make(f"ALE/{game}-v5", obs_type="rgb", frameskip=GAME_SKIP)
+        environment = make_environment(f"ALE/{game}-v5", obs_type="rgb", frameskip=GAME_SKIP)
         console = environment.unwrapped.ale
         addresses = list(memory.values())
         return _play(
@@ -74,7 +74,7 @@ def _play(
     with contextlib.closing(environment):
         for t, seen in enumerate(islice(play(environment, rng, hold), n)):
             shown, state[t] = look(seen)
-            frames[t] = shrink(picture(shown), HEIGHT, WIDTH)
+            frames[t] = shrink(gray_picture(shown), HEIGHT, WIDTH)
     return Shown(frames, state, names)
 
 

@@ -12,7 +12,7 @@ import json
 
 import numpy as np
 
-from recorder.cameras.camera import Camera
+from recorder.cameras.readers import Camera
 
 
 class CameraContract:

@@ -5,10 +5,9 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "recorder.cameras.camera": "Camera",
-        "recorder.cameras.gym": "GymSource",
         "recorder.cameras.live": "LiveSource",
-        "recorder.cameras.stepped": "ArraySource",
+        "recorder.cameras.readers": "Camera",
+        "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.cameras.words": "CAMERAS CameraKind open_live",
     },
 )

@@ -1,10 +1,15 @@
-"""Cameras as a source of frames: what comes when it comes, on one clock."""
+"""Live streams on one clock: which picture each shows at each tick, or that it has none.
+
+At a tick a stream shows its last picture at or before it, as `--align time` does for logs. One
+that is older than `hold` is shown no more: the stream has a gap there. A picture keeps its time:
+one that comes when the ticks at and after its time are decided is late, and changes none of them.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,10 +21,9 @@ from cdmisfa.core.blocks import (
     freeze,
     take_unbroken,
 )
-from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
+from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from recorder.cameras.camera import Picture
-from recorder.cameras.grid import Grid
+from recorder.cameras.readers import Picture, Readers
 from recorder.images.pixels import Shown
 
 HOLD: Final = 0.25
@@ -31,49 +35,69 @@ PATIENCE: Final = 0.2
 START: Final = 30.0
 """Seconds in which every camera must show its first picture."""
 
+COUNTED: Final = ("messages", "repeated", "dropped", "late", "disordered", "missing")
+"""What is counted of each stream: pictures that came; ticks that show the picture of the tick
+before; pictures that no tick shows, for a newer one had come; pictures that came after a tick was
+decided which should have shown them; pictures no newer than one before them, which are not shown;
+ticks without a picture."""
+
 _POLL: Final = NANOSECONDS // 10
 _MEASURED: Final = 12
 """Pictures by which a camera's rate is measured that does not state it."""
 
 
-class Inbox(Protocol):
-    """Where the pictures of all cameras come in, and the clock by which they do."""
+class _Stream:
+    """The pictures of one stream, and which of them are shown.
 
-    def now(self) -> int:
-        """The time, in nanoseconds."""
+    Attributes:
+        counts: see `COUNTED`.
+        newest: time of the newest picture, -1 before the first.
+    """
 
-    def take(self, stream: int) -> Picture | None:
-        """The oldest picture of a stream that waits; None where none does."""
+    def __init__(self) -> None:
+        self.counts = dict.fromkeys(COUNTED, 0)
+        self.newest = -1
+        self._coming: deque[Picture] = deque()
+        self._last: Picture | None = None
+        self._shown = True
 
-    def wait(self, until: int) -> None:
-        """Return when something came in, or at a time."""
+    def put(self, picture: Picture, decided: int) -> None:
+        """Take in a picture; the ticks until the time `decided` are decided."""
+        self.counts["messages"] += 1
+        if picture.time_ns <= self.newest:
+            self.counts["disordered"] += 1
+            return
+        self.counts["late"] += picture.time_ns <= decided
+        self.newest = picture.time_ns
+        self._coming.append(picture)
 
-    def over(self, stream: int) -> str:
-        """Why a stream shows nothing more than what waits; "" while it may."""
-
-    def lost(self, stream: int) -> int:
-        """Pictures of a stream that were thrown away because the queue was full."""
-
-    def rate(self, stream: int) -> float | None:
-        """Pictures a second that a stream states."""
-
-    def close(self) -> None:
-        """Let go of the cameras."""
+    def show(self, tick: int, hold: int) -> Shown | None:
+        """The image at a tick, None for a gap; both in nanoseconds."""
+        while self._coming and self._coming[0].time_ns <= tick:
+            self.counts["dropped"] += not self._shown
+            self._last, self._shown = self._coming.popleft(), False
+        if self._last is None or tick - self._last.time_ns > hold:
+            self.counts["missing"] += 1
+            return None
+        self.counts["repeated"] += self._shown
+        self._shown = True
+        return self._last.image
 
 
 class LiveSource(ForwardSource):
-    """Live streams on one clock, with gaps where a stream has no picture; see `Grid`.
+    """Cameras as a source of frames, with gaps where a stream has no picture.
 
     It cannot go back: record what it shows to have it again. `take_all` gives a block for each
     unbroken stretch of a stream, and none for one that shows nothing. The source ends with the
     first stream that does.
 
     Args:
-        inbox: where the pictures come in, all of one size; closed with the source.
+        readers: of the cameras, whose images are of one size; closed with the source.
         names: of the streams.
         about: what identifies the cameras.
         rate: ticks a second; by default the first camera's rate, stated or measured.
-        hold, patience: see `Grid`.
+        hold: seconds for which a picture stands for those that are missing.
+        patience: seconds for which a tick waits for pictures that are on their way.
         stop: asked while waiting; true ends the wait as if the cameras had ended.
 
     Attributes:
@@ -87,7 +111,7 @@ class LiveSource(ForwardSource):
 
     def __init__(
         self,
-        inbox: Inbox,
+        readers: Readers,
         names: Sequence[str],
         about: Mapping[str, Any],
         *,
@@ -97,40 +121,40 @@ class LiveSource(ForwardSource):
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self.stop = stop
-        self._inbox = inbox
+        self._readers = readers
+        self._hold, self._patience = round(hold * NANOSECONDS), round(patience * NANOSECONDS)
+        self._streams = [_Stream() for _ in names]
+        self._tick, self._decided = 0, -1
         self._ahead: deque[list[Shown | None]] = deque()
         self._ends: int | None = None
         self._why = ""
         try:
-            first = self._first(names, rate is None)
-            fps = rate or self._rate(first[0])
+            firsts = self._first_pictures(names, measure=rate is None)
+            fps = rate or self._rate(firsts[0])
             slowest, fastest = RECORDED_FPS
             if not slowest <= fps <= fastest:
                 raise UsageError(f"--rate is {fps:g}: it must be in [{slowest:g}, {fastest:g}]")
-            # Half a tick later, so that a camera at the rate of the clock may jitter by as much.
-            step = NANOSECONDS / fps
-            start = max(pictures[0].time_ns for pictures in first) + round(step / 2)
-            size = first[0][0].image.shape
-            self._spec = SourceSpec(
-                tuple(names), size, str(first[0][0].image.dtype), (), fps, start
-            )
         except BaseException:
-            inbox.close()
+            readers.close()
             raise
-        self._about = {**about, "size": list(size), "rate": fps, "hold": hold}
-        self._grid = Grid(len(names), fps, start, hold=hold, patience=patience)
-        for stream, pictures in enumerate(first):
+        # Half a tick later, so that a camera at the rate of the clock may jitter by as much.
+        start = max(pictures[0].time_ns for pictures in firsts) + round(NANOSECONDS / fps / 2)
+        image = firsts[0][0].image
+        self._spec = SourceSpec(tuple(names), image.shape, str(image.dtype), (), fps, start)
+        self._about = {**about, "size": list(image.shape), "rate": fps, "hold": hold}
+        for stream, pictures in zip(self._streams, firsts, strict=True):
             before = sum(picture.time_ns <= start for picture in pictures)
             for picture in pictures[max(before - 1, 0) :]:
-                self._grid.put(stream, picture)
+                stream.put(picture, self._decided)
 
     @property
     def alignment(self) -> dict[str, dict[str, int]]:
-        """What became of each stream's pictures so far: `Counts`, and what the queue lost."""
-        counted = zip(self._spec.streams, self._grid.counts, strict=True)
+        """What became of each stream's pictures so far: `COUNTED`, and what the queue lost."""
         return {
-            name: {**counts.as_json(), "lost": self._inbox.lost(stream)}
-            for stream, (name, counts) in enumerate(counted)
+            name: {**stream.counts, "lost": self._readers.lost(number)}
+            for number, (name, stream) in enumerate(
+                zip(self._spec.streams, self._streams, strict=True)
+            )
         }
 
     def take(self, stream: int, n: int) -> Block:
@@ -151,7 +175,7 @@ class LiveSource(ForwardSource):
         """
         check_request(self._spec, 0, n)
         while len(self._ahead) < n:
-            self._ahead.append(self._next())
+            self._ahead.append(self._next_tick())
         rows = [self._ahead.popleft() for _ in range(n)]
         blocks = [
             block
@@ -167,68 +191,65 @@ class LiveSource(ForwardSource):
 
     def close(self) -> None:
         """Let go of the cameras."""
-        self._inbox.close()
+        self._readers.close()
 
-    def _next(self) -> list[Shown | None]:
+    def _next_tick(self) -> list[Shown | None]:
         """What every stream shows at the next tick, waited for."""
-        grid, inbox = self._grid, self._inbox
-        streams = range(len(self._spec.streams))
+        tick = time_of(self._tick, self._spec.fps, self._spec.start_ns)
+        deadline = tick + self._patience
         while True:
-            now = inbox.now()  # before the look: what came until then is seen
-            waiting = [stream for stream in streams if self._lacks(stream)]
-            if self._ends is not None and grid.time_ns > self._ends:
+            now = self._readers.now()  # before the look: what came until then is seen
+            waiting = [self._take_in(number, tick) for number in range(len(self._streams))]
+            if self._ends is not None and tick > self._ends:
                 raise LogExhaustedError(self._why)
-            if not waiting or now >= grid.deadline:
-                return grid.decide()
+            if not any(waiting) or now >= deadline:
+                self._tick, self._decided = self._tick + 1, tick
+                return [stream.show(tick, self._hold) for stream in self._streams]
             if self.stop():
-                raise LogExhaustedError(f"stopped while waiting for frame {grid.tick}")
-            inbox.wait(min(grid.deadline, now + _POLL))
+                raise LogExhaustedError(f"stopped while waiting for frame {self._tick}")
+            self._readers.wait(min(deadline, now + _POLL))
 
-    def _lacks(self, stream: int) -> bool:
-        """Take in what came of a stream; whether it may still show another picture at the tick."""
-        while self._grid.needs(stream):
-            why = self._inbox.over(stream)  # before the look, as above
-            picture = self._inbox.take(stream)
-            if picture is not None:
-                self._grid.put(stream, picture)
-            elif not why:
-                return True
-            else:
-                if self._ends is None:
+    def _take_in(self, number: int, tick: int) -> bool:
+        """Take in what came of a stream; whether a picture for the tick may still come."""
+        stream = self._streams[number]
+        while stream.newest <= tick:
+            why = self._readers.over(number)  # before the look, as above
+            picture = self._readers.take(number)
+            if picture is None:
+                if why and self._ends is None:
                     step = round(NANOSECONDS / self._spec.fps)
-                    self._ends, self._why = self._grid.newest(stream) + step, why
-                return False
+                    self._ends, self._why = stream.newest + step, why
+                return not why
+            stream.put(picture, self._decided)
         return False
 
-    def _first(self, names: Sequence[str], measure: bool) -> list[list[Picture]]:
+    def _first_pictures(self, names: Sequence[str], *, measure: bool) -> list[list[Picture]]:
         """The first picture of each stream, and more of the first where its rate is measured."""
-        inbox = self._inbox
+        readers = self._readers
         found: list[list[Picture]] = [[] for _ in names]
-        deadline = inbox.now() + round(START * NANOSECONDS)
+        deadline = readers.now() + round(START * NANOSECONDS)
         while True:
-            now = inbox.now()
-            wanted = []
-            for stream, pictures in enumerate(found):
-                stated = stream or not measure or inbox.rate(stream)
-                while len(pictures) < (1 if stated else _MEASURED):
-                    why = inbox.over(stream)
-                    picture = inbox.take(stream)
-                    if picture is None:
-                        if why and not pictures:
-                            raise UsageError(why)
-                        if not why:
-                            wanted.append(names[stream])
-                        break
+            now = readers.now()
+            missing = []
+            for number, pictures in enumerate(found):
+                why = readers.over(number)
+                measured = measure and not number and not readers.rate(number)
+                wanted = _MEASURED if measured else 1
+                while len(pictures) < wanted and (picture := readers.take(number)):
                     pictures.append(picture)
-            if not wanted:
+                if why and not pictures:
+                    raise UsageError(why)
+                if not why and len(pictures) < wanted:
+                    missing.append(names[number])
+            if not missing:
                 return found
             if self.stop() or now >= deadline:
-                raise UsageError(f"{wanted[0]} shows no picture: look at the camera and its name")
-            inbox.wait(min(deadline, now + _POLL))
+                raise UsageError(f"{missing[0]} shows no picture: look at the camera and its name")
+            readers.wait(min(deadline, now + _POLL))
 
     def _rate(self, pictures: Sequence[Picture]) -> float:
-        stated = self._inbox.rate(0)
-        if stated:
+        """Pictures a second of the first camera, stated or measured."""
+        if stated := self._readers.rate(0):
             return stated
         steps = np.diff([picture.time_ns for picture in pictures])
         if not len(steps) or np.median(steps) <= 0:

@@ -1,20 +1,38 @@
-"""Streams that show as much as is asked for: iterators of frames, one step at a time together."""
+"""Streams that show as much as is asked for: arrays of the caller's, and Gymnasium's environments.
+
+They are iterators of frames, one step at a time together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
-from itertools import islice
-from typing import Any
+import importlib
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from itertools import chain, islice
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from PIL import Image
 
+from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, check_request, freeze
 from cdmisfa.core.clock import START_NS
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
+from recorder.images.frames import COLOR_RECIPE
+from recorder.images.framing import Fit, Size, framings
+from recorder.images.pixels import RECIPE
 
-Step = tuple[Sequence[Any], NDArray[np.float64]]
+LARGEST_SEED: Final = 2**31 - 1
+
+FPS: Final = 30.0
+"""Frames a second of an environment that states no rate."""
+
+Step = tuple[Sequence[Any], FloatArray]
 """The frame of each stream, and what the world knows at it, (D,) float64."""
+
+Policy = Callable[[Any], Any]
+"""Gives the action for an observation."""
 
 
 class SteppedSource(ForwardSource):
@@ -76,8 +94,6 @@ class ArraySource(SteppedSource):
     ) -> None:
         if not streams:
             raise UsageError("no stream given: name one at least")
-        lengths = [len(s) if isinstance(s, Sized) else None for s in streams.values()]
-        known = [length for length in lengths if length is not None]
         shown = {name: iter(frames) for name, frames in streams.items()}
         firsts = {name: as_array(next(frames, ())) for name, frames in shown.items()}
         for name, first in firsts.items():
@@ -87,34 +103,176 @@ class ArraySource(SteppedSource):
                     "width) of uint8 or (I,) of float64"
                 )
         first = next(iter(firsts.values()))
-        spec = SourceSpec(
-            tuple(streams),
-            first.shape,
-            str(first.dtype),
-            fps=fps,
-            start_ns=start_ns,
-            length=min(known) if len(known) == len(lengths) else None,
-        )
-        steps = [_checked(name, firsts[name], frames, spec) for name, frames in shown.items()]
-        nothing = np.empty(0)
-        super().__init__(spec, ((frames, nothing) for frames in zip(*steps, strict=False)))
+        known = [len(frames) for frames in streams.values() if isinstance(frames, Sized)]
+        length = min(known) if len(known) == len(streams) else None
+        dtype = str(first.dtype)
+        spec = SourceSpec(tuple(streams), first.shape, dtype, (), fps, start_ns, length)
+        alike = [_checked(n, chain([firsts[n]], frames), spec) for n, frames in shown.items()]
+        super().__init__(spec, ((frames, np.empty(0)) for frames in zip(*alike, strict=False)))
 
     def describe(self) -> Mapping[str, Any]:
         """That the frames are the caller's."""
         return {"kind": "arrays", "streams": list(self._spec.streams)}
 
 
-def _checked(name: str, first: Any, frames: Iterator[Any], spec: SourceSpec) -> Iterator[Any]:
-    """The frames of a stream, the first of which was looked at."""
-    frame = first
-    while True:
+def _checked(name: str, frames: Iterable[Any], spec: SourceSpec) -> Iterator[Any]:
+    """The frames of a stream, all of one size and type."""
+    for frame in map(as_array, frames):
         if frame.shape != spec.frame_shape or frame.dtype != spec.dtype:
             raise UsageError(
                 f"{name} shows {frame.dtype} of shape {frame.shape}, not {spec.dtype} of "
                 f"{spec.frame_shape} as the first stream does: give frames of one size and type"
             )
         yield frame
-        try:
-            frame = as_array(next(frames))
-        except StopIteration:
-            return
+
+
+class GymSource(SteppedSource):
+    """Environments that render, one a stream, stepped together; the same seed shows the same.
+
+    An episode that ends is followed by another.
+
+    Args:
+        tasks: the environments' ids, or environments made with `render_mode="rgb_array"`.
+        names: of the streams; by default the ids.
+        size: (height, width) of a frame; by default `default_size` of the first's pictures.
+        fit: how pictures of another aspect ratio become frames: see `fitted`.
+        fps: frames a second; by default as the first environment states.
+        seed: of the environments and of random actions.
+        policy: gives the action for an observation; by default actions are random.
+        hold: frames for which an action is kept.
+        color: show red, green and blue beside one another.
+
+    Raises:
+        UsageError: Gymnasium is missing, or there is no such environment.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[Any],
+        *,
+        names: Sequence[str] | None = None,
+        size: Size | None = None,
+        fit: Fit = "crop",
+        fps: float | None = None,
+        seed: int = 0,
+        policy: Policy | None = None,
+        hold: int = 1,
+        color: bool = False,
+    ) -> None:
+        self._environments = environments = [
+            make_environment(task) if isinstance(task, str) else task for task in tasks
+        ]
+        tasks = [str(getattr(e.spec, "id", e)) for e in environments]
+        names = tuple(names or tasks)
+        counts = [_numbers(e.observation_space) for e in environments]
+        truth = tuple(
+            f"{re.sub(r'[^0-9A-Za-z]', '_', name)}_{i}"
+            for name, count in zip(names, counts, strict=True)
+            for i in range(count)
+        )
+        fps = float(fps or environments[0].metadata.get("render_fps") or FPS)
+        shown = np.asarray if color else gray_picture
+        generators = [np.random.default_rng([seed, i]) for i in range(len(environments))]
+        played = [
+            play(e, rng, hold, policy) for e, rng in zip(environments, generators, strict=True)
+        ]
+
+        def step(seen: Sequence[Any]) -> Step:
+            known = [np.ravel(o) for o, count in zip(seen, counts, strict=True) if count]
+            pictures = [shown(e.render()) for e in environments]
+            return pictures, np.concatenate([*known, np.empty(0)]).astype(np.float64)
+
+        steps = map(step, zip(*played, strict=True))
+        first = next(steps)
+        made = framings(first[0], size, fit, color=color)
+        frames = (
+            ([f.frame(picture) for f, picture in zip(made, pictures, strict=True)], values)
+            for pictures, values in chain([first], steps)
+        )
+        spec = SourceSpec(names, made[0].shape, "uint8", truth, fps, START_NS)
+        super().__init__(spec, frames)
+        self._about = {
+            "kind": "gym",
+            "tasks": tasks,
+            "seed": seed,
+            "policy": "random" if policy is None else "given",
+            "hold": hold,
+            "size": list(spec.frame_shape),
+            "fit": fit,
+            "rate": fps,
+            "recipe": COLOR_RECIPE if color else RECIPE,
+        }
+
+    def describe(self) -> Mapping[str, Any]:
+        """The environments, their seed, and how they were played."""
+        return self._about
+
+    def close(self) -> None:
+        """Close the environments."""
+        for environment in self._environments:
+            environment.close()
+
+
+def play(
+    environment: Any, rng: np.random.Generator, hold: int, policy: Policy | None = None
+) -> Iterator[Any]:
+    """An environment's observations, step by step, for ever.
+
+    Args:
+        environment: reset here.
+        rng: gives its seed, and that of random actions.
+        hold: steps for which an action is kept.
+        policy: gives the action for an observation; by default actions are random.
+    """
+    seen, _ = environment.reset(seed=int(rng.integers(LARGEST_SEED)))
+    environment.action_space.seed(int(rng.integers(LARGEST_SEED)))
+    t = 0
+    while True:
+        if t % hold == 0:
+            action = environment.action_space.sample() if policy is None else policy(seen)
+        seen, _, ended, cut, _ = environment.step(action)
+        if ended or cut:
+            seen, _ = environment.reset()
+        yield seen
+        t += 1
+
+
+def make_environment(task: str, **options: Any) -> Any:
+    """Make an environment that renders, of Gymnasium's own or of Atari's.
+
+    Args:
+        task: its id.
+        options: its own.
+
+    Raises:
+        UsageError: Gymnasium is missing, or there is no such environment.
+    """
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame needs no screen
+    gymnasium = _package("gymnasium", "gym")
+    if task.startswith("ALE/"):
+        ale = _package("ale_py", "arena")
+        ale.ALEInterface.setLoggerMode(ale.LoggerMode.Error)
+        gymnasium.register_envs(ale)
+    try:
+        return gymnasium.make(task, render_mode="rgb_array", **options)
+    except Exception as error:  # whatever an environment raises
+        raise UsageError(f"gym:{task} cannot be made: {one_line(error)}") from None
+
+
+def gray_picture(seen: Any) -> ByteArray:
+    """A colour picture, (height, width, 3), in gray, (height, width) uint8."""
+    return np.asarray(Image.fromarray(seen).convert("L"))
+
+
+def _package(name: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        missing = f"it needs {name}, which is missing: pip install 'cdmisfa[{extra}]'"
+        raise UsageError(missing) from error
+
+
+def _numbers(space: Any) -> int:
+    """How many numbers an observation is; 0 where it is a picture, or no array."""
+    shape = getattr(space, "shape", None)
+    return int(np.prod(shape)) if shape is not None and len(shape) < 2 else 0

@@ -11,10 +11,8 @@ from urllib.parse import unquote, urlsplit
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from recorder.cameras.camera import Camera
-from recorder.cameras.framed import framed
 from recorder.cameras.live import HOLD, LiveSource
-from recorder.cameras.readers import STALL, OnLoss, Readers
+from recorder.cameras.readers import STALL, Camera, CameraFrames, OnLoss, Readers
 from recorder.config import view_names
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
@@ -132,25 +130,17 @@ def open_live(
     Raises:
         UsageError: a word names nothing, a package is missing, or a camera cannot be opened.
     """
-    names = stream_names(words)
-    if any(word.startswith("gym:") for word in words):
-        return _simulated(words, names, options)
+    names = live_names(words)
     schemes = [word.partition(":")[0].lower() for word in words]
+    if "gym" in schemes:
+        return _simulated(words, names, options)
     kinds = [CAMERAS[scheme] for scheme in schemes]
-    for kind, word in zip(kinds, words, strict=True):
-        if options.fields and "fields" not in kind.takes:
-            raise UsageError(f"{word} {_NO_FIELDS}")
-        if options.color and "color" not in kind.takes:
-            raise UsageError(f"{word} shows gray images: leave out --color")
-    if options.depth is not None and not any("depth" in kind.takes for kind in kinds):
-        raise UsageError(f"{words[0]} {_NO_DISTANCES}")
+    _refuse_vain(words, [kind.takes for kind in kinds], options)
     told = {"depth": options.depth, "fields": options.fields, "color": options.color, "say": say}
-    opened = [
+    cameras = [
         kind.open(word, name, **{key: told[key] for key in kind.takes})
         for kind, word, name in zip(kinds, words, names, strict=True)
     ]
-    cameras = framed(opened, options.size, options.fit, color=options.color, say=say)
-    inbox = Readers(cameras, on_loss=options.on_loss, stall=options.stall, say=say)
     about: dict[str, Any] = {
         "cameras": [dict(camera.describe()) for camera in cameras],
         "recipe": "; ".join(dict.fromkeys(kind.recipe for kind in kinds)),
@@ -164,9 +154,11 @@ def open_live(
         about[PACKAGES] = packages
     if options.depth is not None:
         about["range_metres"] = list(options.depth)
-    source = LiveSource(inbox, names, about, rate=options.rate, hold=options.hold, stop=stop)
+    frames = CameraFrames(names, options.size, options.fit, color=options.color, say=say)
+    readers = Readers(cameras, frames.frame, on_loss=options.on_loss, stall=options.stall, say=say)
+    source = LiveSource(readers, names, about, rate=options.rate, hold=options.hold, stop=stop)
     may_show = [
-        "depth" in kind.takes and camera.distances is not False
+        "depth" in kind.takes and getattr(camera, "distances", None) is not False
         for kind, camera in zip(kinds, cameras, strict=True)
     ]
     if options.depth is not None and not any(may_show):
@@ -175,20 +167,30 @@ def open_live(
     return source
 
 
+def _refuse_vain(
+    words: Sequence[str], takes: Sequence[Sequence[str]], options: LiveOptions
+) -> None:
+    """Refuse options that what words name cannot heed, given those that each takes."""
+    for word, taken in zip(words, takes, strict=True):
+        if options.fields and "fields" not in taken:
+            raise UsageError(f"{word} {_NO_FIELDS}")
+        if options.color and "color" not in taken:
+            raise UsageError(f"{word} shows gray images: leave out --color")
+    if options.depth is not None and not any("depth" in taken for taken in takes):
+        raise UsageError(f"{words[0]} {_NO_DISTANCES}")
+
+
 def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions) -> FrameSource:
     """Simulated tasks on one clock."""
-    from recorder.cameras.gym import GymSource
+    from recorder.cameras.stepped import GymSource
 
-    if not all(word.startswith("gym:") for word in words):
+    if any(word.partition(":")[0].lower() != "gym" for word in words):
         raise UsageError(
             "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
         )
-    if options.fields:
-        raise UsageError(f"{words[0]} {_NO_FIELDS}")
-    if options.depth is not None:
-        raise UsageError(f"{words[0]} {_NO_DISTANCES}")
+    _refuse_vain(words, [("color",)] * len(words), options)
     return GymSource(
-        [word.removeprefix("gym:") for word in words],
+        [word.partition(":")[2] for word in words],
         names=names,
         size=options.size,
         fit=options.fit,
@@ -198,7 +200,7 @@ def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions)
     )
 
 
-def stream_names(words: Sequence[str]) -> tuple[str, ...]:
+def live_names(words: Sequence[str]) -> tuple[str, ...]:
     """A name for each stream, that can be one of a file: rtsp://host/left is left."""
     return view_names([_stream_of(word) for word in words])
 

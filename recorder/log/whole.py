@@ -17,9 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cdmisfa.core.errors import LogWriteError, UsageError
-
-PARTIAL = ".partial"
-"""Ending of what is being written, or whose writing was cut short."""
+from recorder.mcap.store import PARTIAL
 
 
 def partial_path(path: Path) -> Path:

@@ -33,10 +33,7 @@ from mcap.records import (
 )
 
 from recorder.config import Compression
-from recorder.mcap.checksum import crc32
-
-MAGIC: Final = b"\x89MCAP0\r\n"
-"""What a file begins and ends with."""
+from recorder.mcap.records import MAGIC, crc32
 
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; the data follow."""

@@ -12,10 +12,10 @@ from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.framing import Size
 from recorder.images.pixels import MalformedImage, Shown
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.alignment import Times, even_times, step_of
 from replay.camera_logs.formats.table import TableNumbers
 from replay.camera_logs.stream import ImagesOf, ImageStream, sorted_times
-from replay.mcap.records import MalformedRecord
 from replay.storage.location import Location
 
 Found = TypeVar("Found")

@@ -16,10 +16,10 @@ from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream, NothingLoggedError
 from replay.camera_logs.video_messages import in_order
-from replay.mcap.identity import log_identity
 from replay.storage.identity import FilesIdentity, Identity
 from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
+from replay.storage.log_identity import log_identity
 
 
 def open_images(

@@ -7,8 +7,8 @@ from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.images.pixels import MalformedImage, Shown
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImagesOf, ImageStream, UnreadableError
-from replay.mcap.records import MalformedRecord
 
 BROKEN = (MalformedImage, MalformedRecord, UnreadableError)
 """What is raised of one image, behind which there may be whole ones."""

@@ -8,8 +8,8 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.frames import VIDEO_RECIPE
 from recorder.images.pixels import MalformedImage, Shown
 from recorder.images.videos import VideoPackets
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImagesOf, ImageStream
-from replay.mcap.records import MalformedRecord
 
 
 class VideoMessages(ImagesOf):

@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import UsageError
+from recorder.mcap.reader import LogReader
 from replay.camera_logs.catalogue import ALL
 from replay.camera_logs.opening import only_foreign
 from replay.camera_logs.options import CameraOptions
 from replay.camera_logs.source import ForeignSource, UnequalError
-from replay.mcap.identity import starts_as_log
-from replay.mcap.reader import LogReader
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
 from replay.storage.location import Location, Url
+from replay.storage.log_identity import starts_as_log
+from replay.storage.opening import open_store
 
 Logged = RecordedSource | ForeignSource
 """Frames from logs."""
@@ -132,7 +133,7 @@ def refuse_what_is_no_log(path: Location) -> None:
 def _refuse_remote_run(path: Location) -> None:
     """Refuse a run behind a URL, once it is known to be no recording."""
     if isinstance(path, Url) and not path.folder:
-        with LogReader(path) as reader:
+        with LogReader(open_store(path)) as reader:
             if any(record.name == RUN_METADATA for record in reader.metadata):
                 raise _a_run(path)
 

@@ -9,6 +9,6 @@ __getattr__, __dir__, __all__ = exports(
         "replay.integrity.verify": "LogCheck check_log",
         "replay.integrity.recover": "Recovery recover_log",
         "replay.integrity.survey": "kind_of",
-        "replay.mcap.segments": "Problem",
+        "recorder.mcap.records": "Problem",
     },
 )

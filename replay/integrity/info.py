@@ -10,18 +10,18 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.untrusted.memory import parse_json
+from recorder.mcap.reader import Check, LogReader
+from recorder.mcap.records import Channel, Problem
 from replay.camera_logs.catalogue import channels_of
 from replay.camera_logs.opening import only_foreign
 from replay.inputs.words import places
 from replay.integrity.survey import SCHEMA, Crc, Kind, survey
-from replay.mcap.reader import Check, LogReader
-from replay.mcap.records import Channel
-from replay.mcap.segments import Problem
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
 from replay.runs.messages import missing
 from replay.storage.listing import log_files
 from replay.storage.location import Location
+from replay.storage.opening import open_store
 
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
@@ -128,7 +128,7 @@ def _describe_place(place: Location) -> list[LogInfo]:
 
 
 def _describe_file(path: Location) -> LogInfo:
-    with LogReader(path, salvage=True, check=_check(path)) as reader:
+    with LogReader(open_store(path), salvage=True, check=_check(path)) as reader:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
         surveyed, channels = survey(reader, decode=decode), []
         for number, found in sorted(surveyed.channels.items()):

@@ -13,14 +13,15 @@ import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.log.logfile import LogFile
-from recorder.log.whole import PARTIAL, make_folder
+from recorder.log.whole import make_folder
+from recorder.mcap.chunks import UNUSED
+from recorder.mcap.mending import mended
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Problem
+from recorder.mcap.store import PARTIAL
+from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import only_foreign
 from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
-from replay.mcap.chunks import UNUSED
-from replay.mcap.mending import mended
-from replay.mcap.reader import LogReader
-from replay.mcap.segments import Problem
-from replay.mcap.tables import MessageTable
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched, open_store
@@ -156,7 +157,7 @@ def _opened(src: Path) -> Iterator[tuple[LogReader, tuple[Problem, ...]]]:
             yield reader, ()
             return
     store = mended(open_store(src))
-    with LogReader(src, salvage=True, store=store) as reader:
+    with LogReader(store, salvage=True) as reader:
         yield reader, tuple(Problem(f"{src}: {p.where}", p.what) for p in store.mended)
 
 

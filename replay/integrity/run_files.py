@@ -11,9 +11,9 @@ from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Problem, Segment
 from replay.integrity.survey import said
-from replay.mcap.reader import LogReader
-from replay.mcap.segments import Problem, Segment
 from replay.runs.final import facts_sha256
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
 from replay.runs.log import SIGNALS_TOPIC, read_header

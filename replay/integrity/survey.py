@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from recorder.log.messages import RECORDING_METADATA
-from replay.mcap.reader import LogReader
-from replay.mcap.records import MalformedRecord
-from replay.mcap.segments import Problem, Segment
-from replay.mcap.tables import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MalformedRecord, Problem, Segment
+from recorder.mcap.tables import MessageTable
 from replay.runs.folders import RUN_METADATA
 from replay.storage.location import Location
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MalformedRecord, Problem, Segment
 from replay.camera_logs.catalogue import channels_of
 from replay.camera_logs.formats.table import is_table, table_notes
 from replay.camera_logs.opening import only_foreign, open_images
@@ -17,14 +19,11 @@ from replay.camera_logs.stream import ImageStream
 from replay.inputs.words import places
 from replay.integrity.run_files import RunPass
 from replay.integrity.survey import SCHEMA, Crc, kind_of, moved, said, survey
-from replay.mcap.reader import LogReader
-from replay.mcap.records import MalformedRecord
-from replay.mcap.segments import Problem, Segment
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.storage.listing import log_files
 from replay.storage.location import Location, location
-from replay.storage.opening import fetched
+from replay.storage.opening import fetched, open_store
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +158,7 @@ def _check_file(
     path: Location, *, beside: bool
 ) -> tuple[Crc, list[Problem], _ViewPass | RunPass | None]:
     try:
-        with LogReader(path, salvage=True, check="pass") as reader:
+        with LogReader(open_store(path), salvage=True, check="pass") as reader:
             passed = _pass_of(path, reader, beside)
             found = survey(reader, decode=True, told=passed.add if passed else lambda _: None)
             if passed:

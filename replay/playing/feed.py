@@ -21,12 +21,13 @@ from recorder.log.messages import (
     VectorEncoder,
     view_topic,
 )
+from recorder.mcap.reader import LogReader
 from replay.camera_logs.catalogue import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
-from replay.mcap.identity import starts_as_log
-from replay.mcap.reader import LogReader
 from replay.storage.listing import log_files
+from replay.storage.log_identity import starts_as_log
+from replay.storage.opening import open_store
 
 READ_AHEAD = 50
 """Frames that are read at once."""
@@ -125,7 +126,7 @@ def opened_feed(
     with contextlib.ExitStack() as stack:
         if as_they_are and all(_is_mcap(path) for path in paths):
             files = log_files(paths)
-            readers = [stack.enter_context(LogReader(file)) for file in files]
+            readers = [stack.enter_context(LogReader(open_store(file))) for file in files]
             yield LoggedFeed(readers, cameras.topics)
         else:
             yield FrameFeed(stack.enter_context(opened_source(paths, fps, cameras, about)))

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.viewfacts import ViewFacts
-from replay.mcap.reader import LogReader
-from replay.mcap.records import Channel, MalformedRecord
-from replay.mcap.segments import Segment
-from replay.mcap.tables import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Channel, MalformedRecord, Segment
+from recorder.mcap.tables import MessageTable
 
 _BATCH: Final = 64
 

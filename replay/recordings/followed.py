@@ -13,7 +13,7 @@ from typing import Any, Final
 from cdmisfa.core.blocks import Block, ClockedSource, check_request
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
 from recorder.log.begun import read_recording
-from recorder.log.whole import PARTIAL
+from recorder.mcap.store import PARTIAL
 from replay.recordings.source import RecordedSource
 from replay.storage.listing import log_files
 

@@ -11,8 +11,9 @@ from google.protobuf import message
 from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import POSE_TOPIC, RECORDING_METADATA
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.storage.listing import log_files
+from replay.storage.opening import open_store
 
 
 def head_poses(path: Path) -> dict[str, HeadPose]:
@@ -27,7 +28,7 @@ def head_poses(path: Path) -> dict[str, HeadPose]:
     """
     found: dict[str, HeadPose] = {}
     for file in log_files(path):
-        with LogReader(file) as reader:
+        with LogReader(open_store(file)) as reader:
             facts = next((r.values for r in reader.metadata if r.name == RECORDING_METADATA), {})
             pose = first_pose(reader)
         if pose is not None and "view" in facts:

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels import frames as kernels
-from replay.mcap.reader import LogReader
-from replay.mcap.records import MAX_CHUNK, Channel, MalformedRecord
-from replay.mcap.segments import Segment
-from replay.mcap.tables import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAX_CHUNK, Channel, MalformedRecord, Place, Segment
+from recorder.mcap.tables import MessageTable
 from replay.recordings.channel_rows import own_messages
-from replay.storage.location import Location
 
 Places = NDArray[np.int64]
 
@@ -48,7 +46,7 @@ class RowLayout:
     distances: Places
     width: int
 
-    def checked_ends(self, path: Location, segment: Segment, table: MessageTable) -> Places:
+    def checked_ends(self, path: Place, segment: Segment, table: MessageTable) -> Places:
         """Place after each message of the channel in its chunk, (n,), if all are laid out so.
 
         Raises:

@@ -27,11 +27,12 @@ from recorder.log.messages import (
     view_topic,
 )
 from recorder.log.viewfacts import ViewFacts
-from replay.mcap.reader import LogReader
-from replay.mcap.segments import Segment
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Segment
 from replay.recordings.channel_rows import ChannelRows
 from replay.recordings.scanner import ChunkScanner, RowLayout
 from replay.storage.location import Location
+from replay.storage.opening import open_store
 
 
 class NoRecordingError(LogDamagedError):
@@ -68,7 +69,7 @@ class ViewFile:
         self.path = path
         self._scanner: ChunkScanner | None = None
         self._passing = passing is not None
-        self.reader = passing or LogReader(path, salvage=salvage)
+        self.reader = passing or LogReader(open_store(path), salvage=salvage)
         try:
             self._open()
         except BaseException:

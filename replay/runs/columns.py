@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import NO_STATE, SIGNALS, BlockSignals, Signal
-from replay.mcap.records import MalformedRecord
+from recorder.mcap.records import MalformedRecord
 from replay.runs.messages import NUMBERS, alike, column, spans
 
 Decode = Callable[[bytes], BlockSignals]

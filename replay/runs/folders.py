@@ -10,7 +10,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import MAX_LIST
 from cdmisfa.core.untrusted.regular import read_json
 from recorder.log.whole import partial_path
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 
 RUN_FILE = "run.mcap"
 """Name of the log in a run's folder."""

@@ -15,7 +15,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.core.untrusted.memory import parse_json
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
 from replay.runs.messages import decode_keyframe, missing
 

@@ -42,7 +42,7 @@ from cdmisfa.core.signals import (
 )
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.log.messages import varint
-from replay.mcap.records import MalformedRecord
+from recorder.mcap.records import MalformedRecord
 from replay.storage.arrays import contents, stored_arrays
 
 SIGNALS_SCHEMA = "cdmisfa.BlockSignals"

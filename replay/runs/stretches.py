@@ -15,10 +15,10 @@ from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.log.whole import PARTIAL
-from replay.mcap.reader import LogReader
-from replay.mcap.records import Channel, MalformedRecord
-from replay.mcap.tables import MessageTable
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Channel, MalformedRecord
+from recorder.mcap.store import PARTIAL
+from recorder.mcap.tables import MessageTable
 from replay.runs.columns import Blocks, SignalColumns, columns_of_messages
 from replay.runs.folders import run_log
 from replay.runs.log import (

@@ -16,7 +16,7 @@ from cdmisfa.core.learning import Keyframe, Learner, Sink, weights_after
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.runs.columns import columns_of_messages
 from replay.runs.folders import FINAL_METADATA, RUN_METADATA
 from replay.runs.log import (

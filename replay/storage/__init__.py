@@ -9,6 +9,6 @@ __getattr__, __dir__, __all__ = exports(
         "replay.storage.listing": "log_files",
         "replay.storage.location": "Location Url",
         "replay.storage.opening": "open_store",
-        "replay.storage.store": "Store",
+        "recorder.mcap.store": "Store",
     },
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from replay.storage.location import Location
+from recorder.mcap.records import Place
 from replay.stored import StoredSource
 
 AT_ONCE: Final = 64 * 1024 * 1024
@@ -38,7 +38,7 @@ class Identity(ABC):
         size: bytes that `whole` reads.
     """
 
-    path: Location
+    path: Place
     size: int
 
     @abstractmethod

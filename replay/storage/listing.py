@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from recorder.log.whole import PARTIAL
+from recorder.mcap.store import PARTIAL
 from replay.storage.location import Location, Url, location
 
 

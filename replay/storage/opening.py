@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from cdmisfa.core.errors import CdmisfaError
+from recorder.mcap.store import FileStore, Store
 from replay.storage.listing import log_files
-from replay.storage.location import Location, Url
-from replay.storage.store import FileStore, Store
+from replay.storage.location import Location, Url, location
 
 
-def open_store(place: Location) -> Store:
+def open_store(place: str | Location) -> Store:
     """Open a file, or an object behind a URL.
 
     Raises:
@@ -22,6 +22,7 @@ def open_store(place: Location) -> Store:
         LogDamagedError: the server does not give it.
         CdmisfaError: what reads URLs is not installed.
     """
+    place = location(place)
     if isinstance(place, Path):
         return FileStore(place)
     from replay.storage.remote import RemoteStore

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import Final
 
+from recorder.mcap.store import Store
 from replay.storage.limits import limits
 from replay.storage.location import Url
 from replay.storage.servers import SPARE_SECONDS, Part, RemoteError, connect, refusal
-from replay.storage.store import Store
 from replay.storage.tries import Again, patiently
 
 EDGE_BYTES: Final = 64 * 1024
@@ -31,9 +31,12 @@ _AT_ONCE: Final = 16
 class RemoteStore(Store):
     """An object on a server, read part by part; `tag` names its version (ETag or date)."""
 
+    remote = True
+
     def __init__(self, url: Url) -> None:
         """Look for the object and read its beginning; errors as those of `open_store`."""
         super().__init__(url)
+        self._url = url
         self._server, self._limits = connect(url), limits()
         self._parts: OrderedDict[int, bytes] = OrderedDict()
         self._begins: list[int] = []
@@ -144,9 +147,9 @@ class RemoteStore(Store):
         try:
             return future.result(self._limits.of(stop - start) + SPARE_SECONDS)
         except Again as error:
-            raise refusal(self.path, error.__cause__ or error) from None
+            raise refusal(self._url, error.__cause__ or error) from None
         except Exception as error:
-            raise refusal(self.path, error) from None
+            raise refusal(self._url, error) from None
 
     def _checked(self, part: Part, start: int, stop: int) -> bytes:
         if (part.total, part.tag) != (self.size, self.tag):

@@ -39,9 +39,9 @@ from recorder.images.reading import MessageKind
 from recorder.images.videos import VideoPackets
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
 from replay.export.lerobot import write_lerobot
-from replay.mcap.records import MalformedRecord
 from replay.recordings.source import RecordedSource
 from replay.runs.final import facts_sha256
 from replay.runs.folders import REQUEST, RUN_JSON, read_run_json

@@ -187,7 +187,7 @@ def _chunk_parts(content: bytes) -> tuple[bytes, int, str, bytes]:
 
 
 def _inner(content: bytes) -> list[Record]:
-    from replay.mcap.compression import Decompressor
+    from recorder.mcap.compression import Decompressor
 
     _, size, name, stored = _chunk_parts(content)
     records = np.empty(size, np.uint8)

@@ -17,11 +17,11 @@ import numpy as np
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import CdmisfaError
+from recorder.mcap.reader import LogReader, Message
+from recorder.mcap.records import MAX_CHUNK
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
-from replay.mcap.reader import LogReader, Message
-from replay.mcap.records import MAX_CHUNK
 from replay.recordings.channel_rows import own_messages
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap.chunks import Chunks
-from replay.mcap.data_section import DataSection
-from replay.mcap.reader import LogReader
-from replay.mcap.segments import Segment
+from recorder.mcap.chunks import Chunks
+from recorder.mcap.data_section import DataSection
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Segment
 from tools.fuzz import decoders, guided, logs, mutations, oracle
 
 CASES = 10_000

@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.runs.log import SIGNALS_TOPIC
 
 from .commands import ERRORS, LIMIT, UNCLEAR, Fork, Process, Ran, here, until

@@ -25,7 +25,7 @@ from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.experiments.resume import log_to_resume
 from cdmisfa.experiments.store import read_rows
 from recorder.log.resume import frames_held
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON
 from replay.runs.log import read_keyframe
 from replay.runs.modules import load_modules

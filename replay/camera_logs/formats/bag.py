@@ -16,6 +16,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from recorder.images.decoding import Taken, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.reading import IMAGES, MessageKind, Reading
+from recorder.mcap.records import MAX_CHUNK
 from replay.camera_logs.formats.bag_folder import plain_bag, unpacked_message
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -24,7 +25,6 @@ from replay.camera_logs.stream import (
     explained,
     sorted_times,
 )
-from replay.mcap.records import MAX_CHUNK
 
 BAGS: Final = (".bag", ".db3")
 

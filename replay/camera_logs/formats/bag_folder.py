@@ -15,8 +15,8 @@ import zstandard
 
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
+from recorder.mcap.records import MAX_CHUNK
 from replay.camera_logs.stream import explained
-from replay.mcap.records import MAX_CHUNK
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 1024 * 1024

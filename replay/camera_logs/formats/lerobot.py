@@ -17,6 +17,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
 from recorder.images.framing import Size
 from recorder.images.pixels import compressed_image
+from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.camera_logs.formats.video import VideoImages
 from replay.camera_logs.stream import (
     ChannelFacts,
@@ -25,7 +26,6 @@ from replay.camera_logs.stream import (
     explained,
     in_one_line,
 )
-from replay.mcap.records import MAX_CHUNK, MalformedRecord
 
 INFO: Final = "meta/info.json"
 PAUSE: Final = 20

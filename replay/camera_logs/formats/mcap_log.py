@@ -12,6 +12,9 @@ from cdmisfa.core.errors import UsageError
 from recorder.images.decoding import decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.reading import IMAGES, MessageKind, Reading
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Channel, MalformedRecord, Segment
+from recorder.mcap.tables import MessageTable
 from replay.camera_logs.stream import (
     MessageImages,
     NothingLoggedError,
@@ -19,11 +22,8 @@ from replay.camera_logs.stream import (
     explained,
     sorted_times,
 )
-from replay.mcap.reader import LogReader
-from replay.mcap.records import Channel, MalformedRecord
-from replay.mcap.segments import Segment
-from replay.mcap.tables import MessageTable
 from replay.storage.location import Location
+from replay.storage.opening import open_store
 
 Found = TypeVar("Found")
 
@@ -51,7 +51,7 @@ class McapImages(MessageImages):
         self._own: tuple[MessageTable | None, NDArray[np.intp]] = None, np.empty(0, np.intp)
         if reading.fields:
             self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
-        self.reader = LogReader(path, salvage=salvage)
+        self.reader = LogReader(open_store(path), salvage=salvage)
         try:
             _refuse_nothing(self.reader)
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
@@ -141,7 +141,7 @@ def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
     Raises:
         LogDamagedError: it is no MCAP file, or has nothing in it.
     """
-    with LogReader(path, salvage=True) as reader:
+    with LogReader(open_store(path), salvage=True) as reader:
         _refuse_nothing(reader)
         channels = reader.channels.values()
         found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)

@@ -22,8 +22,8 @@ from cdmisfa.core.untrusted.memory import data_bytes
 from recorder.images.frames import VIDEO_RECIPE, frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS
 from recorder.images.videos import pyav
+from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
-from replay.mcap.records import MalformedRecord
 
 VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 _NOWHERE: Final = 2**62

@@ -12,10 +12,11 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
-from replay.mcap.reader import LogReader
+from recorder.mcap.reader import LogReader
 from replay.recordings.poses import first_pose
 from replay.runs.log import RunHeader
 from replay.storage.listing import log_files
+from replay.storage.opening import open_store
 
 PRESET = (
     "the recording that it learned from is not where it was: the table, the eyes and the sizes of "
@@ -66,7 +67,7 @@ def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
     """
     data, pose = b"{}", None
     for file in log_files(path):  # the first has it, unless they are many
-        with LogReader(file) as reader:
+        with LogReader(open_store(file)) as reader:
             if own := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
                 data, pose = bytes(reader.attachment_data(own[0])), first_pose(reader)
                 break

@@ -10,9 +10,8 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
-from replay.mcap.records import MAX_CHUNK, RECORD_HEADER, MalformedRecord
-from replay.mcap.segments import Segment
-from replay.storage.store import Store
+from recorder.mcap.records import MAX_CHUNK, RECORD_HEADER, MalformedRecord, Segment
+from recorder.mcap.store import Store
 
 _FIXED: Final = struct.Struct("<BQQQQI")
 """A chunk's opcode, length, log times, size and CRC."""
@@ -76,3 +75,10 @@ def next_chunk(file: Store, at: int, stop: int) -> int | None:
                 return at + place
         at += _BLOCK
     return None
+
+
+def fitting(chunk: Segment, end: int) -> Segment:
+    """A chunk whose data must not run over the end of its record."""
+    if chunk.data_offset + chunk.stored > end:
+        raise MalformedRecord("a chunk's length is not that of its data")
+    return chunk

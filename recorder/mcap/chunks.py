@@ -16,13 +16,18 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.blocks import freeze
-from recorder.mcap.checksum import crc32
-from replay.mcap.compression import Decompressor, Memory, check_size
-from replay.mcap.records import INDEX_HEADER, MAX_CHUNK, RECORD_HEADER, MalformedRecord
-from replay.mcap.segments import Definitions, Segment
-from replay.mcap.tables import MessageTable, Spans, indexed_table, walked_table
-from replay.storage.once import OnePass
-from replay.storage.store import FileStore, Store
+from recorder.mcap.compression import Decompressor, Memory, check_size
+from recorder.mcap.records import (
+    INDEX_HEADER,
+    MAX_CHUNK,
+    RECORD_HEADER,
+    Definitions,
+    MalformedRecord,
+    Segment,
+    crc32,
+)
+from recorder.mcap.store import FileStore, OnePass, Store
+from recorder.mcap.tables import MessageTable, Spans, indexed_table, walked_table
 
 UNUSED: Final = "(the index is not used)"
 """How it ends what is said of an index that contradicts its chunk, which costs no message."""

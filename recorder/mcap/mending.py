@@ -14,14 +14,19 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from cdmisfa.core.arrays import ByteArray
-from recorder.mcap.checksum import crc32
-from replay.mcap.compression import Decompressor, check_size
-from replay.mcap.records import MESSAGE_HEADER, RECORD_HEADER, MalformedRecord
-from replay.mcap.segments import Problem, Segment
-from replay.mcap.summary import stated_chunks
-from replay.mcap.tables import MessageTable, walked_table
-from replay.mcap.walk import LogStructure
-from replay.storage.store import Store
+from recorder.mcap.compression import Decompressor, check_size
+from recorder.mcap.records import (
+    MESSAGE_HEADER,
+    RECORD_HEADER,
+    MalformedRecord,
+    Problem,
+    Segment,
+    crc32,
+)
+from recorder.mcap.store import Store
+from recorder.mcap.summary import stated_chunks
+from recorder.mcap.tables import MessageTable, walked_table
+from recorder.mcap.walk import LogStructure
 
 _TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _INDEX: Final = struct.Struct("<BQHI")
@@ -38,7 +43,7 @@ class MendedStore(Store):
 
     def __init__(self, store: Store) -> None:
         super().__init__(store.path)
-        self.size = store.size
+        self.size, self.remote = store.size, store.remote
         self.mended: list[Problem] = []
         self._store = store
         self._places: list[int] = []

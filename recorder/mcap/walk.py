@@ -8,25 +8,30 @@ summary claims is compared with what was found.
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 from typing import Final
 
 from mcap.opcode import Opcode
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.writer import MAGIC
-from replay.mcap.compression import check_size
-from replay.mcap.records import (
+from recorder.mcap.compression import check_size
+from recorder.mcap.records import (
+    MAGIC,
     MAX_CHUNK,
     MAX_DEFINITION,
     RECORD_HEADER,
+    Attachment,
+    Definitions,
     Fields,
+    IndexPart,
     MalformedRecord,
+    Metadata,
+    Refuse,
+    Segment,
     no_log,
 )
-from replay.mcap.resync import leave_chunks, next_chunk, own_end, stands
-from replay.mcap.segments import Attachment, Definitions, IndexPart, Metadata, Refuse, Segment
-from replay.mcap.summary import (
+from recorder.mcap.resync import fitting, leave_chunks, next_chunk, own_end, stands
+from recorder.mcap.store import Store
+from recorder.mcap.summary import (
     Summary,
     definition,
     header_at,
@@ -34,7 +39,6 @@ from replay.mcap.summary import (
     stated_segments,
     stated_spans,
 )
-from replay.storage.store import Store
 
 LOOSE_BYTES: Final = 1024 * 1024
 """Messages outside chunks are read about this many bytes at once."""
@@ -137,7 +141,7 @@ class LogStructure:
             for start, stop in stated_spans(summary, Opcode.METADATA_INDEX):
                 self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord as error:
-            if not isinstance(self._file.path, Path):
+            if self._file.remote:
                 self._refuse("summary", str(error))  # of a file a walk says more
             self._at, self.data_crc = len(MAGIC), None
             self.metadata, self._metadata_bytes = [], 0
@@ -249,7 +253,7 @@ class LogStructure:
 
     def _chunk(self, content: int, length: int) -> Segment:
         head = self._file.peek(content, min(length, _CHUNK_HEADER))
-        return _fitting(Segment.of_chunk(self._at, head), content + length)
+        return fitting(Segment.of_chunk(self._at, head), content + length)
 
     def _cut_chunk(self, content: int, length: int, limit: int) -> None:
         try:
@@ -261,7 +265,7 @@ class LogStructure:
         if length == _OPEN_LENGTH:
             tail.size, tail.crc = MAX_CHUNK, 0
         else:
-            _fitting(tail, content + length)
+            fitting(tail, content + length)
         tail.stored, tail.cut = limit - tail.data_offset, True
         self.tail = tail
 
@@ -391,10 +395,3 @@ class LogStructure:
         for what, (said, there) in found.items():
             if said != there:
                 self._refuse("statistics of the summary", f"{said} {what} stated, {there} there")
-
-
-def _fitting(chunk: Segment, end: int) -> Segment:
-    """A chunk whose data must not run over the end of its record."""
-    if chunk.data_offset + chunk.stored > end:
-        raise MalformedRecord("a chunk's length is not that of its data")
-    return chunk

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
-from recorder.mcap.writer import MAGIC
-from replay.mcap.reader import LogReader
-from replay.storage.identity import ByteIdentity, Counted, Identity
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAGIC
+from replay.storage.identity import PIECE, ByteIdentity, Counted, Identity, sampled
 from replay.storage.location import Url
 
 
@@ -43,7 +44,12 @@ class _LocalIdentity(ByteIdentity):
         self._data = reader.data
 
     def sample_sha256(self) -> str:
-        return self._data.sample()
+        found = hashlib.sha256()
+        for place in sampled(self.size):
+            found.update(self._data.read(place, PIECE))
+        for block in self._data.tail():
+            found.update(block)
+        return found.hexdigest()
 
     def sha256(self, counted: Counted) -> str:
         return self._data.sha256(0, counted)

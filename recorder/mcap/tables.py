@@ -13,8 +13,14 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
-from replay.mcap.records import MESSAGE_FIELDS, MESSAGE_HEADER, RECORD_HEADER, MalformedRecord, walk
-from replay.mcap.segments import Segment
+from recorder.mcap.records import (
+    MESSAGE_FIELDS,
+    MESSAGE_HEADER,
+    RECORD_HEADER,
+    MalformedRecord,
+    Segment,
+    walk,
+)
 
 MAX_MESSAGES: Final = 1 << 20
 """Most messages of a chunk that are read; their table takes some 100 bytes of each."""

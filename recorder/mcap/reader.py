@@ -1,6 +1,6 @@
 """Reading any MCAP file, strictly: whole or cut, with or without an index.
 
-`LogReader` gives every message that is there, in the order of log time (ties in file
+It gives every message that is there, in the order of log time (ties in file
 order), and never one whose checksum does not match. Memory holds a few chunks.
 """
 
@@ -15,15 +15,21 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
-from replay.mcap.chunks import CACHE_BYTES, Chunks
-from replay.mcap.data_section import DataSection
-from replay.mcap.records import MAX_CHUNK, Channel, MalformedRecord, Schema
-from replay.mcap.segments import Attachment, Message, Problem, Segment
-from replay.mcap.tables import MessageTable, in_order, within
-from replay.mcap.walk import LogStructure
-from replay.storage.location import Location, Url, location
-from replay.storage.opening import open_store
-from replay.storage.store import Store
+from recorder.mcap.chunks import CACHE_BYTES, Chunks
+from recorder.mcap.data_section import DataSection
+from recorder.mcap.records import (
+    MAX_CHUNK,
+    Attachment,
+    Channel,
+    MalformedRecord,
+    Message,
+    Problem,
+    Schema,
+    Segment,
+)
+from recorder.mcap.store import FileStore, Store
+from recorder.mcap.tables import MessageTable, in_order, within
+from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
 
@@ -58,36 +64,34 @@ class LogReader:
 
     def __init__(
         self,
-        path: str | Location,
+        log: str | Path | Store,
         *,
         salvage: bool = False,
         cache_bytes: int = CACHE_BYTES,
         check: Check | None = None,
-        store: Store | None = None,
     ) -> None:
-        """Open a file or URL.
+        """Open a log.
 
         Args:
-            path: of the log.
+            log: path of a file, or what has its bytes, which is closed with the reader.
             salvage: leave out what is damaged.
             cache_bytes: of decoded chunks that are kept.
             check: "chunks" believes a summary that accounts for every message; "data" looks at
                 every record of a file and at the checksum over its data, "pass" leaves the latter
                 to `one_pass`. By default "chunks", with `salvage` "data"; of a URL "chunks".
-            store: what has its bytes, closed with the reader; by default it is opened.
 
         Raises:
             UsageError: it cannot be opened.
             LogDamagedError: not an MCAP file, or its structure is damaged.
         """
-        self.path = location(path)
         self.salvage = salvage
         self.problems: list[Problem] = []
         self._failed: set[int] = set()
         self._defined, self._searched = 0, False
-        self._file = store or open_store(self.path)
+        self._file = log if isinstance(log, Store) else FileStore(Path(log))
+        self.path = self._file.path
         try:
-            remote = isinstance(self.path, Url)
+            remote = self._file.remote
             check = check or ("data" if salvage else "chunks")
             by_index = remote or check == "chunks"
             found = LogStructure(self._file, self._refuse, by_index=by_index, resync=salvage)
@@ -159,8 +163,7 @@ class LogReader:
     def attachment_data(self, attachment: Attachment) -> bytes:
         """Read an attachment's bytes.
 
-        Raises:
-            LogDamagedError: it is larger than is read at once.
+        Raises LogDamagedError where it is larger than is read at once.
         """
         if attachment.size > MAX_CHUNK:
             raise LogDamagedError(
@@ -171,7 +174,7 @@ class LogReader:
 
     def digest(self) -> str:
         """SHA-256 of the file, checked as it is read; of a URL opened by index of its end."""
-        remote = self.by_index and isinstance(self.path, Url)
+        remote = self.by_index and self._file.remote
         return self.data.sha256(self._structure.data_end if remote else 0)
 
     def confirm(self) -> None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.checksum import crc32
-from recorder.mcap.writer import MAGIC
-from replay.mcap.summary import FOOTER_BYTES
-from replay.mcap.walk import DATA_END_BYTES, LogStructure
-from replay.storage.identity import PIECE, Counted, sampled
-from replay.storage.location import Url
-from replay.storage.store import Store
+from recorder.mcap.records import MAGIC, crc32
+from recorder.mcap.store import Store
+from recorder.mcap.summary import FOOTER_BYTES
+from recorder.mcap.walk import DATA_END_BYTES, LogStructure
 
 _BEGINNING: Final = 64 * 1024
 """Bytes that are read of a log behind a URL before its end is known."""
@@ -33,7 +30,7 @@ class DataSection:
         self._structure = structure
         self._damaged = damaged
         self._checked = 0
-        self._remote = isinstance(file.path, Url) and structure.complete
+        self._remote = file.remote and structure.complete
         self._marks_then = self._marks() if self._remote else []
 
     def check(self, crc: int | None = None) -> None:
@@ -74,7 +71,7 @@ class DataSection:
         spans = ((0, _BEGINNING), (end, end + DATA_END_BYTES), (last, size))
         return [self._file.crc(start, stop) for start, stop in spans]
 
-    def sha256(self, start: int, counted: Counted = lambda count: None) -> str:
+    def sha256(self, start: int, counted: Callable[[int], None] = lambda count: None) -> str:
         """SHA-256 of the file from a place on, with its checksum checked where that is 0.
 
         Args:
@@ -92,16 +89,15 @@ class DataSection:
             self.check(crc)
         return sha256.hexdigest()
 
-    def sample(self) -> str:
-        """SHA-256 of a few pieces of the file, and where it was opened by its index, of that."""
-        found, file = hashlib.sha256(), self._file
-        for place in sampled(file.size):
-            found.update(file.read(place, PIECE))
-        if self._structure.by_index:
-            for block in file.blocks(self._structure.data_end, file.size):
-                found.update(block)
-        return found.hexdigest()
-
     def changed(self) -> bool:
         """Whether the file may hold something else than when it was opened."""
         return self._file.changed()
+
+    def read(self, offset: int, count: int) -> bytes:
+        """`count` bytes of the file, fewer only where it ends."""
+        return self._file.read(offset, count)
+
+    def tail(self) -> Iterator[bytes]:
+        """The bytes from its data end record on, where the file was opened by its index."""
+        if self._structure.by_index:
+            yield from self._file.blocks(self._structure.data_end, self._file.size)

@@ -11,7 +11,7 @@ import numpy as np
 import zstandard
 
 from cdmisfa.core.arrays import ByteArray
-from replay.mcap.records import MAX_CHUNK, MalformedRecord
+from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 
 _WINDOW: Final = MAX_CHUNK // 2
 """Most memory that zstd may take for its window, in bytes."""

@@ -18,20 +18,22 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
-from recorder.mcap.writer import MAGIC
-from replay.mcap.records import (
+from recorder.mcap.records import (
     INDEX_HEADER,
+    MAGIC,
     MAX_CHUNK,
     MAX_DEFINITION,
     RECORD_HEADER,
+    Definitions,
     Fields,
+    IndexPart,
     MalformedRecord,
+    Refuse,
+    Segment,
     Statistics,
     statistics,
 )
-from replay.mcap.segments import Definitions, IndexPart, Refuse, Segment
-from replay.storage.once import Excerpt
-from replay.storage.store import Store
+from recorder.mcap.store import Excerpt, Store
 
 _FIXED = RECORD_HEADER.size + 40
 """Bytes of a chunk before its records, without the name of its compression."""
