@@ -16,7 +16,7 @@ from benchmarks import foreign
 from benchmarks.report import interleaved, middle, save
 from benchmarks.report import ratio as times_ratio
 from cdmisfa.experiments.convert import convert
-from recorder.world.rendering import BLOCK
+from recorder.world.scenes import BLOCK
 from replay.camera_logs.source import ForeignSource
 
 RATE = 30.0

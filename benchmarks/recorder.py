@@ -10,8 +10,7 @@ from pathlib import Path
 
 from benchmarks.report import interleaved, middle, ratio, save
 from recorder.recording import record_scene
-from recorder.world.rendering import take_here
-from recorder.world.scenes import open_scene
+from recorder.world.scenes import open_scene, take_here
 
 
 def rendering(scene: str, frames: int) -> Callable[[], int]:

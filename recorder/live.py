@@ -17,7 +17,7 @@ from recorder.log.resume import other_recordings
 from recorder.log.split import Split
 from recorder.log.viewlog import ViewParts
 from recorder.recording import ViewRecording, check_block, identity_of, view_recording
-from recorder.world.rendering import BLOCK
+from recorder.world.scenes import BLOCK
 
 COUNTS: Final = "cdmisfa.live"
 """Name of the metadata record that says what became of a live stream's pictures."""

@@ -35,8 +35,14 @@ from recorder.log.split import Split
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewParts
 from recorder.log.whole import refuse_taken, refuse_unless_png, whole
-from recorder.world.rendering import render_in_processes, take_here
-from recorder.world.scenes import SCENES, OpenScene, open_scene, scene_of
+from recorder.world.scenes import (
+    SCENES,
+    OpenScene,
+    open_scene,
+    render_in_processes,
+    scene_of,
+    take_here,
+)
 
 MAX_JOBS = 1024
 

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 from folders import contents
 from foxglove_schemas_protobuf import RawImage_pb2
@@ -30,8 +29,7 @@ from recorder.log.whole import partial_path
 from recorder.recording import RecordingStoppedError, record, record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
-from recorder.world.rendering import BLOCK, requests
-from recorder.world.scenes import SCENES, open_scene
+from recorder.world.scenes import BLOCK, SCENES, open_scene, requests
 
 ROOT = Path(__file__).parent.parent
 STREAMS = ("x1", "x2", "x3")
@@ -424,9 +422,9 @@ def recorder(tmp_path):
     wait_for(
         lambda: sum(p.stat().st_size for p in folder.glob("*.partial")) >= 1 << 17, 60, process
     )
-    children = psutil.Process(process.pid).children()
+    commands = {n: Path(f"/proc/{n}/cmdline").read_text() for n in children(process)}
     with process:
-        yield process, [c.pid for c in children if "spawn_main" in " ".join(c.cmdline())]
+        yield process, [pid for pid, command in commands.items() if "spawn_main" in command]
         process.kill()
 
 
@@ -468,11 +466,17 @@ def test_rendering_processes_end_with_their_killed_parent(tmp_path):
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     process.stdout.readline()
-    children = [child.pid for child in psutil.Process(process.pid).children()]
-    assert len(children) >= 2
+    rendering = children(process)
+    assert len(rendering) >= 2
     process.kill()
     process.communicate()
-    wait_for(lambda: not any(running(child) for child in children), 20)
+    wait_for(lambda: not any(running(child) for child in rendering), 20)
+
+
+def children(process):
+    """The processes that any thread of a process started."""
+    listed = Path(f"/proc/{process.pid}/task").glob("*/children")
+    return [int(word) for path in listed for word in path.read_text().split()]
 
 
 def running(pid: int) -> bool:

@@ -19,7 +19,8 @@ from replay.camera_logs.options import CameraOptions
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE
-from replay.runs.log import read_header, read_keyframe
+from replay.runs.keyframes import read_keyframe
+from replay.runs.log import read_header
 from replay.storage.location import location
 
 COMMAND = "command"

@@ -25,12 +25,11 @@ from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.command import read_command, source_of
 from cdmisfa.experiments.resume import config_history, reconfigured, restore
 from replay.runs.columns import SignalColumns, columns_of_records
-from replay.runs.compare import Difference, differing, first_of
-from replay.runs.final import other_files, stated_source
+from replay.runs.compare import Difference, differing, first_differing
 from replay.runs.folders import run_log
-from replay.runs.log import RunHeader, read_header, read_keyframe, read_keyframes
-from replay.runs.messages import arrays_of
-from replay.runs.stretches import read_columns
+from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
+from replay.runs.log import RunHeader, read_columns, read_header
+from replay.runs.run import other_files, stated_source
 
 SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
 """What a source must have in common with the one that a run learned from."""
@@ -202,7 +201,7 @@ class Recomputation:
         Args:
             stop: the iteration.
             keyframes: that are compared, too.
-            rounding: see `first_of`.
+            rounding: see `first_differing`.
         """
         left = iter(keyframes)
         at, kept = self.learner.iteration, next(left, None)
@@ -216,7 +215,7 @@ class Recomputation:
                         other = other or self._difference_from(kept, rounding)
                         kept = next(left, None)
             learned = columns_of_records(records)
-            found = first_of(iter([logged]), learned, self.header.schema, at, rounding)
+            found = first_differing(iter([logged]), learned, self.header.schema, at, rounding)
             at += len(logged)
             both = [one for one in (found, other) if one is not None]
             if both:

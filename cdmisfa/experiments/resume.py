@@ -20,9 +20,9 @@ from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
 from cdmisfa.experiments.command import COMMAND, SET_ASIDE, log_to_resume, read_command
 from cdmisfa.experiments.sources import CLOCK
 from recorder.world.scenes import SCENES
-from replay.runs.final import known_to_both, stated_source
-from replay.runs.log import read_header, read_keyframe
-from replay.runs.stretches import read_columns
+from replay.runs.keyframes import read_keyframe
+from replay.runs.log import read_columns, read_header
+from replay.runs.run import known_to_both, stated_source
 
 if TYPE_CHECKING:
     from cdmisfa.experiments.recompute import Recomputation

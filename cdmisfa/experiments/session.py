@@ -51,8 +51,8 @@ from cdmisfa.experiments.run_folder import (
 from cdmisfa.experiments.sources import versions_used
 from recorder.log.folder import folder_here
 from recorder.log.whole import partial_path
-from replay.runs.final import states_whole
 from replay.runs.folders import RUN_FILE, run_log
+from replay.runs.run import states_whole
 
 if TYPE_CHECKING:
     from replay.viewer.live import LiveView

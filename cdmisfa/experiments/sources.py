@@ -14,8 +14,10 @@ from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, par
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import versions
-from recorder.cameras.words import PACKAGES, LiveOptions, is_live, open_live
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.words import PACKAGES, is_live, open_live
 from recorder.config import RecordConfig, SceneConfig
+from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, open_scene, scene_of
 from replay.camera_logs.options import CameraOptions
 
@@ -274,7 +276,7 @@ def open_source(
     return source, configuration
 
 
-def is_scene(words: Sequence[str | Path], cameras: CameraOptions | None = None) -> bool:
+def is_scene(words: Sequence[str | Path], cameras: ImageOptions | None = None) -> bool:
     """Whether words name a live scene, which no options of cameras are for.
 
     Raises:
@@ -348,7 +350,7 @@ def open_cameras_now(
     words: Sequence[str | Path],
     live: LiveOptions,
     *,
-    cameras: CameraOptions,
+    cameras: ImageOptions,
     preset: str | None = None,
     settings: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
@@ -375,10 +377,8 @@ def open_cameras_now(
             f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
             "and logs apart"
         )
-    framing = {
-        key: getattr(cameras, key) for key in ("size", "fit", "depth", "fields", "color", "rate")
-    }
-    theirs = CameraOptions(**framing).given()
+    framing = {field.name: getattr(cameras, field.name) for field in fields(ImageOptions)}
+    theirs = ImageOptions(**framing).given()
     if of_logs := [option for option in cameras.given() if option not in theirs]:
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     live = replace(live, **framing)

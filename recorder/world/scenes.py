@@ -1,21 +1,27 @@
-"""The scenes there are, opened by name; others are added by `SCENES.add` and by plugins."""
+"""The scenes there are, opened by name, and the blocks that they show, in order of time.
+
+Others are added by `SCENES.add` and by plugins.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import weakref
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, MutableMapping
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
-from cdmisfa.core.blocks import FrameSource, SeekableSource
+from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
 from cdmisfa.core.config import as_table
-from cdmisfa.core.errors import UsageError
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from cdmisfa.core.processes import Workers
 from cdmisfa.core.registry import Registry
 from recorder.config import RecordConfig, SceneConfig
 from recorder.world.icub.config import IcubConfig
-from recorder.world.icub.picture import scene_picture
-from recorder.world.icub.source import IcubSource
+from recorder.world.icub.source import IcubSource, scene_picture
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource
 
 if TYPE_CHECKING:
@@ -27,6 +33,16 @@ Opener = Callable[[Any, RecordConfig], SeekableSource]
 
 Only a function that can be imported can also open it in other processes.
 """
+
+
+Request = tuple[int, int, int]
+"""Stream, first frame and number of frames of a block."""
+
+BLOCK = 64
+"""Frames rendered at a time; divides `motions.CHUNK`, so no block needs two chunks."""
+
+_AHEAD = 3
+"""Blocks a process may be ahead of the writer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +103,7 @@ class OpenScene:
         return {key: v for table in (*tables, as_table(self.config)) for key, v in table.items()}
 
 
-_OPEN: dict[int, OpenScene] = {}
+_OPEN: MutableMapping[FrameSource, OpenScene] = WeakKeyDictionary()
 
 
 def open_scene(
@@ -111,11 +127,111 @@ def open_scene(
     scene = OpenScene(name, replace(config, seed=config.seed or 0), record or RecordConfig())
     source = SCENES[name].open(scene.config, scene.record)
     with contextlib.suppress(TypeError):  # a class without weak references
-        weakref.finalize(source, _OPEN.pop, id(source), None)
-        _OPEN[id(source)] = scene
+        _OPEN[source] = scene
     return source
 
 
 def scene_of(source: FrameSource) -> OpenScene | None:
     """What `open_scene` opened a source from; None for any other source."""
-    return _OPEN.get(id(source))
+    try:
+        return _OPEN.get(source)
+    except TypeError:
+        return None
+
+
+def requests(starts: dict[int, int], frames: int) -> Iterator[Request]:
+    """All blocks still missing: by time, then by stream, so that no view gets far ahead.
+
+    Args:
+        starts: the first missing frame of each stream.
+        frames: where all streams end.
+    """
+    for low in range(0, frames, BLOCK):
+        high = min(low + BLOCK, frames)
+        for stream, start in starts.items():
+            first = max(low, start)
+            if first < high:
+                yield stream, first, high - first
+
+
+def take_here(
+    source: FrameSource, starts: dict[int, int], frames: int
+) -> Generator[Block, None, None]:
+    """The missing blocks of some streams, one after the other, from one source.
+
+    Args:
+        source: can go back, or has not yet come to any of the missing frames.
+        starts: the first missing frame of each stream.
+        frames: where all streams end.
+
+    Raises:
+        UsageError: the source cannot go back to the first missing frame.
+        LogExhaustedError: it ends before.
+    """
+    if isinstance(source, SeekableSource):
+        for request in requests(starts, frames):
+            yield from _take(source, request)
+        return
+    first = min(starts.values(), default=frames)
+    if first >= frames:
+        return
+    if source.t > first:
+        raise UsageError(
+            f"the source is at frame {source.t} and cannot go back to {first}: open it anew"
+        )
+    step = max(1, min(BLOCK, int(source.spec.fps / 2)))  # so that files grow every second
+    while source.t < frames:
+        for block in source.take_all(min(step, frames - source.t)):
+            done = starts.get(block.stream, frames) - block.t
+            if done < len(block):
+                new = slice(max(done, 0), None)
+                t = block.t + max(done, 0)
+                yield Block(block.stream, t, block.frames[new], block.truth[new])
+
+
+def render_in_processes(
+    scene: OpenScene, starts: dict[int, int], frames: int, jobs: int
+) -> Generator[Block, None, None]:
+    """The blocks of `take_here` in the same order, by `jobs` processes with a world each.
+
+    Raises:
+        CdmisfaError: a process died, or could not open the scene.
+    """
+    pending: deque[Future[list[Block]]] = deque()
+    workers = Workers(jobs, _start, (SCENES[scene.name].open, scene.config, scene.record))
+    try:
+        for request in requests(starts, frames):
+            pending.append(workers.submit(_render, request))
+            if len(pending) > _AHEAD * jobs:
+                yield from pending.popleft().result()
+        while pending:
+            yield from pending.popleft().result()
+    except BrokenProcessPool as error:
+        raise CdmisfaError(
+            "a rendering process ended: go on with --resume; if it ends again, with --jobs 1 to "
+            "see why, or with more memory"
+        ) from error
+    finally:
+        workers.close()
+
+
+_source: SeekableSource
+"""The world of a rendering process."""
+
+
+def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
+    """Open a world in a rendering process."""
+    global _source
+    _source = opener(config, record)
+
+
+def _render(request: Request) -> list[Block]:
+    return list(_take(_source, request))
+
+
+def _take(source: SeekableSource, request: Request) -> Iterator[Block]:
+    """What a stream shows of a block's frames: all, or each stretch between its gaps."""
+    stream, first, n = request
+    for low, high in source.spans(stream, first, first + n):
+        source.seek(low)
+        yield source.take(stream, high - low)

@@ -77,7 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"no results in {results}: run campaigns first")
     (chosen.out / "torture.json").write_text(json.dumps(summary, indent=1) + "\n")
     if chosen.page is not None:
-        chosen.page.write_text(page.markdown(summary))
+        data = chosen.page.with_suffix(".json")
+        data.write_text(json.dumps(summary) + "\n")
+        chosen.page.write_text(page.markdown(summary, data.name))
     print(page.short(summary))
     return 1 if summary["defects"] else 0
 

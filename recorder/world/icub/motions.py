@@ -26,7 +26,7 @@ Motion = Iterator[FloatArray]
 """Positions of one object, (CHUNK, 2), chunk after chunk."""
 
 
-def toggling(config: BoxConfig, generator: np.random.Generator) -> Motion:
+def toggling_motion(config: BoxConfig, generator: np.random.Generator) -> Motion:
     """X uniform and independent; y one of two places, changing every so many frames."""
     for t in itertools.count(0, CHUNK):
         x = _uniform(generator.random(CHUNK), config.x)
@@ -34,14 +34,14 @@ def toggling(config: BoxConfig, generator: np.random.Generator) -> Motion:
         yield np.stack([x, np.asarray(config.y)[phase]], axis=1)
 
 
-def uniform(config: CylinderConfig, generator: np.random.Generator) -> Motion:
+def uniform_motion(config: CylinderConfig, generator: np.random.Generator) -> Motion:
     """X and y uniform and independent of the frame before."""
     while True:
         units = generator.random((CHUNK, 2))
         yield np.stack([_uniform(units[:, 0], config.x), _uniform(units[:, 1], config.y)], axis=1)
 
 
-def walk(config: SphereConfig, generator: np.random.Generator) -> Motion:
+def walking_motion(config: SphereConfig, generator: np.random.Generator) -> Motion:
     """A Gaussian random walk, reflected at the borders; starts anywhere within them."""
     borders = (config.x, config.y)
     last = np.stack([_uniform(generator.random(1), limits) for limits in borders], axis=1)
@@ -110,9 +110,9 @@ class Motions:
             for i in range(3)
         )
         self._motions = (
-            toggling(self._scene.object1, box),
-            uniform(self._scene.object2, cylinder),
-            walk(self._scene.object3, sphere),
+            toggling_motion(self._scene.object1, box),
+            uniform_motion(self._scene.object2, cylinder),
+            walking_motion(self._scene.object3, sphere),
         )
         self._chunk = -1
 

@@ -81,19 +81,6 @@ class World:
         """Turn the robot's head; degrees, to the left. Only pictures from outside show it."""
         self._bullet.resetJointState(self._robot, self._neck_joint, math.radians(yaw))
 
-    @contextlib.contextmanager
-    def only(self, *, table: bool) -> Iterator[None]:
-        """Within this context just the table, or just the objects, can be seen."""
-        hidden = self._objects if table else [self._table]
-        poses = [self._bullet.getBasePositionAndOrientation(body)[0] for body in hidden]
-        for body in hidden:
-            self._move(body, _AWAY)
-        try:
-            yield
-        finally:
-            for body, pose in zip(hidden, poses, strict=True):
-                self._move(body, pose)
-
     def hide_table(self) -> None:
         """Move the table out of sight for good."""
         self._move(self._table, _AWAY)
@@ -177,6 +164,8 @@ class World:
             ),
             self._body(bullet.GEOM_SPHERE, (sphere.grey,) * 3, radius=sphere.radius),
         ]
+        for body in self._objects:  # until they are placed
+            self._move(body, _AWAY)
         self._heights = (top + box.half_size, top + cylinder.height / 2, top + sphere.radius)
 
     def _body(self, shape: int, colour: tuple[float, ...], **size: Any) -> int:
