@@ -19,7 +19,7 @@ from waiting import wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import runs_in
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view.properties import (
     properties_of,
     property_chunks,

@@ -233,7 +233,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         UsageError: there is no such tab.
         LogDamagedError: that run cannot be read.
     """
-    from replay.runs.outline import read_outline
+    from replay.runs.run import read_outline
 
     # These take half a second: only once the table is there.
     from replay.view.layouts.of_run import run_layout

@@ -12,9 +12,8 @@ from typing import Any
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, refuse_unless_png, whole
 from replay.camera_logs.source import ForeignSource
-from replay.inputs.opening import holds_run, open_to_look
-from replay.runs.log import EVENT_TOPIC, read_header
-from replay.runs.stretches import read_columns, read_stretches
+from replay.inputs import holds_run, open_to_look
+from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
 from replay.view.columns import FRAME
@@ -231,8 +230,8 @@ def _of_iteration(run: Path, iteration: int) -> int:
 def _of_event(run: Path, words: str) -> int:
     wanted = re.compile(rf"(?<!\w){re.escape(words.strip())}(?!\w)", re.IGNORECASE)
     told: list[str] = []
-    for stretch in read_stretches(run, read_header(run), topics=(EVENT_TOPIC,)):
-        for event in stretch.events:
+    for batch in read_batches(run, read_header(run), topics=(EVENT_TOPIC,)):
+        for event in batch.events:
             if wanted.search(event.text):
                 return int(event.t)
             told.append(event.text)
