@@ -8,14 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-<<<<<<< HEAD
 from replay.playing.feed import SLICE, Playback, Played, Topic, opened_messages, paced
-=======
-from replay.camera_logs.options import CameraOptions
-from replay.inputs import Logged
-from replay.playing.feed import Feed, opened_feed
-from replay.playing.pace import SLICE, Played, paced, rounds
->>>>>>> 74d69f895d375df33f7719636e623cdb828330ef
 
 HOST: Final = "127.0.0.1"
 
