@@ -56,9 +56,7 @@ FORBIDDEN = {
     "recorder.world.icub": ("recorder.log.logfile", "replay.palette", "mcap"),
     "replay": ("cdmisfa.agents.learner", "cdmisfa.features.sfa", "recorder.world.icub.world"),
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
-    "replay.camera_logs.formats": ("replay.recordings.source", "replay.runs.log", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
-    "replay.inputs": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),
     "replay.playing": (
         "cdmisfa.experiments.session",
