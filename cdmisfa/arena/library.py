@@ -22,7 +22,7 @@ from cdmisfa.core.modules import Module
 from cdmisfa.core.untrusted.regular import read_json
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.storage.arrays import read_arrays
 
 RECIPE: Final = 2
@@ -167,7 +167,7 @@ class Library:
             good = self.stream(signal.kind, seed)
             plain = Shown(good.frames, good.state)
         shown = make(name, seed, plain)
-        with whole(folder) as partial:
+        with atomic_write(folder) as partial:
             partial.mkdir(parents=True)
             np.save(partial / "frames.npy", shown.frames)
             np.save(partial / "state.npy", shown.state)
@@ -222,7 +222,7 @@ def linear(phi: FloatArray, mean: FloatArray, expansion: str, scale: float) -> M
 
 
 def _save(path: Path, found: Reference) -> None:
-    with whole(path, sync=False) as partial, open(partial, "wb") as file:
+    with atomic_write(path, sync=False) as partial, open(partial, "wb") as file:
         np.savez(
             file,
             slowness=found.slowness,

@@ -18,7 +18,7 @@ from cdmisfa.arena.results import write_results
 from cdmisfa.arena.sets import SETS
 from cdmisfa.arena.streams import HELD_OUT, LEARNED_FROM
 from cdmisfa.experiments.documents import markdown
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.export.figures import STYLE
 from replay.palette import CYCLE
 
@@ -128,7 +128,7 @@ def draw(document: Mapping[str, Any], folder: Path) -> list[Path]:
         shown = [lines[name] for name in learners if name in lines]
         figure.legend(shown, [x.get_label() for x in shown], loc="outside upper center", ncols=9)
         for path, metadata in zip(paths, ({"Software": None}, {"Date": None}), strict=True):
-            with whole(path) as partial:
+            with atomic_write(path) as partial:
                 figure.savefig(partial, format=path.suffix[1:], dpi=130, metadata=metadata)
     return paths
 
@@ -174,7 +174,7 @@ def write_page(folder: Path, page: Path) -> dict[str, Any]:
     figures = page.with_suffix("")
     figures.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(png, figures / png.name)
-    with whole(page) as partial:
+    with atomic_write(page) as partial:
         partial.write_text(_text(document, f"{figures.name}/{png.name}"), encoding="utf-8")
     return document
 

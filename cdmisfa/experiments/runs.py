@@ -41,8 +41,15 @@ from cdmisfa.experiments.resume import (
     take_over,
 )
 from cdmisfa.experiments.sources import versions_used
-from recorder.log.folder import folder_here, held, logs_in, refuse_existing
-from recorder.log.whole import make_folder, partial_path, refuse_special
+from recorder.log.files import (
+    folder_here,
+    held,
+    logs_in,
+    make_folder,
+    partial_path,
+    refuse_existing,
+    refuse_special,
+)
 
 if TYPE_CHECKING:
     from replay.runs.writer import RunWriter

@@ -28,7 +28,7 @@ from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.statistics import Summary, summary, wilson
 from cdmisfa.experiments.store import DONE, TrialStore, code, identity
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 
 NAMES = ("oscillatory", "five", "stability", "costs", "nonstationary", "icub", "difficulty")
 """The experiments, each a module of this package, in the order of their page."""
@@ -242,7 +242,7 @@ def reproduce(
             row, arrays = result
             point = {"id": names[i], "status": DONE, "point": planned[i], "code": version}
             store.add({**point, "result": row})
-            with whole(curves[i], sync=False) as partial, open(partial, "wb") as file:
+            with atomic_write(curves[i], sync=False) as partial, open(partial, "wb") as file:
                 np.savez_compressed(file, **cast(dict[str, Any], arrays))
             if progress is not None:
                 progress(done, len(planned))
@@ -253,7 +253,7 @@ def reproduce(
     ]
     findings = module.evaluate(trials)
     table = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
-    with whole(request.folder / "rows.parquet") as partial:
+    with atomic_write(request.folder / "rows.parquet") as partial:
         parquet.write_table(pyarrow.Table.from_pylist(table), partial)
     figures = module.draw(trials, request.folder)
     document: dict[str, Any] = plain(
@@ -273,7 +273,7 @@ def reproduce(
         }
     )
     write_json(request.folder / "results.json", document)
-    with whole(request.folder / "table.md") as partial:
+    with atomic_write(request.folder / "table.md") as partial:
         partial.write_text(markdown_table(document["table"]), encoding="utf-8")
     return document
 

@@ -241,6 +241,20 @@ class LogReader:
         for segment, table in in_order(chosen, self.table) if ordered else in_file:
             yield segment, within(table, low, high)
 
+    def undamaged(self) -> Iterator[MessageTable]:
+        """Give the messages chunk by chunk in file order, up to where the log is damaged or torn.
+
+        The reader is one with `salvage`.
+        """
+        end = self._structure.first_damage
+        for segment in self._structure.segments:
+            if end is not None and segment.offset >= end:
+                return
+            table = self.table(segment)
+            if table is None:
+                return
+            yield table
+
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Give every chunk in file order, None for one that is damaged and left out.
 

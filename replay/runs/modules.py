@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.modules import Module
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
 
@@ -42,7 +42,7 @@ def save_modules(path: Path, modules: Iterable[Module]) -> None:
     for module in modules:
         for field in dataclasses.fields(Module):
             arrays[_key(module.index, field.name)] = getattr(module, field.name)
-    with whole(Path(path)) as partial, open(partial, "wb") as file:
+    with atomic_write(Path(path)) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.storage.location import Url
 from replay.storage.opening import copied
 from replay.uploads.objects import NOTES, Stored, is_of, objects_below, put
@@ -62,7 +62,7 @@ def fetch(url: Url, local: Path, there: Mapping[str, Stored], progress: Progress
         CdmisfaError: there is no room for it.
     """
     done, total = 0, sum(stored.size for stored in there.values())
-    with whole(local) as folder:
+    with atomic_write(local) as folder:
         for rest, stored in sorted(there.items()):
             parts = rest.split("/")
             if parts[0] or {"", ".", ".."} & {*parts[1:]}:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError
-from recorder.log.whole import refuse_taken, refuse_unless_png, whole
+from recorder.log.files import atomic_write, refuse_taken, refuse_unless_png
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
 from replay.view.columns import FRAME
@@ -62,7 +62,7 @@ def screenshot(
         raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
     with view_of(path, every, all_views, tab) as view:
         png = _draw(view, frame, window)
-    with whole(out) as partial:
+    with atomic_write(out) as partial:
         partial.write_bytes(png)
 
 
@@ -104,7 +104,7 @@ def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WI
         viewer.ask(lambda client: client.open(table.address) or True)
         time.sleep(SETTLE)
         png = bytes(viewer.ask(lambda client: client.take_screenshot()))
-    with whole(out) as partial:
+    with atomic_write(out) as partial:
         partial.write_bytes(png)
 
 

@@ -28,7 +28,7 @@ from cdmisfa.core.errors import CdmisfaError, LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import open_scene

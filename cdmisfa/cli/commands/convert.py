@@ -67,7 +67,7 @@ def convert_command(
     """
     from cdmisfa.experiments.convert import convert
     from recorder.cameras.words import is_live
-    from recorder.log.folder import refuse_existing
+    from recorder.log.files import refuse_existing
     from replay.camera_logs.options import CameraOptions
     from replay.inputs.opening import open_cameras, refuse_what_is_no_log
     from replay.inputs.words import places

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from recorder.recording import ViewRecording
     from replay.camera_logs.options import CameraOptions
 
-CONVERTED = ("foreign",)
+CONVERTED = "foreign"
 """What a recording names as its source where it was converted from camera logs."""
 
 LIVE = ("cameras", "gym")
@@ -95,7 +95,7 @@ def record_command(
     """
     from cdmisfa.experiments.sources import configure, is_scene
     from recorder.cameras.words import is_live
-    from recorder.log.begun import Begun, read_recording
+    from recorder.log.manifest import RecordingStart, read_start
     from recorder.world.scenes import SCENES
     from replay.camera_logs.options import CameraOptions
 
@@ -124,17 +124,17 @@ def record_command(
         )
         return
     _refuse_logs(source)
-    begun = read_recording(out) if resume and out is not None else Begun()
-    if begun.source and begun.source[0] in LIVE:
+    start = read_start(out) if resume and out is not None else RecordingStart()
+    if start.scene in LIVE:
         raise UsageError(
             f"{out} is of live streams, which cannot go back: what is recorded can be read, record "
             "the rest into another folder"
         )
-    if begun.source == CONVERTED:
+    if start.scene == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
         raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
-    named = "".join(source or begun.source)
+    named = "".join(source) or start.scene
     is_scene([named], cameras)  # which refuses options of cameras
     if resume and out is not None and not (named or frames or given_seed or split):
         from recorder.recording import recorded
@@ -147,7 +147,7 @@ def record_command(
         where = f"{out} does not say of what it is: " if resume and out is not None else ""
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
     if not given_seed:
-        seed = begun.options.get("seed", seed)
+        seed = seed if start.seed is None else start.seed
     configuration = configure(named, preset, settings, seed)
     if scene_picture is not None:
         from recorder.recording import save_picture
@@ -160,7 +160,7 @@ def record_command(
             return
     if out is None:
         raise click.UsageError("say -o FOLDER, where the recording goes")
-    from recorder.log.split import Split
+    from recorder.config import Split
     from recorder.recording import DEFAULT_FRAMES, record_scene
 
     parts = None if split is None else Split.parse(split)
@@ -226,9 +226,9 @@ def record_streams(
 ) -> None:
     """Record live streams until there are so many frames, they end, or Ctrl-C."""
     from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.config import Split
     from recorder.live import RecordedWhileWatched, record_watched
-    from recorder.log.folder import refuse_existing
-    from recorder.log.split import Split
+    from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)

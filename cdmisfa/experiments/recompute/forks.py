@@ -17,7 +17,7 @@ from cdmisfa.experiments.recompute.check import learner_after
 from cdmisfa.experiments.resume import FORK, Fork, command_of, read_command
 from cdmisfa.experiments.runs import RunResult, run
 from cdmisfa.experiments.sources import versions_used
-from recorder.log.folder import folder_here
+from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.log import read_header
 
