@@ -22,7 +22,7 @@ from cdmisfa.experiments.resume import Keyframes, command_of
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
 from replay.runs.folders import run_log
-from replay.runs.log import KEYFRAME_TOPIC
+from replay.runs.keyframes import KEYFRAME_TOPIC
 
 FRAMES = 60_000
 MOMENTS = 15

@@ -27,8 +27,8 @@ from replay.camera_logs.formats import picture_folder
 from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json, runs_in
+from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.log import read_header
-from replay.runs.messages import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
 from replay.storage.arrays import stored_arrays
 

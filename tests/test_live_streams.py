@@ -33,8 +33,9 @@ from cdmisfa import ArraySource, GymSource
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.testing.sources import ForwardContract
+from recorder.cameras.options import LiveOptions
 from recorder.cameras.video import video_camera
-from recorder.cameras.words import LiveOptions, is_live, live_names, open_live
+from recorder.cameras.words import is_live, live_names, open_live
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_header
 

@@ -26,10 +26,10 @@ from replay.camera_logs.opening import identity_of
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import told_otherwise
-from replay.runs.final import stated_source
 from replay.runs.log import read_header
+from replay.runs.run import stated_source
 from replay.storage import identity
-from replay.storage.log_identity import log_identity
+from replay.storage.identity import log_identity
 from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)

@@ -25,8 +25,8 @@ from cdmisfa.experiments.recompute.forks import fork_run
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
 from replay.runs.compare import first_difference
-from replay.runs.log import read_header, read_keyframe
-from replay.runs.messages import encode_keyframe
+from replay.runs.keyframes import encode_keyframe, read_keyframe
+from replay.runs.log import read_header
 from replay.runs.modules import load_modules
 
 EASY = ("learner.tau=40", "learner.eta_dot_window=8", "learner.warm_up=3", "learner.delta=1.0")

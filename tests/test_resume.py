@@ -36,7 +36,7 @@ from recorder.world.oscillatory import OscillatorySource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import first_difference
 from replay.runs.folders import run_log
-from replay.runs.log import KEYFRAME_TOPIC, read_keyframe
+from replay.runs.keyframes import KEYFRAME_TOPIC, read_keyframe
 from replay.runs.writer import RunWriter
 
 CONFIG = LearnerConfig(

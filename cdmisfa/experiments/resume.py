@@ -121,7 +121,7 @@ def found_path(word: str, folder: Path) -> str:
 
 def _packages_gone(log: Path) -> str:
     """The packages of plugins that a run used and that are not installed any more."""
-    from replay.runs.log import read_keyframe
+    from replay.runs.keyframes import read_keyframe
 
     keyframe = read_keyframe(log)
     used = {} if keyframe is None else keyframe.versions
@@ -240,8 +240,8 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> 
     Returns:
         The keyframe; None where the log has none, and all begins anew.
     """
-    from replay.runs.log import read_keyframe
-    from replay.runs.stretches import read_columns
+    from replay.runs.keyframes import read_keyframe
+    from replay.runs.log import read_columns
 
     keyframe = read_keyframe(log)
     if forked_at is not None and (keyframe is None or keyframe.iteration < forked_at):
@@ -346,7 +346,7 @@ def ancestry_of(run: Path | None) -> Mapping[str, Any] | None:
 
 def stated_whole(run: Path | None) -> bool:
     """Whether a run that is to be resumed states the SHA-256 of all of a file."""
-    from replay.runs.final import stated_source, states_whole
+    from replay.runs.run import stated_source, states_whole
 
     try:
         return run is not None and states_whole(stated_source(log_to_resume(run)))
@@ -366,8 +366,8 @@ def _has_header(log: Path) -> bool:
 
 def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
     """Refuse to resume with another configuration, seed or source, naming the first difference."""
-    from replay.runs.final import known_to_both, stated_source
     from replay.runs.log import read_header
+    from replay.runs.run import known_to_both, stated_source
 
     header = read_header(log)
     source_then, source_now = known_to_both(stated_source(log), _json(manifest["source"]))

@@ -376,9 +376,9 @@ def _write_run(
     *,
     rerun: bool,
 ) -> None:
-    from replay.runs.final import final_record
     from replay.runs.folders import MODULES_FILE, RUN_JSON, VIEW_FILE
     from replay.runs.modules import save_modules
+    from replay.runs.run import final_record
 
     save_modules(out / MODULES_FILE, result.modules)
     document = {

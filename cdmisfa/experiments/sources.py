@@ -15,11 +15,12 @@ from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import versions
 from recorder.config import RecordConfig, SceneConfig
+from recorder.images.options import ImageOptions
 from recorder.world.scenes import SCENES, scene_of
 from replay.camera_logs.options import CameraOptions
 
 if TYPE_CHECKING:
-    from recorder.cameras.words import LiveOptions
+    from recorder.cameras.options import LiveOptions
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -262,7 +263,7 @@ def open_source(
         raise
 
 
-def is_scene(words: Sequence[str | Path], cameras: CameraOptions | None = None) -> bool:
+def is_scene(words: Sequence[str | Path], cameras: ImageOptions | None = None) -> bool:
     """Whether words name a live scene, which no options of cameras are for.
 
     Raises:
@@ -337,7 +338,7 @@ def open_cameras_now(
     words: Sequence[str | Path],
     live: LiveOptions,
     *,
-    cameras: CameraOptions,
+    cameras: ImageOptions,
     preset: str | None = None,
     settings: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
@@ -366,10 +367,8 @@ def open_cameras_now(
             f"{stored[0]} is no live stream, as the others are: record these, and name recordings "
             "and logs apart"
         )
-    framing = {
-        key: getattr(cameras, key) for key in ("size", "fit", "depth", "fields", "color", "rate")
-    }
-    theirs = CameraOptions(**framing).given()
+    framing = {field.name: getattr(cameras, field.name) for field in fields(ImageOptions)}
+    theirs = ImageOptions(**framing).given()
     if of_logs := [option for option in cameras.given() if option not in theirs]:
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     live = replace(live, **framing)

@@ -37,7 +37,7 @@ from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
-from replay.storage.limits import Limits, limited, limits
+from replay.storage.location import Limits, limited, limits
 
 REQUEST = "sweep.json"
 """What was asked for last."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.reading import IMAGES, Reading
+from recorder.images.decoding import IMAGES, Reading
 from replay.camera_logs.formats.bag import bag_channels, bag_topics
 from replay.camera_logs.formats.lerobot import dataset_cameras, dataset_channels, is_dataset
 from replay.camera_logs.formats.mcap_log import mcap_topics

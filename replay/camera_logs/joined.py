@@ -10,7 +10,7 @@ import numpy as np
 
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.framing import Size
+from recorder.images.options import Size
 from recorder.images.pixels import MalformedImage, Shown
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.alignment import Times, even_times, step_of

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.reading import IMAGES, Reading
+from recorder.images.decoding import IMAGES, Reading
 from replay.camera_logs.formats.bag import BAGS, BagImages
 from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
 from replay.camera_logs.formats.mcap_log import McapImages
@@ -16,10 +16,9 @@ from replay.camera_logs.formats.video import VIDEOS, VideoImages
 from replay.camera_logs.joined import JoinedImages, Stamped
 from replay.camera_logs.stream import ImageStream, NothingLoggedError
 from replay.camera_logs.video_messages import in_order
-from replay.storage.identity import FilesIdentity, Identity
-from replay.storage.listing import log_files
+from replay.storage.identity import FilesIdentity, Identity, log_identity
 from replay.storage.location import Location, Url, location
-from replay.storage.log_identity import log_identity
+from replay.storage.opening import log_files
 
 
 def open_images(

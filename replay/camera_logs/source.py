@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,11 +13,13 @@ import numpy as np
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.core.options import option_words
+from recorder.images.decoding import Reading
 from recorder.images.fields import rounded
-from recorder.images.frames import COLOR_RECIPE
-from recorder.images.framing import Fit, Size, framings
-from recorder.images.pixels import Depth, Shown, UnknownPixels
-from recorder.images.reading import Clock, Reading
+from recorder.images.framing import framings
+from recorder.images.options import Clock, Depth, Fit, Size
+from recorder.images.pixels import Shown, UnknownPixels
+from recorder.images.videos import COLOR_RECIPE
 from replay.camera_logs.alignment import (
     Rows,
     by_index,
@@ -37,7 +40,7 @@ from replay.camera_logs.catalogue import named_streams
 from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
 from replay.camera_logs.names import stream_names
 from replay.camera_logs.opening import identity_of, image_logs, open_images
-from replay.camera_logs.options import Align, Gaps, spelled
+from replay.camera_logs.options import Align, CameraOptions, Gaps
 from replay.camera_logs.salvaged import BROKEN, SALVAGE, WholeImages
 from replay.camera_logs.stream import ImageStream
 from replay.storage.identity import Identity, LoggedSource
@@ -128,13 +131,13 @@ class ForeignSource(LoggedSource):
         named = [paths] if isinstance(paths, str | Path | Url) else paths
         self._files = image_logs(named)
         self._loop = loop
-        self._fit, self._reading = fit, Reading(depth, tuple(fields), time, stamp, color)
-        self._asked_size, self._asked_gaps, self._part = size, gaps, (start, stop)
+        self._reading = reading = Reading(depth, tuple(fields), time, stamp, color)
+        chosen = CameraOptions(**dataclasses.asdict(reading), size=size, fit=fit, gaps=gaps)
+        self._asked = dataclasses.replace(chosen, start=start, stop=stop)
         self._goal, self._salvage = goal, salvage
         self._streams: list[ImageStream] = []
         self.changes: dict[int, str] = {}
         self._shown: dict[int, tuple[int, Shown]] = {}
-        reading = self._reading
         try:
             for path, topic in named_streams(self._files, topics, reading):
                 self._streams.append(open_images(path, topic, salvage=salvage, reading=reading))
@@ -250,7 +253,7 @@ class ForeignSource(LoggedSource):
             chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if any(framing.lossy for framing in self._framings):
-            chosen["fit"] = self._fit
+            chosen["fit"] = self._asked.fit
         if self._reading.depth is not None:
             key = "range_metres" if self._spec.images else "range"
             chosen[key] = list(self._reading.depth)
@@ -382,10 +385,10 @@ class ForeignSource(LoggedSource):
             except UsageError as error:
                 said = f"{error}; --field is of every stream, images are no numbers"
                 raise UsageError(said) from None
-            framings(firsts, None, self._fit)
+            framings(firsts, None, self._asked.fit)
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        words += spelled(self._reading, self._asked_size, self._fit, *self._part, self._asked_gaps)
+        words += option_words(self._asked)
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
-from recorder.images.decoding import Taken, decoder_of
-from recorder.images.framing import Size
+from recorder.images.decoding import MessageKind, Reading, Stamp, Taken, decoder_of, stamp_of
 from recorder.images.messages import SCHEMAS, holds_distances
+from recorder.images.options import Size
 from recorder.images.pixels import RECIPE, Shown
-from recorder.images.reading import MessageKind, Reading
-from recorder.images.stamps import Stamp, stamp_of
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
 

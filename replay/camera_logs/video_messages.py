@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.frames import VIDEO_RECIPE
 from recorder.images.pixels import MalformedImage, Shown
-from recorder.images.videos import VideoPackets
+from recorder.images.videos import VIDEO_RECIPE, VideoPackets
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImagesOf, ImageStream
 

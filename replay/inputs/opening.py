@@ -19,8 +19,7 @@ from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
 from replay.storage.location import Location, Url
-from replay.storage.log_identity import starts_as_log
-from replay.storage.opening import open_store
+from replay.storage.opening import open_store, starts_as_log
 
 Logged = RecordedSource | ForeignSource
 """Frames from logs."""

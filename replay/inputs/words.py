@@ -13,8 +13,8 @@ from replay.camera_logs.formats.bag import BAGS
 from replay.camera_logs.formats.picture_folder import PICTURES, by_number
 from replay.camera_logs.formats.table import TABLES
 from replay.camera_logs.formats.video import VIDEOS
-from replay.storage.listing import log_files
 from replay.storage.location import Location, Url, location
+from replay.storage.opening import log_files
 
 _WHOLE: Final = frozenset((*VIDEOS, *BAGS, *TABLES, *PICTURES))
 """Endings of files that are read whole, and so by their paths alone."""

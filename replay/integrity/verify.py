@@ -21,9 +21,8 @@ from replay.integrity.run_files import RunPass
 from replay.integrity.survey import SCHEMA, Crc, kind_of, moved, said, survey
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
-from replay.storage.listing import log_files
 from replay.storage.location import Location, location
-from replay.storage.opening import fetched, open_store
+from replay.storage.opening import fetched, log_files, open_store
 
 
 @dataclass(frozen=True, slots=True)

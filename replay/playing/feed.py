@@ -25,9 +25,7 @@ from recorder.mcap.reader import LogReader
 from replay.camera_logs.catalogue import fits_topic
 from replay.camera_logs.options import CameraOptions
 from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
-from replay.storage.listing import log_files
-from replay.storage.log_identity import starts_as_log
-from replay.storage.opening import open_store
+from replay.storage.opening import log_files, open_store, starts_as_log
 
 READ_AHEAD = 50
 """Frames that are read at once."""

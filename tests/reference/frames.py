@@ -66,15 +66,3 @@ def gather(data: bytes, ends, distances, width: int) -> bytes:
     """The values of messages, one after the other."""
     lows = [end - distance for end in ends for distance in distances]
     return b"".join(data[low : low + width] for low in lows)
-
-
-def average(image, across, down):
-    """Means of the areas (start, count) of an image's rows, and of those along its columns."""
-    rows = np.stack([_mean(image[:, at : at + n], 1) for at, n in across], axis=1)
-    return np.stack([_mean(rows[at : at + n], 0) for at, n in down], axis=0)
-
-
-def _mean(pixels, axis: int):
-    """By weights of 2^-22ths, as Pillow has them."""
-    weight = int(0.5 + 1 / pixels.shape[axis] * (1 << 22))
-    return ((pixels.astype(np.int64).sum(axis) * weight + (1 << 21)) >> 22).astype(np.uint8)

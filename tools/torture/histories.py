@@ -35,8 +35,7 @@ from recorder.world.scenes import open_scene
 from replay.integrity.verify import check_log
 from replay.recordings.followed import FollowedSource
 from replay.recordings.source import RecordedSource
-from replay.runs.log import read_header
-from replay.runs.stretches import read_columns
+from replay.runs.log import read_columns, read_header
 
 from .calls import Call, watched
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome

@@ -9,6 +9,8 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.sweep import parse_seeds
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import SCHEMA, print_json, print_table
 from cdmisfa.cli.progress import bar
 
 ALL = "all"
@@ -16,8 +18,8 @@ ALL = "all"
 
 @click.command("arena")
 @click.argument("sets", nargs=-1, metavar="[SET]...")
-@click.option("--learners", metavar="NAME,...", help="Which learners [default: all].")
-@click.option(
+@option("--learners", metavar="NAME,...", help="Which learners [default: all].")
+@option(
     "--seeds",
     default="0:10",
     show_default=True,
@@ -26,8 +28,8 @@ ALL = "all"
     "1,5,9.",
 )
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
-@click.option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")
-@click.option(
+@option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")
+@option(
     "--frames",
     type=click.IntRange(1),
     help="Stop a run after so many frames, instead of the set's number.",
@@ -35,8 +37,8 @@ ALL = "all"
 @options.settings
 @options.jobs
 @options.engine
-@click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
-@click.option("--page", type=options.OUT, help="Write this Markdown page of all results in OUT.")
+@options.retry_failed
+@option("--page", type=options.OUT, help="Write this Markdown page of all results in OUT.")
 @options.as_json
 @click.pass_context
 def arena_command(
@@ -65,9 +67,9 @@ def arena_command(
     figure, _ = draw(document, folder)
     click.echo(f"figure {figure}" + (f", page {page}" if page is not None else ""), err=True)
     if as_json:
-        options.print_json(document | {"schema": options.SCHEMA, "folder": folder})
+        print_json(document | {"schema": SCHEMA, "folder": folder})
     else:
-        options.print_table(*table(document))
+        print_table(*table(document))
     for row in failed:
         at = " ".join(f"{key}={value}" for key, value in row["point"].items())
         click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=True)

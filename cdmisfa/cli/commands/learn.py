@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,16 +13,17 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import (
-    camera_options,
-    live_options,
-    live_source,
-    live_streams,
+from cdmisfa.cli.cameras import live_source
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.printing import (
+    print_json,
     print_plan,
+    print_table,
+    quoted,
     say_about,
     say_changes,
 )
-from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
@@ -31,7 +33,8 @@ if TYPE_CHECKING:
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
     from cdmisfa.experiments.runs import RunResult
-    from recorder.cameras.readers import OnLoss
+    from recorder.cameras.options import LiveOptions
+    from replay.camera_logs.options import CameraOptions
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 
@@ -39,44 +42,59 @@ TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
 
 
-@click.command("learn")
+@grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
 @uploads.out("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed
 @options.preset
 @options.settings
-@click.option(
+@option(
     "--algorithm",
     metavar="NAME",
     help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
+    group="Learner",
 )
-@click.option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
-@click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
-@click.option(
-    "--max-modules",
-    type=click.IntRange(1),
-    help="End after so many modules; by default the paper's learners end after as many as there "
-    "are streams.",
+@option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
+@options.end_after("iterations", "End after so many iterations.")
+@options.end_after(
+    "modules",
+    "End after so many modules; by default the paper's learners end after as many as there are "
+    "streams.",
 )
-@click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
-@click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
-@click.option("--salvage", is_flag=True, help="Pass over damaged parts and images of a log.")
-@click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
-@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
-@click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
-@options.seconds("--follow-timeout", 60.0, "With --follow, give up when no frame came for so long.")
-@click.option(
+@options.loop
+@option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
+@options.salvage
+@option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
+@options.no_rerun
+@option(
+    "--follow",
+    is_flag=True,
+    help="Wait for the frames of a recording being written.",
+    group="Source",
+)
+@option(
+    "--follow-timeout",
+    type=click.FloatRange(0.1, 1e6),
+    default=60.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="With --follow, give up when no frame came for so long.",
+    group="Source",
+)
+@option(
     "--record",
     "record_to",
     type=options.OUT,
     metavar="DIR",
     help="Record what every live stream shows while learning, to learn the same from it again.",
+    group="Live streams",
 )
 @options.keyframes
 @options.fsync_every
-@camera_options
-@live_options
+@options.log_options
+@options.dry_run
+@options.live_options
 @options.server_limits
 @options.force
 @options.as_json
@@ -105,10 +123,8 @@ def learn_command(
     force: bool,
     as_json: bool,
     dry_run: bool,
-    hold: float,
-    lost: OnLoss,
-    stall: float,
-    **cameras: Any,
+    live: LiveOptions,
+    cameras: CameraOptions,
 ) -> None:
     """Learn slow feature modules from a scene, a recording, logs or cameras.
 
@@ -136,7 +152,6 @@ def learn_command(
     from cdmisfa.experiments.runs import RunExhaustedError, run
     from cdmisfa.experiments.sources import open_source, refuse_keys_of_scenes
     from recorder.cameras.words import is_live
-    from replay.camera_logs.options import CameraOptions
 
     frames: FrameSource
     if algorithm is not None:
@@ -152,8 +167,8 @@ def learn_command(
                 )
             opened = live_source(
                 source,
-                live_streams(hold, lost, stall, seed=seed),
-                CameraOptions(**cameras),
+                replace(live, seed=seed),
+                cameras,
                 out,
                 record_to,
                 preset=preset,
@@ -174,7 +189,7 @@ def learn_command(
                 seed=seed,
                 loop=loop,
                 salvage=salvage,
-                cameras=CameraOptions(**cameras),
+                cameras=cameras,
                 follow=follow_timeout if follow else None,
             )
             stack.callback(frames.close)
@@ -216,7 +231,7 @@ def learn_command(
     show(result, as_json=as_json)
     if result.ended == INTERRUPTED:
         if result.run is not None and not any(map(is_live, source)):
-            again = f"cdmisfa learn --resume -o {options.quoted(result.run)}"
+            again = f"cdmisfa learn --resume -o {quoted(result.run)}"
             click.echo(f"go on with {again}", err=True)
         ctx.exit(stop.exit_code)
 
@@ -239,8 +254,7 @@ def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
 
 def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.display import has_display
-    from replay.viewer.program import open_privately
+    from replay.viewer.program import has_display, open_privately
 
     click.echo(f"live view {address}    look at it: rerun {address}", err=True)
     if has_display():
@@ -302,7 +316,7 @@ def show(result: RunResult, *, as_json: bool) -> None:
     from cdmisfa.experiments.loop import ENDINGS
 
     if as_json:
-        options.print_json(result.as_json())
+        print_json(result.as_json())
         return
     rows = [
         (
@@ -315,10 +329,10 @@ def show(result: RunResult, *, as_json: bool) -> None:
         for module in result.modules
     ]
     if rows and "streams" not in result.summary:
-        options.print_table(("module", "stream", "iteration", "policy", "eta"), rows)
+        print_table(("module", "stream", "iteration", "policy", "eta"), rows)
     elif rows:  # no policy led to them
         plain = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
-        options.print_table(("module", "stream", "iteration", "eta"), plain)
+        print_table(("module", "stream", "iteration", "eta"), plain)
     else:
         click.echo("no module was learned")
     for outcome in result.summary.get("streams", ()):
@@ -326,5 +340,5 @@ def show(result: RunResult, *, as_json: bool) -> None:
     click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     click.echo(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
-        look = f"look at it: cdmisfa view {options.quoted(result.run)}"
+        look = f"look at it: cdmisfa view {quoted(result.run)}"
         click.echo(f"run {result.run}    {look}")

@@ -11,12 +11,14 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.learn import Reporter, outcome_line, show
 from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import SCHEMA, print_json, quoted
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-source = click.option(
+source = option(
     "--source",
     multiple=True,
     metavar="SOURCE",
@@ -28,7 +30,7 @@ source = click.option(
 @click.command("at")
 @options.path_argument("run")
 @click.argument("iterations", metavar="K", type=click.IntRange(0))
-@click.option(
+@option(
     "--save-module",
     type=options.OUT,
     metavar="F.npz",
@@ -62,9 +64,9 @@ def at_command(
     if save_module is not None:
         _save_unfinished(learner, save_module, force=force)
     if as_json:
-        options.print_json(
+        print_json(
             {
-                "schema": options.SCHEMA,
+                "schema": SCHEMA,
                 "run": str(run_log(run).parent),
                 "iterations": iterations,
                 "t": t,
@@ -107,10 +109,8 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
 
 @click.command("check")
 @options.path_argument("run")
-@click.option(
-    "--from", "start", type=click.IntRange(0), default=0, metavar="K", help="First iteration."
-)
-@click.option(
+@option("--from", "start", type=click.IntRange(0), default=0, metavar="K", help="First iteration.")
+@option(
     "--to",
     "stop",
     type=click.IntRange(1),
@@ -139,7 +139,7 @@ def check_command(
 
     checked = check_run(run, source, start, stop)
     if as_json:
-        options.print_json({"schema": options.SCHEMA, "run": str(run), **checked.as_json()})
+        print_json({"schema": SCHEMA, "run": str(run), **checked.as_json()})
     else:
         click.echo(str(checked))
     if not checked.holds:
@@ -148,7 +148,7 @@ def check_command(
 
 @click.command("fork")
 @options.path_argument("run")
-@click.option(
+@option(
     "--at",
     type=click.IntRange(0),
     required=True,
@@ -156,30 +156,22 @@ def check_command(
     help="Go on after so many iterations of the run.",
 )
 @options.out("Folder of the fork.", required=True)
-@click.option(
+@option(
     "--set",
     "settings",
     multiple=True,
     metavar="learner.KEY=VALUE",
     help="What the learner is told from there on; may be repeated.",
 )
-@click.option(
+@option(
     "--seed",
     type=click.IntRange(0, 2**63 - 1),
     help="Seed of the random choices from there on; the world stays.",
 )
-@click.option(
-    "--max-iterations",
-    type=click.IntRange(1),
-    help="End after so many iterations in all; by default as the run.",
-)
-@click.option(
-    "--max-modules",
-    type=click.IntRange(1),
-    help="End after so many modules in all; by default as the run.",
-)
+@options.end_after("iterations", "End after so many iterations in all; by default as the run.")
+@options.end_after("modules", "End after so many modules in all; by default as the run.")
 @source
-@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@options.no_rerun
 @options.keyframes
 @options.fsync_every
 @options.server_limits
@@ -234,7 +226,7 @@ def fork_command(
         show(error.result, as_json=as_json)
         raise
     show(result, as_json=as_json)
-    both = f"cdmisfa compare {options.quoted(run)} {options.quoted(out)} --save both.rrd"
+    both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
     click.echo(f"both in one view: {both}", err=True)
     if result.ended == INTERRUPTED:
         ctx.exit(stop.exit_code)

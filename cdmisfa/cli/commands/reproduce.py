@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import SCHEMA, print_json
 from cdmisfa.cli.progress import bar
 
 if TYPE_CHECKING:
@@ -19,15 +21,15 @@ if TYPE_CHECKING:
 @click.command("reproduce")
 @click.argument("name", required=False)
 @options.out("Folder of the results [default: reproduction].")
-@click.option(
+@option(
     "--trials", type=click.IntRange(1), help="Trials per condition, instead of the paper's number."
 )
 @options.jobs
 @options.engine
-@click.option("--recording", type=click.Path(path_type=Path), help="Recording of the iCub scene.")
-@click.option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
-@click.option("--page", type=options.OUT, help="Write this Markdown page of all results.")
-@click.option("--force", is_flag=True, help="Replace results of more or other trials.")
+@option("--recording", type=click.Path(path_type=Path), help="Recording of the iCub scene.")
+@option("--quick", is_flag=True, help="Few trials, enough to test the claim.")
+@option("--page", type=options.OUT, help="Write this Markdown page of all results.")
+@option("--force", is_flag=True, help="Replace results of more or other trials.")
 @options.as_json
 def reproduce_command(
     name: str | None,
@@ -67,7 +69,7 @@ def reproduce_command(
         write_page(root, page)
         click.echo(f"page {page}", err=True)
     if as_json:
-        options.print_json({"schema": options.SCHEMA, "experiments": documents})
+        print_json({"schema": SCHEMA, "experiments": documents})
     else:
         sys.stdout.write(_words(documents))
     for document in documents:

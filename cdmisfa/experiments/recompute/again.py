@@ -18,9 +18,10 @@ from cdmisfa.experiments.sources import open_logs, open_source
 from recorder.cameras.words import is_live
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
-from replay.runs.final import other_files, stated_source
 from replay.runs.folders import run_log
-from replay.runs.log import RunHeader, read_header, read_keyframe
+from replay.runs.keyframes import read_keyframe
+from replay.runs.log import RunHeader, read_header
+from replay.runs.run import other_files, stated_source
 
 SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
 """What a source must have in common with the one that a run learned from."""

@@ -19,10 +19,9 @@ from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.recompute.again import Again
 from replay.runs.columns import SignalColumns, columns_of_records
-from replay.runs.compare import Difference, differing, first_of
-from replay.runs.log import read_keyframes
-from replay.runs.messages import arrays_of
-from replay.runs.stretches import read_columns
+from replay.runs.compare import Difference, differing, first_differing
+from replay.runs.keyframes import arrays_of, read_keyframes
+from replay.runs.log import read_columns
 
 ROUNDING = 1e-6
 """Share of a signal's largest number up to which another arithmetic explains a difference."""
@@ -159,7 +158,7 @@ def _learned_again(
         again: learns.
         stop: the iteration.
         keyframes: that are compared, too.
-        rounding: see `first_of`.
+        rounding: see `first_differing`.
     """
     left = iter(keyframes)
     at, kept = again.learner.iteration, next(left, None)
@@ -173,7 +172,7 @@ def _learned_again(
                     other = other or _moved(kept, again, rounding)
                     kept = next(left, None)
         learned = columns_of_records(records)
-        found = first_of(iter([logged]), learned, again.header.schema, at, rounding)
+        found = first_differing(iter([logged]), learned, again.header.schema, at, rounding)
         at += len(logged)
         both = [one for one in (found, other) if one is not None]
         if both:

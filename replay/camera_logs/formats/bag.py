@@ -13,9 +13,8 @@ import lz4.frame
 import numpy as np
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from recorder.images.decoding import Taken, decoder_of
+from recorder.images.decoding import IMAGES, MessageKind, Reading, Taken, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.reading import IMAGES, MessageKind, Reading
 from recorder.mcap.records import MAX_CHUNK
 from replay.camera_logs.formats.bag_folder import plain_bag, unpacked_message
 from replay.camera_logs.stream import (

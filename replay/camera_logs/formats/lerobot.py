@@ -15,7 +15,7 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular, read_json
-from recorder.images.framing import Size
+from recorder.images.options import Size
 from recorder.images.pixels import compressed_image
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
 from replay.camera_logs.formats.video import VideoImages

@@ -11,7 +11,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
-from recorder.images.framing import Size
+from recorder.images.options import Size
 from recorder.images.pixels import compressed_image, picture_size
 from replay.camera_logs.stream import ImageStream
 

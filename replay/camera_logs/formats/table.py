@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular
+from recorder.images.decoding import IMAGES, Reading
 from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
 from recorder.images.pixels import Shown
-from recorder.images.reading import IMAGES, Reading
 from replay.camera_logs.formats.csv_table import Words, line_of, read_csv
 from replay.camera_logs.stream import (
     LAST_NS,
@@ -264,7 +264,7 @@ def _column(path: Path, table: Any, name: str) -> NDArray[np.float64]:
     Raises:
         UsageError: there is none in the table, or no number in it.
     """
-    field = Field.named(name) if name in table.column_names else Field(name)
+    field = Field(name, plain=name in table.column_names)
     first = field.first
     if first not in table.column_names:
         there = ", ".join(table.column_names[:20])

@@ -19,9 +19,8 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import data_bytes
-from recorder.images.frames import VIDEO_RECIPE, frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS
-from recorder.images.videos import pyav
+from recorder.images.videos import VIDEO_RECIPE, frame_colors, frame_gray, pyav
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
 
