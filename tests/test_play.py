@@ -29,7 +29,7 @@ from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.playing.as_robot import play_as_robot
 from replay.playing.feed import Told, Topic, opened_feed
 from replay.playing.pace import Played, paced, rounds

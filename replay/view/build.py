@@ -16,7 +16,7 @@ from rerun.chunk import Chunk
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write, refuse_taken
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import holds_run
+from replay.inputs import holds_run
 from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import Frames, read_batches, read_header
 from replay.runs.modules import load_modules

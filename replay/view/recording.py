@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged, open_to_look
+from replay.inputs import Logged, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
 from replay.runs.columns import Blocks

@@ -12,7 +12,7 @@ from typing import Any
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.files import atomic_write, refuse_taken, refuse_unless_png
 from replay.camera_logs.source import ForeignSource
-from replay.inputs.opening import holds_run, open_to_look
+from replay.inputs import holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of

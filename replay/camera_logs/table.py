@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.regular import check_regular
-from recorder.images.decoding import IMAGES, Reading
 from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
+from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
-from replay.camera_logs.formats.csv_table import Words, line_of, read_csv
+from replay.camera_logs.csv_table import Words, line_of, read_csv
 from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,

@@ -1,12 +1,12 @@
-"""A video file as a stream of images, through PyAV: FFmpeg on one thread.
+"""Pictures in a folder, or in a video file, as a stream of images.
 
-Grey is the luma that a video stores, so that no colour conversion of FFmpeg, whose bits depend
-on the processor, comes between; only videos without luma are taken by their colours.
+Videos are decoded through PyAV, FFmpeg, on one thread.
 """
 
 from __future__ import annotations
 
 import contextlib
+import re
 from array import array
 from collections.abc import Iterator
 from fractions import Fraction
@@ -19,15 +19,60 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import data_bytes
-from recorder.images.pixels import MAX_PIXELS
+from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
+from recorder.images.options import Size
+from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
 from recorder.images.videos import VIDEO_RECIPE, frame_colors, frame_gray, pyav
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.stream import ImageStream, explained, sorted_times
+
+PICTURES: Final = (".jpeg", ".jpg", ".png")
+
+MAX_PICTURE: Final = 64 * 1024 * 1024
+"""Largest file that is read as a picture."""
+
 
 VIDEOS: Final = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm", ".wmv")
 _NOWHERE: Final = 2**62
 _FORWARD: Final = 256
 """Frames that are decoded and passed over rather than sought."""
+
+
+class FolderImages(ImageStream):
+    """The pictures of a folder, in the order of their names, numbers by value."""
+
+    def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
+        self.path, self._color = path, color
+        self.topic = path.resolve().name
+        if topic not in (None, self.topic):
+            raise UsageError(f"{path}: a folder of pictures has no topics, leave {topic} out")
+        self._files = sorted(
+            (p for p in path.iterdir() if p.suffix.lower() in PICTURES), key=by_number
+        )
+        for file in self._files:
+            check_regular(file, MAX_PICTURE)
+        self.encoding = " ".join(sorted({p.suffix.lower()[1:] for p in self._files}))
+        self.times = np.empty(0, np.uint64)
+
+    @property
+    def count(self) -> int:
+        return len(self._files)
+
+    def image(self, row: int) -> ByteArray:
+        return compressed_image(read_regular(self._files[row], MAX_PICTURE), color=self._color)
+
+    def stated_size(self, row: int) -> Size | None:
+        with opened_regular(self._files[row], MAX_PICTURE) as file:
+            return picture_size(file)
+
+    def where(self, row: int) -> str:
+        return str(self._files[row])
+
+
+def by_number(path: Path) -> list[tuple[int, str]]:
+    """Sort key that puts 9.png before 10.png."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(p) if p.isdecimal() else -1, p) for p in parts]
 
 
 class VideoImages(ImageStream):

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.decoding import IMAGES, MessageKind, Reading, decoder_of
+from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.options import IMAGES, Reading
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable

@@ -18,7 +18,7 @@ from cdmisfa.core.untrusted.regular import check_regular, read_json
 from recorder.images.options import Size
 from recorder.images.pixels import compressed_image
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
-from replay.camera_logs.formats.video import VideoImages
+from replay.camera_logs.pictures import VideoImages
 from replay.camera_logs.stream import (
     ChannelFacts,
     ImageStream,

@@ -1,8 +1,10 @@
-"""Opening what holds frames: a recording of ours, or camera logs of others."""
+"""What words of a command line name, opened: recordings of ours, and camera logs of others."""
 
 from __future__ import annotations
 
 import contextlib
+import fnmatch
+import glob
 import shlex
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -11,15 +13,15 @@ from typing import Any
 
 from cdmisfa.core.errors import UsageError
 from recorder.mcap.reader import LogReader
-from replay.camera_logs.catalogue import ALL
-from replay.camera_logs.opening import only_foreign
+from replay.camera_logs.opening import ALL, WHOLE_FILES, only_foreign
 from replay.camera_logs.options import CameraOptions
+from replay.camera_logs.pictures import by_number
 from replay.camera_logs.source import ForeignSource, UnequalError
 from replay.recordings.source import RecordedSource, SeveralRecordingsError
 from replay.recordings.view_file import NoRecordingError
 from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
-from replay.storage.location import Location, Url
-from replay.storage.opening import open_store, starts_as_log
+from replay.storage.location import Location, Url, location
+from replay.storage.opening import log_files, open_store, starts_as_log
 
 Logged = RecordedSource | ForeignSource
 """Frames from logs."""
@@ -142,3 +144,40 @@ def _a_run(path: Location) -> UsageError:
         f"{path} is a run, not a recording: look at it with cdmisfa view {shlex.quote(str(path))}, "
         "or learn from what it learned from"
     )
+
+
+def places(words: Sequence[str | Location]) -> list[Location]:
+    """The places that words name, in their order; a pattern names what matches, by number.
+
+    Raises:
+        UsageError: nothing matches a pattern, or a URL is of a kind that is not read.
+    """
+    found: list[Location] = []
+    for word in words:
+        found += _matches(word) if isinstance(word, str) and _is_pattern(word) else [location(word)]
+    for place in found:
+        if isinstance(place, Url) and place.suffix.lower() in WHOLE_FILES:
+            raise UsageError(f"{place}: of URLs MCAP logs are read: copy this file here first")
+    return found
+
+
+def _is_pattern(word: str) -> bool:
+    return any(letter in word for letter in "*?[") and not Path(word).exists()
+
+
+def _matches(word: str) -> list[Location]:
+    if "://" not in word:
+        matched = [Path(name) for name in glob.glob(word, recursive=True)]
+        matched = [path for path in matched if path.suffix not in (".rrd", ".json")]
+        if not matched:
+            raise UsageError(f"{word}: no file or folder matches")
+        return [*sorted(matched, key=by_number)]
+    if not word.startswith("s3://"):
+        return [location(word)]  # a question mark of a web address, and servers list nothing
+    folder, _, pattern = word.rpartition("/")
+    if _is_pattern(folder):
+        raise UsageError(f"{word}: a pattern is the last part of an s3:// address only")
+    listed = [log for log in log_files(location(folder)) if fnmatch.fnmatchcase(log.name, pattern)]
+    if not listed:
+        raise UsageError(f"{word}: no log matches")
+    return [log for log in listed if isinstance(log, Url)]
