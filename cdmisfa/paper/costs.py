@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from cdmisfa import kernels
-from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
-from cdmisfa.agents.gate import Frozen
+from cdmisfa.agents.agent import OUTCOME, Frozen, as_struct, new_agent, rules
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.experiments.trial import run_trial
 from cdmisfa.paper.oscillatory import STREAMS, learner_config

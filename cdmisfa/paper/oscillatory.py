@@ -13,7 +13,7 @@ from cdmisfa.core.config import LearnerConfig, build, load_preset
 from cdmisfa.core.expansion import quadratic
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.features.slowness import instantaneous_slowness
+from cdmisfa.kernels import instantaneous_slowness
 from cdmisfa.paper import panels
 from cdmisfa.paper.reproduce import Claim, Findings, Line, Output, Request, Settings, Trial, learned
 from recorder.world.oscillatory import one_period

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.features.feature import Feature
+from cdmisfa.features.incsfa import Feature
 
 INPUTS = 3
 

@@ -1,4 +1,4 @@
-"""Outputs of slow features on whole blocks of frames: y = phi (x - mean)."""
+"""Outputs of slow features, y = phi (x - mean), and what tells how slow they are."""
 
 from __future__ import annotations
 
@@ -35,3 +35,13 @@ def project(phi: FloatArray, offset: FloatArray, frames: Any) -> FloatArray:
             f"weights of shape {phi.shape} and offsets of {offset.shape} given: give (R, I), (R,)"
         )
     return kernels.outputs(phi, offset, frames)
+
+
+def slowness_by_moments(derivative_square: float, variance: float) -> float:
+    """Slowness in 1/frame from E(ydot^2) and Var(y); infinite where there is no variance."""
+    return float(kernels.lib.slowness(derivative_square, variance))
+
+
+def window_rate(window: float, count: int) -> float:
+    """Rate of an exponential mean over `window` samples that starts as a plain mean."""
+    return max(2.0 / (window + 1.0), 1.0 / count)
