@@ -186,9 +186,6 @@ class ViewLogs:
         split: where parts end.
         poses: of the head in each of the recording's views, where there is a head.
         fsync_every: see `record`.
-
-    Raises:
-        LogWriteError: the disk does not take it.
     """
 
     def __init__(

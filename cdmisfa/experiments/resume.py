@@ -23,7 +23,7 @@ from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.sources import CLOCK
 from recorder.cameras.words import is_live
-from recorder.log.files import partial_path
+from recorder.log.files import found_path, partial_path, relative_path
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
 
@@ -107,16 +107,6 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     if preset is not None and str(preset).endswith(".toml"):
         options["preset"] = found_path(str(preset), run)
     return tuple(found_path(word, run) for word in source), options
-
-
-def relative_path(word: str, folder: Path) -> str:
-    """A path relative to the folder that keeps it, so that both can move; a URL as it is."""
-    return word if "://" in word else os.path.join(os.curdir, os.path.relpath(word, folder))
-
-
-def found_path(word: str, folder: Path) -> str:
-    """A path of `relative_path` where it lies now; another word as it is."""
-    return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
 
 
 def _packages_gone(log: Path) -> str:

@@ -134,6 +134,16 @@ def folder_here(place: str | Path) -> Path:
     return Path(place)
 
 
+def relative_path(word: str, folder: Path) -> str:
+    """A path relative to the folder that keeps it, so that both can move; a URL as it is."""
+    return word if "://" in word else os.path.join(os.curdir, os.path.relpath(word, folder))
+
+
+def found_path(word: str, folder: Path) -> str:
+    """A path of `relative_path` where it lies now; another word as it is."""
+    return os.path.normpath(folder / word) if word.startswith(os.curdir) else word
+
+
 # Files that replace what was there
 
 

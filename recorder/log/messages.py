@@ -55,7 +55,6 @@ ENCODING = "protobuf"
 
 IMAGE_ENCODING = "mono8"
 """Pixel format of image views: one byte of grey."""
-
 IMAGE_SCHEMA = "foxglove.RawImage"
 VECTOR_SCHEMA = "cdmisfa.Vector"
 TRUTH_SCHEMA = "cdmisfa.GroundTruth"
@@ -236,12 +235,7 @@ class PoseEncoder(_Encoder):
 
 
 class CalibrationEncoder(_Encoder):
-    """How an eye maps what is in front of it, as `foxglove.CameraCalibration`.
-
-    Args:
-        eye: which.
-        frame_id: its coordinate frame.
-    """
+    """How an eye, with its coordinate frame, maps what it sees, as `foxglove.CameraCalibration`."""
 
     def __init__(self, eye: Eye, frame_id: str) -> None:
         f, x, y = eye.focal, eye.width / 2, eye.height / 2

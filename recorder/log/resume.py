@@ -7,7 +7,6 @@ bytes of a log that was never interrupted.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -61,10 +60,7 @@ class FramesHeld(NamedTuple):
 def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
     """Read once through a log, damaged or not, for the frames of a view that it holds.
 
-    Args:
-        path: the log.
-        view: name of the view.
-        gaps: whether the source may lack frames.
+    With `gaps` the source may lack frames.
     """
     first = stop = end = count = 0
     for topic, frame, _, _ in messages(path):
@@ -86,10 +82,18 @@ def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
     Raises:
         LogDamagedError: the disk does not give the file, which says nothing of the log.
     """
-    with _reading(path) as log:
-        for table in log.undamaged() if log else ():
+    log = _opened(path)
+    if log is None:
+        return
+    with log:
+        for segment in log.segments:
+            damage = log.first_damage
+            unproven = segment.cut or (damage is not None and segment.offset >= damage)
+            table = None if unproven else log.table(segment)
+            if table is None:
+                return
             for number, sequence, log_time, _, data in table.rows():
-                channel = log.channels.get(number) if log else None
+                channel = log.channels.get(number)
                 yield channel.topic if channel else "", sequence, log_time, data
 
 
@@ -374,8 +378,7 @@ def set_log_aside(place: ViewResume) -> Path | None:
     return kept
 
 
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[LogReader | None]:
+def _opened(path: Path) -> LogReader | None:
     """A log, damaged or not; None of a file that does not begin as one.
 
     Raises:
@@ -386,14 +389,13 @@ def _reading(path: Path) -> Iterator[LogReader | None]:
             start = file.read(len(MAGIC))
     except OSError as error:
         raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
-    if start != MAGIC:
-        yield None
-        return
-    with LogReader(path, salvage=True, check="chunks") as log:
-        yield log
+    return LogReader(path, salvage=True, check="chunks") if start == MAGIC else None
 
 
 def _metadata(path: Path) -> Metadata | None:
     """What a log says of what it is, its first metadata record; None where it does not say it."""
-    with _reading(path) as log:
-        return log.metadata[0] if log and log.metadata else None
+    log = _opened(path)
+    if log is None:
+        return None
+    with log:
+        return log.metadata[0] if log.metadata else None

@@ -56,6 +56,7 @@ class LogReader:
         profile: the writer's profile, as "ros2".
         library: what wrote the file.
         complete: the file has its end.
+        first_damage: place of the first damaged record that stands outside chunks, or None.
         data_complete: every message is there, if not the summary behind them.
         metadata: the metadata records.
         statistics: what the summary says the file holds, or None.
@@ -161,10 +162,7 @@ class LogReader:
         return self._structure.definitions.schemas
 
     def attachment_data(self, attachment: Attachment) -> bytes:
-        """Read an attachment's bytes.
-
-        Raises LogDamagedError where it is larger than is read at once.
-        """
+        """Read an attachment's bytes; a LogDamagedError where that is too much at once."""
         if attachment.size > MAX_CHUNK:
             raise LogDamagedError(
                 f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
@@ -240,20 +238,6 @@ class LogReader:
         in_file = ((s, t) for _, s in chosen if (t := self.table(s)) is not None)
         for segment, table in in_order(chosen, self.table) if ordered else in_file:
             yield segment, within(table, low, high)
-
-    def undamaged(self) -> Iterator[MessageTable]:
-        """Give the messages chunk by chunk in file order, up to where the log is damaged or torn.
-
-        The reader is one with `salvage`.
-        """
-        end = self._structure.first_damage
-        for segment in self._structure.segments:
-            if end is not None and segment.offset >= end:
-                return
-            table = self.table(segment)
-            if table is None:
-                return
-            yield table
 
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Give every chunk in file order, None for one that is damaged and left out.
@@ -362,6 +346,7 @@ class LogReader:
         """Take over what the walk found, with the times of a chunk whose header states none yet."""
         structure = self._structure
         self.by_index, self.complete = structure.by_index, structure.complete
+        self.first_damage = structure.first_damage
         self.profile, self.library = structure.profile, structure.library
         self.data_complete, self.metadata = structure.data_crc is not None, structure.metadata
         self.statistics = structure.summary.statistics if structure.summary else None

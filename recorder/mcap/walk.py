@@ -75,8 +75,7 @@ class LogStructure:
     def __init__(
         self, file: Store, refuse: Refuse, *, by_index: bool = False, resync: bool = False
     ) -> None:
-        self._file = file
-        self._resync = resync
+        self._file, self._resync = file, resync
         self._sure = len(MAGIC)
         self.by_index = False
         self._tell = refuse
@@ -86,17 +85,14 @@ class LogStructure:
         self.tail: Segment | None = None
         self.metadata: list[Metadata] = []
         self.attachments: list[Attachment] = []
-        self.profile = ""
-        self.library = ""
+        self.profile = self.library = ""
         self.summary: Summary | None = None
-        self.complete = False
-        self.missing = ""
+        self.complete, self.missing = False, ""
         self.data_crc: int | None = None
         self.data_end = 0
         self._limit: int | None = None
         self._attachment_spans: list[tuple[int, int]] = []
-        self._metadata_bytes = 0
-        self._inside = 0
+        self._metadata_bytes = self._inside = 0
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
         self._at = len(MAGIC)
