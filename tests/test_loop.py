@@ -14,8 +14,7 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.loop import ENDINGS, Digest, learn
-from cdmisfa.experiments.resume import Keyframes
+from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn
 from cdmisfa.paper.demo import Shown
 from cdmisfa.testing.sinks import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource

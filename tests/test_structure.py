@@ -34,15 +34,14 @@ def python(*args: str) -> subprocess.CompletedProcess[str]:
 
 FORBIDDEN = {
     "cdmisfa": ("cdmisfa.cli.app",),
-    "cdmisfa.agents": ("cdmisfa.experiments.runs", "replay.palette", "recorder.config", "mcap"),
+    "cdmisfa.agents": ("cdmisfa.experiments.session", "replay.palette", "recorder.config", "mcap"),
     "cdmisfa.arena": ("cdmisfa.paper.panels", "cdmisfa.cli.app"),
     "cdmisfa.cli": ("rerun", "mcap", "pybullet"),
     "cdmisfa.cli.commands": ("rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
     "cdmisfa.core.untrusted": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.experiments": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
-    "cdmisfa.experiments.recompute": ("cdmisfa.paper.reproduce", "cdmisfa.cli.app"),
-    "cdmisfa.agents.progress": ("cdmisfa.experiments.runs", "replay.palette", "rerun"),
+    "cdmisfa.agents.progress": ("cdmisfa.experiments.session", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
     "cdmisfa.paper": ("cdmisfa.arena.sets", "cdmisfa.cli.app"),
     "cdmisfa.kernels": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
@@ -59,14 +58,18 @@ FORBIDDEN = {
     "replay.camera_logs": ("replay.recordings.source", "replay.view.columns", "rerun"),
     "replay.export": ("replay.view.columns", "replay.integrity.info", "rerun"),
     "replay.integrity": ("replay.export.frames", "replay.viewer.program", "rerun"),
-    "replay.playing": ("cdmisfa.experiments.runs", "cdmisfa.agents.learner", "recorder.recording"),
+    "replay.playing": (
+        "cdmisfa.experiments.session",
+        "cdmisfa.agents.learner",
+        "recorder.recording",
+    ),
     "replay.recordings": ("replay.camera_logs.source", "replay.view.columns", "recorder.recording"),
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.frames", "pybullet"),
     "replay.view.layouts": ("replay.viewer.window", "replay.export.figures", "recorder.recording"),
     "replay.view.world": ("replay.viewer.window", "replay.export.figures", "recorder.world.scenes"),
-    "replay.viewer": ("cdmisfa.experiments.runs", "recorder.world.icub.world"),
+    "replay.viewer": ("cdmisfa.experiments.session", "recorder.world.icub.world"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""
 

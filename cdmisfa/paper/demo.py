@@ -16,7 +16,8 @@ from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import ACTIONS, BlockSignals
-from cdmisfa.experiments.runs import RunResult, run
+from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import Configuration, configure, open_source
 from cdmisfa.experiments.statistics import correlation
 

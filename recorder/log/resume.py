@@ -65,8 +65,7 @@ def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
     first = stop = end = count = 0
     for topic, frame, _, _ in messages(path):
         if topic == view_topic(view):
-            if not end:
-                first = stop = frame
+            first, stop = (first, stop) if end else (frame, frame)
             if frame == stop or (gaps and frame > stop):
                 stop, count = frame + 1, count + 1
             end = max(end, frame + 1)
