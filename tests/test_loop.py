@@ -17,7 +17,7 @@ from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, learn
 from cdmisfa.experiments.resume import Keyframes
 from cdmisfa.paper.demo import Shown
-from cdmisfa.testing.sinks import CONFIG, SinkContract
+from cdmisfa.testing.learners import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 
