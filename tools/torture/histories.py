@@ -27,7 +27,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
-from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
+from cdmisfa.experiments.run_folder import RunExhaustedError, RunResult
+from cdmisfa.experiments.session import run
 from recorder.log.split import Split
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatoryConfig

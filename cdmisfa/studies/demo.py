@@ -16,7 +16,8 @@ from cdmisfa.core.errors import NotReproducedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import ACTIONS, BlockSignals
-from cdmisfa.experiments.runs import RunResult, run
+from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import Configuration, configure, open_source
 from cdmisfa.experiments.statistics import correlation
 
@@ -31,7 +32,7 @@ SCORED_FRAMES = 4000
 """Frames on which a module's output is compared with the object's true position."""
 
 
-class Bar(Protocol):
+class StageProgress(Protocol):
     """What a stage of the demonstration reports to."""
 
     def update(self, done: float, total: float | None = None, note: str = "") -> None:
@@ -41,12 +42,12 @@ class Bar(Protocol):
         """Show a line that stays."""
 
 
-Stage = Callable[[str, str], AbstractContextManager[Bar]]
+Stage = Callable[[str, str], AbstractContextManager[StageProgress]]
 """Opens a stage by its title and the unit that it counts."""
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class DemoModule:
     """A module, and what in the world its output follows.
 
     Attributes:
@@ -75,7 +76,7 @@ class Report:
     figures: tuple[Path, ...]
     iterations: int
     live_equals_recorded: bool
-    modules: tuple[Learned, ...]
+    modules: tuple[DemoModule, ...]
 
     def as_json(self) -> dict[str, Any]:
         """The report as `demo --json` prints it."""
@@ -122,10 +123,10 @@ def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> Repor
     return Report(recording, folder, figures, result.iterations, True, learned)
 
 
-class Shown(Sink):
-    """Shows on a bar how far a run is."""
+class ProgressSink(Sink):
+    """Says how far a run is."""
 
-    def __init__(self, bar: Bar, max_iterations: int | None) -> None:
+    def __init__(self, bar: StageProgress, max_iterations: int | None) -> None:
         self._bar, self._max_iterations = bar, max_iterations
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
@@ -140,7 +141,7 @@ def _learn(
     configuration: Configuration,
     out: Path | None,
     seed: int,
-    bar: Bar,
+    bar: StageProgress,
     max_iterations: int | None = None,
     max_modules: int | None = None,
 ) -> RunResult:
@@ -152,7 +153,7 @@ def _learn(
             seed=seed,
             sections=configuration.tables(),
             force=True,
-            sinks=(Shown(bar, max_iterations),),
+            sinks=(ProgressSink(bar, max_iterations),),
             max_iterations=max_iterations,
             max_modules=max_modules,
         )
@@ -163,7 +164,7 @@ def _opened(words: list[str | Path], seed: int) -> AbstractContextManager[Seekab
 
 
 def _check(
-    recording: Path, configuration: Configuration, seed: int, iterations: int, bar: Bar
+    recording: Path, configuration: Configuration, seed: int, iterations: int, bar: StageProgress
 ) -> None:
     live, recorded = (
         _learn([word], configuration, None, seed, bar, max_iterations=iterations).signals_sha256
@@ -177,14 +178,14 @@ def _check(
     bar.say(f"live and recorded signals of {iterations} iterations are the same, bit for bit")
 
 
-def _score(module: Module, source: SeekableSource) -> Learned:
+def _score(module: Module, source: SeekableSource) -> DemoModule:
     """Find the true quantity that a module's first output on its own view follows best."""
     source.seek(0)
     block = source.take(module.stream_index, SCORED_FRAMES)
     y = module.transform(block.frames)[:, 0]
     r = [correlation(y, column) for column in block.truth.T]
     best = int(np.argmax(r))
-    return Learned(
+    return DemoModule(
         module.index,
         module.stream,
         tuple(ACTIONS[action] for action in module.policy),
