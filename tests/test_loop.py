@@ -16,7 +16,7 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn
 from cdmisfa.studies.demo import ProgressSink
-from cdmisfa.testing.sinks import CONFIG, SinkContract
+from cdmisfa.testing.learners import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 
