@@ -117,8 +117,8 @@ LIVE = ("record", "gym:Pendulum-v1", "--frames", 3)
     ("words", "last"),
     [
         (LEARN, "replay.view.build.build_view"),
-        (RECORD, "recorder.log.viewlog.ViewParts.write"),
-        (LIVE, "recorder.log.viewlog.ViewParts.finish"),
+        (RECORD, "recorder.log.viewlog.ViewLog.write"),
+        (LIVE, "recorder.log.viewlog.ViewLog.finish"),
     ],
     ids=["learn", "record", "live"],
 )
@@ -143,7 +143,7 @@ def test_an_interrupt_says_what_is_missing_of_a_run(
     assert cdmisfa("verify", out).code == 0
 
     words = (*LEARN, "-o", out, "--force", "--no-rerun")
-    done = _signalled(cdmisfa, words, "replay.runs.modules.save_modules", 2, monkeypatch)
+    done = _signalled(cdmisfa, words, "cdmisfa.experiments.run_folder.save_modules", 2, monkeypatch)
     assert done.code == 130
     said = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
     assert done.err.splitlines()[-1] == said

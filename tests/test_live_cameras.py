@@ -20,13 +20,14 @@ from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
-from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
+from cdmisfa.experiments.run_folder import RunExhaustedError, RunResult
+from cdmisfa.experiments.session import run
 from cdmisfa.testing.sources import same
 from recorder.cameras.live import LiveSource
 from recorder.cameras.readers import CameraFrames, Readers
 from recorder.cameras.video import Steady
+from recorder.config import Split
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
-from recorder.log.split import Split
 from replay.export.forms import export
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log

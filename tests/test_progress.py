@@ -33,7 +33,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import STATES, canonical_bytes
 from cdmisfa.experiments.loop import Digest, learn
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure
 from recorder.recording import record
 from replay.recordings.source import RecordedSource

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource

@@ -29,7 +29,7 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
 
     What an earlier demo left in the same folder is replaced.
     """
-    from cdmisfa.paper.demo import demo
+    from cdmisfa.studies.demo import demo
 
     report = demo(out or Path(), seed=seed, frames=frames, jobs=jobs, stage=_stage)
     if as_json:
