@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS, open_learner
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.config import as_table, build, differences, parse_settings
+from cdmisfa.core.config import build, differences, parse_settings, section_table
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
@@ -321,7 +321,7 @@ def plan_fork(
             f"{' '.join(settings)}: what was learned does not fit it ({error}): fork with keys "
             "that keep its shape"
         ) from error
-    changes = differences(manifest["config"]["learner"], as_table(config))
+    changes = differences(manifest["config"]["learner"], section_table(config))
     changed = {f"learner.{key}": [old, new] for key, old, new in changes}
     if span.reseeded:
         changed["seed"] = [seed_before, seed]
@@ -352,7 +352,9 @@ def _config_of_fork(before: Mapping[str, Any], settings: Sequence[str]) -> Any:
         raise UsageError(f"{other}.* is the parent's and stays: a fork changes learner.* alone")
     kind = LEARNERS[before["algorithm"]].configuration
     config = build(kind, "learner", before, words.get("learner", {}))
-    for key, old, new in differences(as_table(build(kind, "learner", before)), as_table(config)):
+    for key, old, new in differences(
+        section_table(build(kind, "learner", before)), section_table(config)
+    ):
         if key in KEPT:
             raise UsageError(
                 f"learner.{key} is {old} and stays: what was learned depends on it, so {new} is "
