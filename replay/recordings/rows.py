@@ -35,15 +35,15 @@ class RowLayout:
         what: a message, as an error names it.
         least: fewest bytes of a message.
         marks: by distance bytes that are the same in every message.
-        distances: of each value.
+        distances: (R,) of each value.
         width: bytes of a value.
     """
 
     def __init__(
         self, what: str, least: int, marks: dict[int, int], distances: list[int], width: int
     ) -> None:
-        self.what = what
-        self.least = least
+        self.what, self.least = what, least
+        self.distances, self.width = np.array(distances, np.int64), width
         places, values = list(marks), list(marks.values())
         self._kernel = kernel_layout(least, places, values, distances, width)
 
@@ -118,20 +118,16 @@ class ChannelRows:
         if not (self._reader.salvage and self._reader.table(segment) is None):
             self._number(self._times(number), self._starts[number], self.runs)
 
-    def checked(self, segment: Segment) -> MessageTable | None:
-        """The messages of the chunk that was added last, if it has any and is whole.
+    def check_last(self, segment: Segment) -> None:
+        """Check how messages are laid out in the chunk that was added last, if it is whole.
 
         Raises:
-            LogDamagedError: they are laid out otherwise than others.
+            LogDamagedError: one is laid out otherwise than others.
         """
-        if not self._segments or self._segments[-1] is not segment:
-            return None
-        if self._reader.table(segment) is None:
-            return None
-        number = len(self._segments) - 1
-        table = self._table(number)
-        self._check(number, table, None)
-        return table
+        if self._segments and self._segments[-1] is segment:
+            number = len(self._segments) - 1
+            if self._reader.table(segment) is not None:
+                self._check(number, self._table(number), None)
 
     @property
     def ranges(self) -> list[tuple[int, int]]:

@@ -103,8 +103,8 @@ class ViewFile:
         for rows in self._channels:
             rows.extend()
         self._find_ranges()
-        if self.ranges and self._channels[0].layout is None:
-            self._set_layouts(self._channels[0].payload(self.ranges[0][0]))
+        if self.ranges:
+            self._find_layouts()
 
     def _find_ranges(self) -> None:
         self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))
@@ -143,9 +143,9 @@ class ViewFile:
         """
         for rows in self._channels:
             rows.add(segment)
-            found = rows.checked(segment)
-            if found is not None and self._channels[0].layout is None:
-                self._set_layouts(self._channels[0].payload(self._channels[0].runs[0].start))
+        self._find_layouts()
+        for rows in self._channels:
+            rows.check_last(segment)
 
     def passed(self) -> None:
         """Hear that there is no further chunk: `ranges` are known."""
@@ -155,8 +155,12 @@ class ViewFile:
         """Let go of the file."""
         self.reader.close()
 
-    def _set_layouts(self, first: bytes) -> None:
-        payload = self._find_payload(first)
+    def _find_layouts(self) -> None:
+        """Find where messages hold their values, once there is a frame to look at."""
+        frames = self._channels[0]
+        if frames.layout is not None or not frames.runs:
+            return
+        payload = self._find_payload(frames.payload(frames.runs[0].start))
         place = payload.tail + payload.size
         marks = {place + len(payload.before) - i: b for i, b in enumerate(payload.before)}
         least = place + len(payload.before)
