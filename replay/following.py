@@ -1,8 +1,8 @@
-"""What of the world each module of a run follows: the same for figures and for the view."""
+"""What quantity of the world each module's output follows, for figures and for the view."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from replay.runs.columns import SignalColumns
 from replay.runs.folders import MODULES_FILE, run_log
-from replay.runs.log import TRUTH_TOPIC, WATCHED_TOPIC, RunHeader
+from replay.runs.log import (
+    TRUTH_TOPIC,
+    WATCHED_TOPIC,
+    Frames,
+    RunHeader,
+    read_batches,
+    read_columns,
+)
 from replay.runs.modules import load_modules
-from replay.runs.outline import Outline
-from replay.runs.stretches import Frames, read_columns, read_stretches
+from replay.runs.run import Outline
 
 KEPT = 20_000
 """Last frames of each module's output that are fitted."""
@@ -28,21 +34,17 @@ FREQUENCIES = 12
 """Sines of an angle that are tried."""
 
 LAST_BLOCKS = 40
-"""Blocks before the save whose output is shown with what the frozen module says later."""
-
-
-MOST_HEARD = 64 * 1024 * 1024
-"""Most bytes of a run's outputs that are kept; of a longer run they are read again."""
+"""Blocks before the save whose output is shown with that of the frozen module later."""
 
 
 @dataclass(frozen=True, slots=True)
-class Output:
-    """What a frozen module says about its own stream.
+class OutputHistory:
+    """A frozen module's output wherever its own stream was watched.
 
     Attributes:
         t: (n,) frames at which that stream was watched after the save.
         y: (n,) its first output there.
-        truth: (n, D) what the world knows at these frames; D may be 0.
+        truth: (n, D) ground truth at these frames; D may be 0.
         angles: columns of truth that go round in the run; None: those that do at these frames.
     """
 
@@ -53,8 +55,8 @@ class Output:
     truth: FloatArray
     angles: tuple[int, ...] | None = None
 
-    def follows(self, names: Sequence[str]) -> Following | None:
-        """What the world knows that the output follows most; None where it knows nothing.
+    def best_fit(self, names: Sequence[str]) -> Fit | None:
+        """The quantity that the output follows most, and how; None where there is no truth.
 
         Of a long output the last `KEPT` frames count.
 
@@ -62,46 +64,18 @@ class Output:
             names: of the columns of truth.
         """
         truth, y = self.truth[-KEPT:], self.y[-KEPT:]
-        round_ = _that_go_round(truth) if self.angles is None else self.angles
+        angles = _angles(truth) if self.angles is None else self.angles
         found = [
             fit
             for column, name in enumerate(names[: truth.shape[1]])
-            if (fit := follow(truth[:, column], y, column, name, angle=column in round_))
+            if (fit := simplest_fit(truth[:, column], y, column, name, angle=column in angles))
         ]
         return max(found, key=lambda fit: fit.r, default=None)
 
 
-class Heard:
-    """What of a run's records `read_outputs` needs, kept while they are read for something else.
-
-    Args:
-        modules: how many modules may be asked for, at most.
-    """
-
-    def __init__(self, modules: int) -> None:
-        self._modules = modules
-        self._pieces: list[SignalColumns] = []
-        self._bytes = 0
-
-    def add(self, columns: SignalColumns) -> None:
-        """Take the records that follow."""
-        if self._bytes > MOST_HEARD:
-            self._pieces = []
-            return
-        kept = {name: columns[name] for name in ("t", "stream", "module", "saved", "y")}
-        kept["y_frozen"] = columns["y_frozen"][:, : self._modules, :, :1]
-        self._pieces.append(SignalColumns({name: part.copy() for name, part in kept.items()}))
-        self._bytes += sum(part.nbytes for part in kept.values())
-
-    @property
-    def pieces(self) -> Sequence[SignalColumns] | None:
-        """The records of the whole run; None where they are too many to be kept."""
-        return None if self._bytes > MOST_HEARD else self._pieces
-
-
 @dataclass(frozen=True, slots=True)
-class Following:
-    """A function of something true that an output follows.
+class Fit:
+    """A function of a true quantity that an output follows.
 
     Attributes:
         column: of the truth.
@@ -122,9 +96,9 @@ class Following:
         return np.asarray(self.terms(truth) @ self.weights)
 
 
-def follow(
+def simplest_fit(
     truth: FloatArray, y: FloatArray, column: int, name: str, *, angle: bool
-) -> Following | None:
+) -> Fit | None:
     """The simplest function of a true quantity that an output follows.
 
     Of an angle these are its sines, of all others a straight line or, where
@@ -148,14 +122,14 @@ def follow(
             (f"sin({name if k == 1 else f'{k} {name}'} + c)", partial(_sines, frequency=k))
             for k in range(1, FREQUENCIES + 1)
         ]
-    best: Following | None = None
+    best: Fit | None = None
     for function, terms in tried:
         table = terms(truth)
         weights: FloatArray = np.linalg.lstsq(table, y, rcond=None)[0].astype(np.float64)
         fit = table @ weights
         r = float(np.corrcoef(fit, y)[0, 1]) if np.std(fit) > 0 else 0.0
         if best is None or r > best.r + BETTER:
-            best = Following(column, function, r, weights, terms)
+            best = Fit(column, function, r, weights, terms)
     return best
 
 
@@ -167,7 +141,7 @@ def _sines(x: FloatArray, frequency: int) -> FloatArray:
     return np.stack([np.ones_like(x), np.sin(frequency * x), np.cos(frequency * x)], axis=1)
 
 
-def _that_go_round(truth: FloatArray) -> tuple[int, ...]:
+def _angles(truth: FloatArray) -> tuple[int, ...]:
     """Columns of (n, D) truth that are angles of all around a circle, in radians."""
     if not len(truth):
         return ()
@@ -183,42 +157,40 @@ def read_outputs(
     most: int = KEPT,
     *,
     truth: Frames | None = None,
-    records: Iterable[SignalColumns] | None = None,
-) -> tuple[Output, ...]:
-    """What the first modules of a run say about their own streams; see `read_stretches`.
+) -> tuple[OutputHistory, ...]:
+    """The outputs of the first modules of a run on their own streams; see `read_batches`.
 
-    Of a module whose stream was not watched any more after its save it is what the module says of
-    its last frames before, where it was kept; otherwise what the abstraction said of them while
-    it was still changing.
+    If a module's stream was not watched after its save, it is the module's output on its last
+    frames before, where the module was kept; otherwise the output of the abstraction while it was
+    still changing.
 
     Args:
         path: of the run.
         outline: the run in short.
         modules: how many, at most.
         most: last frames of each.
-        truth: what the world knew at each frame, where that was read already.
-        records: of the run, where they were; see `Heard`.
+        truth: ground truth of each frame, where that was read already.
     """
     header = outline.header
-    heard = [
+    collectors = [
         _OutputCollector(save.module, save.stream, alone=header.by_progress)
         for save in outline.saved[:modules]
     ]
-    if heard and records is None:
-        records = read_columns(path, header)
-    for columns in records or ():
-        for module in heard:
-            module.add(columns)
-    if heard and truth is None:
-        truth = _read_truth(path, header)
-    spoken = {module.number: module.said(most) for module in heard if module.blocks}
-    silent = {m.number: spoken[m.number][0] for m in heard if m.blocks and m.is_silent}
-    spoken |= _of_kept_modules(path, header, silent)
-    angles = _that_go_round(truth[1]) if truth is not None else None
+    if not collectors:
+        return ()
+    for columns in read_columns(path, header):
+        for collector in collectors:
+            collector.add(columns)
+    truth = _read_truth(path, header) if truth is None else truth
+    outputs = {c.number: c.last(most) for c in collectors if c.blocks}
+    silent = {c.number: outputs[c.number][0] for c in collectors if c.blocks and c.is_silent}
+    outputs |= _of_kept_modules(path, header, silent)
+    angles = _angles(truth[1]) if truth is not None else None
     return tuple(
-        Output(module.number, module.stream, t, y, _known_at(t, truth), angles)
-        for module in heard
-        for t, y in [spoken.get(module.number, (np.empty(0, np.int64), np.empty(0)))]
+        OutputHistory(c.number, c.stream, t, y, _truth_at(t, truth), angles)
+        for c in collectors
+        if c.number in outputs
+        for t, y in [outputs[c.number]]
         if len(t)
     )
 
@@ -226,14 +198,14 @@ def read_outputs(
 def _of_kept_modules(
     path: Path, header: RunHeader, silent: Mapping[int, NDArray[np.int64]]
 ) -> dict[int, Frames]:
-    """What modules that were kept say of frames that the log holds."""
+    """Outputs of modules that were kept on frames that the log holds."""
     log = run_log(path)
     if not silent or not (log.parent / MODULES_FILE).is_file():
         return {}
     kept = {m.index: m for m in load_modules(log.parent) if m.index in silent}
     found: dict[int, list[Frames]] = {number: [] for number in kept}
-    for stretch in read_stretches(path, header, topics=(WATCHED_TOPIC,)):
-        for frames, shown in stretch.watched:
+    for batch in read_batches(path, header, topics=(WATCHED_TOPIC,)):
+        for frames, shown in batch.watched:
             for number, module in kept.items():
                 own = np.isin(frames, silent[number])
                 if own.any():
@@ -245,8 +217,8 @@ def _of_kept_modules(
     }
 
 
-def _known_at(t: NDArray[np.int64], truth: Frames | None) -> FloatArray:
-    """(n, D) what the world knew at n frames; D is 0 where it is not known of all of them."""
+def _truth_at(t: NDArray[np.int64], truth: Frames | None) -> FloatArray:
+    """(n, D) ground truth at n frames; D is 0 where not all of them have it."""
     if truth is not None and len(t):
         frames, values = truth
         at = np.searchsorted(frames, t)
@@ -256,11 +228,11 @@ def _known_at(t: NDArray[np.int64], truth: Frames | None) -> FloatArray:
 
 
 def _read_truth(path: Path, header: RunHeader) -> Frames | None:
-    """What the world knew at each frame that was watched; None where it knows nothing."""
+    """Ground truth of each frame that was watched; None where the world has none."""
     if not header.spec.truth:
         return None
-    stretches = read_stretches(path, header, topics=(TRUTH_TOPIC,))
-    pieces = [piece for stretch in stretches for piece in stretch.truth]
+    batches = read_batches(path, header, topics=(TRUTH_TOPIC,))
+    pieces = [piece for batch in batches for piece in batch.truth]
     if not pieces:
         return None
     frames, values = zip(*pieces, strict=True)
@@ -268,7 +240,7 @@ def _read_truth(path: Path, header: RunHeader) -> Frames | None:
 
 
 class _OutputCollector:
-    """What a module says whenever its own stream is watched; at its save, what it last said.
+    """A module's outputs whenever its own stream is watched; before its save the last ones.
 
     Args:
         module: its number.
@@ -284,9 +256,9 @@ class _OutputCollector:
     def add(self, columns: SignalColumns) -> None:
         own, frozen = columns["stream"] == self.stream, columns["y_frozen"]
         if frozen.shape[1] >= self.number:
-            said = frozen[own, self.number - 1, :, 0]
+            outputs = frozen[own, self.number - 1, :, 0]
             self.is_silent &= not own.any()
-            self.blocks += zip(columns.frames[own].tolist(), said, strict=True)
+            self.blocks += zip(columns.frames[own].tolist(), outputs, strict=True)
             return
         # Before it is frozen the abstraction still changes: only its last blocks count.
         own &= self._alone | (columns["module"] == self.number)
@@ -294,8 +266,8 @@ class _OutputCollector:
         self.blocks += zip(columns.frames[own].tolist(), columns["y"][own, :, 0], strict=True)
         del self.blocks[: -LAST_BLOCKS - int(columns["saved"][own].any())]
 
-    def said(self, most: int) -> Frames:
-        """The last `most` frames that were heard, and the output at each."""
+    def last(self, most: int) -> Frames:
+        """The last `most` frames, and the output at each."""
         blocks = self.blocks[-max(most // max(len(self.blocks[0][1]), 1), 1) :]
         t = np.concatenate([start + np.arange(len(y)) for start, y in blocks])
         return t, np.concatenate([y for _, y in blocks])

@@ -64,7 +64,7 @@ def pale(index: int) -> Rgb:
     return PALE[index % len(PALE)]
 
 
-def dim(rgb: Rgb) -> Rgb:
+def darker(rgb: Rgb) -> Rgb:
     """A colour at half its brightness."""
     red, green, blue = (value // 2 for value in rgb)
     return red, green, blue

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcap.writer import Writer
 
-from recorder.images.reading import MessageKind
+from recorder.images.decoding import MessageKind
 
 START = 10**18
 """The log time of what comes first, in nanoseconds."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.signals import BlockSignals
-from replay.runs.stretches import read_columns, read_stretches
+from replay.runs.log import read_batches, read_columns
 from replay.runs.writer import RunWriter
 
 START_NS = 1_451_606_400_000_000_000
@@ -159,7 +159,7 @@ def write_run(
 
 def parts_of(run: Path, kind: str) -> list[Any]:
     """What a run's log holds of one kind: "watched", "truth", "phi" or "events"."""
-    return [part for stretch in read_stretches(run) for part in getattr(stretch, kind)]
+    return [part for batch in read_batches(run) for part in getattr(batch, kind)]
 
 
 def rows_of(run: Path, kind: str) -> NDArray[Any]:

@@ -44,9 +44,9 @@ def buckets(endpoint: str, patch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def s3_files() -> Any:
     """The files as the project opens them."""
-    from replay.storage.servers import _s3
+    from replay.storage.servers import s3_files as files
 
-    return _s3()
+    return files()
 
 
 def forget(files: Any) -> None:

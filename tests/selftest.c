@@ -273,27 +273,6 @@ static void test_records(void) {
   tell("records");
 }
 
-static areas some_areas(int64_t most_pixels, int64_t most_areas) {
-  int64_t pixels = 1 + below(most_pixels), n = 1 + below(most_areas);
-  int64_t *starts = room(n * 8), *counts = room(n * 8), most = 0;
-  for (int64_t i = 0; i < n; i++) {
-    starts[i] = below(pixels);
-    counts[i] = 1 + below(smaller(pixels - starts[i], 256));
-    most = counts[i] > most ? counts[i] : most;
-  }
-  return (areas){.n = n, .pixels = pixels, .most = most, .starts = starts, .counts = counts};
-}
-
-static void test_average(void) {
-  for (int i = 0; i < 60; i++) {
-    areas across = some_areas(i < 30 ? 20 : 700, 40), down = some_areas(30, 9);
-    uint8_t *out = room(across.n * down.n);
-    add_number(average(bytes(across.pixels * down.pixels), &across, &down, out));
-    add(out, across.n * down.n);
-  }
-  tell("average");
-}
-
 int main(void) {
   test_elementary();
   test_projection();
@@ -301,6 +280,5 @@ int main(void) {
   test_recursive();
   test_agent();
   test_records();
-  test_average();
   return 0;
 }

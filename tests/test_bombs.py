@@ -31,8 +31,8 @@ from recorder.log.logfile import LogFile
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
 from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
+from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.log import read_header
-from replay.runs.messages import decode_keyframe, encode_keyframe
 
 OWN = 112
 """Megabytes of a command that has read nothing yet."""

@@ -12,7 +12,7 @@ import pytest
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog

@@ -16,7 +16,7 @@ from message_files import write_mcap
 from PIL import Image
 
 from recorder.config import view_names
-from recorder.images.reading import MessageKind
+from recorder.images.decoding import MessageKind
 
 SMALL = ("--size", "16x12")
 QUICK = ("--max-iterations", "4", "--no-rerun", "--set", "learner.tau=10")
@@ -113,7 +113,7 @@ def test_a_scene_takes_no_camera_options(cdmisfa: Cdmisfa) -> None:
     assert (done.code, "is a scene: --topic is for cameras" in done.err) == (2, True)
     newer = ("--range", "0.3:5", "--from", "1", "--stamp", "header", "--color")
     done = cdmisfa("learn", "oscillatory", *newer)
-    assert "a scene: --from, --range, --stamp and --color are for cameras" in done.err
+    assert "a scene: --color, --range, --stamp and --from are for cameras" in done.err
     done = cdmisfa("learn", "oscillatory", "--size", "12")
     assert (done.code, "128x48" in done.err) == (2, True)
 

@@ -19,7 +19,7 @@ from waiting import wait_for
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import runs_in
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view.properties import (
     properties_of,
     property_chunks,
@@ -38,9 +38,8 @@ from replay.viewer.catalogue import (
     serve_catalogue,
     set_layout,
 )
-from replay.viewer.display import missing_driver
 from replay.viewer.headless import draw_table, headless_viewer
-from replay.viewer.program import free_port, running
+from replay.viewer.program import free_port, missing_driver, running
 
 
 @pytest.fixture

@@ -16,11 +16,12 @@ from PIL import Image
 
 from cdmisfa import GymSource
 from cdmisfa.core.errors import UsageError
-from recorder.cameras.words import CAMERAS, CameraKind, LiveOptions, open_live
-from recorder.images.frames import frame_colors
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.words import CAMERAS, CameraKind, open_live
+from recorder.images.decoding import MessageKind
 from recorder.images.framing import Framing
 from recorder.images.messages import image_decoder
-from recorder.images.reading import MessageKind
+from recorder.images.videos import frame_colors
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 

@@ -14,12 +14,11 @@ from run_data import VECTOR, write_run
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.signals import SIGNALS
 from replay.export.forms import export
-from replay.runs import stretches
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    monkeypatch.setattr(stretches, "ITERATIONS", 7)
+    monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", 7)
     return tmp_path, write_run(tmp_path / "run.mcap", VECTOR, 20)
 
 

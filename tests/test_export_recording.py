@@ -14,8 +14,7 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
 from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
-from replay.export import images as frames
-from replay.export import videos as film
+from replay.export import frames
 from replay.export.forms import export
 
 FRAMES = 53
@@ -267,7 +266,7 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(film, "_pictures", full)
+    monkeypatch.setattr(frames, "_pictures", full)
     for form in ("mp4", "lerobot"):
         with pytest.raises(CdmisfaError, match="No space left on device"):
             export(tmp_path / "r", tmp_path / "out", form)

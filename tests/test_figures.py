@@ -12,7 +12,7 @@ from run_data import IMAGE, VECTOR, write_run
 from cdmisfa.core.errors import UsageError
 from replay.export import figures
 from replay.export.figures import decision, draw_figures, modules, streams
-from replay.export.history import Output, read_history
+from replay.export.history import OutputHistory, read_history
 
 
 @pytest.mark.parametrize(("spec", "count"), [(IMAGE, 4), (VECTOR, 3)], ids=["images", "vectors"])
@@ -79,18 +79,18 @@ def test_policy_is_drawn_where_it_stays(tmp_path):
 
 
 def output_of(y, *truth):
-    return Output(1, 0, np.arange(len(y)), y, np.column_stack(truth))
+    return OutputHistory(1, 0, np.arange(len(y)), y, np.column_stack(truth))
 
 
 def test_an_output_finds_the_truth_it_follows():
     rng = np.random.default_rng(0)
     truth = rng.standard_normal((500, 3))
     y = -2 * truth[:, 1] + 0.01 * rng.standard_normal(500)
-    found = output_of(y, truth, np.ones(500)).follows(("a", "b", "c", "constant"))
+    found = output_of(y, truth, np.ones(500)).best_fit(("a", "b", "c", "constant"))
     assert (found.column, found.function) == (1, "b")
     assert found.r > 0.99
     np.testing.assert_allclose(found(truth[:, 1]), -2 * truth[:, 1], atol=0.01)
-    assert output_of(y, np.ones(500)).follows(("constant",)) is None
+    assert output_of(y, np.ones(500)).best_fit(("constant",)) is None
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_the_simplest_function_of_a_truth_is_named(function, said):
     """The oscillatory streams' slow features are sines of a phase, which itself they follow not."""
     phase = 2 * np.pi * np.arange(1000) / 500 % (2 * np.pi)
     noise = 0.05 * np.random.default_rng(0).standard_normal(1000)
-    found = output_of(function(phase) + noise, phase).follows(("angle",))
+    found = output_of(function(phase) + noise, phase).best_fit(("angle",))
     assert found.function == said
     assert found.r > 0.99
     np.testing.assert_allclose(found(phase), function(phase), atol=0.05)
@@ -114,10 +114,10 @@ def test_the_simplest_function_of_a_truth_is_named(function, said):
 
 def test_no_phase_is_seen_in_what_does_not_go_round():
     x = np.linspace(0.4, 0.6, 500)
-    found = output_of(np.sin(200 * x), x).follows(("box_y",))
+    found = output_of(np.sin(200 * x), x).best_fit(("box_y",))
     assert found.function in ("box_y", "a parabola of box_y")
     places = np.array([0.4, 0.6, 0.4, 0.6])
-    found = output_of(np.array([1.0, 3.0, 1.0, 3.0]), places).follows(("box_y",))
+    found = output_of(np.array([1.0, 3.0, 1.0, 3.0]), places).best_fit(("box_y",))
     assert found.function == "box_y"
     np.testing.assert_allclose(found(np.array([0.4, 0.6])), [1.0, 3.0])
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.testing.sources import ForwardContract, same
 from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError, record

@@ -27,14 +27,14 @@ from test_view_world import SCENE, without_models
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 from replay.view.bindings import viewer_client, viewer_program
-from replay.viewer import display, headless, live
+from replay.viewer import headless, live, program
+from replay.viewer.broadcast import Pieces
 from replay.viewer.live import LiveView
 from replay.viewer.program import open_privately
-from replay.viewer.stream import Stream
 
 MANIFEST = {"config": {"learner": {"delta": 0.0008}}, "seed": 0}
 
@@ -136,9 +136,8 @@ def test_only_who_has_the_address_is_given_the_run(tmp_path):
         reader = threading.Thread(target=lambda: taken.append(urlopen(view.address).read()))
         reader.start()
     reader.join()
-    pieces = list(view._broadcast._stream.read())
-    assert taken == [b"".join(pieces)]
-    (tmp_path / "a.rrd").write_bytes(pieces[-1])
+    (data,) = taken
+    (tmp_path / "a.rrd").write_bytes(data[data.rindex(data[:8]) :])  # the last piece
     paths = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()}
     assert {"/signals/epsilon", "/events"} <= paths
     with pytest.raises(URLError):
@@ -146,7 +145,7 @@ def test_only_who_has_the_address_is_given_the_run(tmp_path):
 
 
 def test_what_does_not_fit_goes_from_behind_the_beginning():
-    stream = Stream(50)
+    stream = Pieces(50)
     early, late = stream.read(), stream.read()
     for number in range(4):
         stream.add(bytes([number]) * 10)
@@ -159,7 +158,7 @@ def test_what_does_not_fit_goes_from_behind_the_beginning():
 
 
 def test_a_viewer_is_given_the_rest_before_the_end():
-    stream = Stream(1000)
+    stream = Pieces(1000)
     taken = []
 
     def slowly():
@@ -177,7 +176,7 @@ def test_a_viewer_is_given_the_rest_before_the_end():
     reader.join()
 
 
-@pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
+@pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
 def test_a_window_shows_the_run_and_nobody_the_address(tmp_path, monkeypatch):
     """The window is one without a screen here."""
     real, words = viewer_program(), tmp_path / "words"
@@ -274,7 +273,7 @@ def test_rerun_switched_off_is_said(monkeypatch):
         LiveView(VECTOR, MANIFEST, 40, 1)
 
 
-@pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
+@pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
 def test_a_viewer_that_connects_shows_it(tmp_path):
     with LiveView(IMAGE, MANIFEST, 40, 1) as view, headless.headless_viewer("900x600") as opened:
         feed(view, IMAGE)

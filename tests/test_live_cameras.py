@@ -20,7 +20,8 @@ from cdmisfa.agents.progress.config import ProgressConfig
 from cdmisfa.core.blocks import FrameSource, SeekableSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
-from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
+from cdmisfa.experiments.run_folder import RunExhaustedError, RunResult
+from cdmisfa.experiments.session import run
 from cdmisfa.testing.sources import same
 from recorder.cameras.live import LiveSource
 from recorder.cameras.readers import CameraFrames, Readers

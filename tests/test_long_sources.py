@@ -20,16 +20,17 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.runs import RunResult, run
+from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.session import run
 from recorder.mcap.reader import LogReader
 from replay.camera_logs.opening import identity_of
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 from replay.runs.compare import told_otherwise
-from replay.runs.final import stated_source
 from replay.runs.log import read_header
+from replay.runs.run import stated_source
 from replay.storage import identity
-from replay.storage.log_identity import log_identity
+from replay.storage.identity import log_identity
 from replay.view.build import build_view
 
 CONFIG = LearnerConfig(tau=20)

@@ -15,11 +15,10 @@ from server_lies import LIES
 
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.reader import LogReader
-from replay.storage import tries
-from replay.storage.limits import Limits, limited, limits
-from replay.storage.location import Url
+from replay.storage import servers
+from replay.storage.location import Limits, Url, limited, limits
 from replay.storage.remote import RemoteStore
-from replay.storage.tries import UnreachableError, asked_wait, backoff
+from replay.storage.servers import UnreachableError, asked_wait, backoff
 
 pytest.importorskip("aiohttp")
 
@@ -28,7 +27,7 @@ BODY = bytes(range(256)) * 1200
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tries, "FIRST_WAIT", 0.005)
+    monkeypatch.setattr(servers, "FIRST_WAIT", 0.005)
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +166,7 @@ def test_a_server_is_not_asked_for_ever() -> None:
     with lying(BODY, LIES["503 for ever"]) as server:
         with pytest.raises(UnreachableError, match="the server answers 503 Busy"):
             RemoteStore(Url(server.address))
-        assert server.requests == tries.TRIES
+        assert server.requests == servers.TRIES
 
 
 def test_what_does_not_get_better_is_asked_once() -> None:
@@ -184,7 +183,7 @@ def test_the_limit_is_for_each_mebibyte() -> None:
 
 
 def test_waits_grow_and_differ(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tries, "FIRST_WAIT", 1.0)
+    monkeypatch.setattr(servers, "FIRST_WAIT", 1.0)
     for attempt in range(5):
         waits = {backoff(attempt) for _ in range(20)}
         assert len(waits) > 10

@@ -19,7 +19,7 @@ from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
 from test_foreign import raw_json, ros1
 from web_server import serving
 
-from recorder.images.reading import MessageKind
+from recorder.images.decoding import MessageKind
 
 COUNT = 60
 STEP_MS = 20

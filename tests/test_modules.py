@@ -14,9 +14,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.modules import Module
-from replay.runs.messages import decode_keyframe, encode_keyframe
-from replay.runs.modules import load_modules, save_modules
-from replay.runs.transformer import SlowFeatures
+from replay.runs.keyframes import decode_keyframe, encode_keyframe
+from replay.runs.modules import SlowFeatures, load_modules, save_modules
 
 EASY = {"delta": 1.0, "eta_dot_window": 3, "min_variance": 0.0, "warm_up": 0, "tau": 20}
 """Saves what it has after a few blocks."""

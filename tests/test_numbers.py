@@ -22,12 +22,11 @@ from message_files import START, STEP, every, write_mcap
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.testing.sources import SourceContract
-from recorder.images.decoding import message_decoder
+from recorder.images.decoding import MessageKind, message_decoder
 from recorder.images.fields import Field, numbers_of
-from recorder.images.reading import MessageKind
 from recorder.log.messages import descriptor_set
-from replay.camera_logs.formats.table import MAX_ROWS
 from replay.camera_logs.source import ForeignSource
+from replay.camera_logs.table import MAX_ROWS
 from replay.recordings.source import RecordedSource
 
 COUNT = 90

@@ -75,11 +75,11 @@ def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
     )
 
 
-@pytest.mark.parametrize("stretch", [500, 2])
-def test_where_a_fork_begins_is_marked_on_each_curve(stretch, three, tmp_path, monkeypatch):
+@pytest.mark.parametrize("batch", [500, 2])
+def test_where_a_fork_begins_is_marked_on_each_curve(batch, three, tmp_path, monkeypatch):
     """Also on one of which nothing is known in that iteration."""
     runs, (records, *_) = three
-    monkeypatch.setattr("replay.runs.stretches.ITERATIONS", stretch)
+    monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", batch)
     monkeypatch.setattr("replay.runs.log.RunHeader.forked_at", 5)
     build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
     marks = 0

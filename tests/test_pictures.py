@@ -11,7 +11,7 @@ from run_data import IMAGE, VECTOR, write_run
 from test_overlay import three
 
 from replay.runs.compare import side_by_side
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view import overlay
 from replay.view.layouts.of_run import run_layout
 from replay.view.recording import recording_layout

@@ -23,7 +23,7 @@ from cdmisfa.experiments.sweep import plan
 from recorder.cameras.words import CAMERAS
 from recorder.world.scenes import SCENES
 from replay.export.forms import FORMS
-from replay.runs.log import read_keyframe
+from replay.runs.keyframes import read_keyframe
 
 ROOT = Path(__file__).parents[1]
 TOY = ROOT / "tests" / "toy_plugin"

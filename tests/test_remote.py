@@ -56,7 +56,7 @@ def web(server: WebServer) -> WebServer:
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("replay.storage.tries.FIRST_WAIT", 0.02)
+    monkeypatch.setattr("replay.storage.servers.FIRST_WAIT", 0.02)
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from conftest import Cdmisfa
 from rtsp_camera import RATE, rtsp_camera
 
 from cdmisfa.core.errors import UsageError
-from recorder.cameras.words import LiveOptions, open_live
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.words import open_live
 from replay.recordings.source import RecordedSource
 
 

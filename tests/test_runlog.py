@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -14,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf import RawImage_pb2
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -24,16 +22,15 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
-from replay.runs.folders import is_run
-from replay.runs.log import read_header
-from replay.runs.messages import (
+from replay.runs.codec import (
     decode_matrix,
     decode_signals,
     encode_matrix,
     encode_signals,
 )
+from replay.runs.folders import is_run
+from replay.runs.log import read_header
 from replay.runs.modules import load_modules, save_modules
-from replay.runs.stretches import PixelFinder
 from replay.runs.writer import RunWriter
 
 
@@ -277,25 +274,3 @@ def test_a_message_does_not_depend_on_how_arrays_lie_in_memory():
         t, back = decode_matrix(encode_matrix(7, matrix))
         assert t == 7
         np.testing.assert_array_equal(back, matrix)
-
-
-def test_pixels_are_found_as_protobuf_finds_them():
-    """Whatever the messages before were, and in whatever order the fields of one stand."""
-    rng = random.Random(0)
-    entries = []
-    for _ in range(400):
-        image = RawImage_pb2.RawImage(width=4, height=2, encoding="mono8", step=4)
-        image.data = rng.randbytes(rng.choice([0, 1, 8, 8, 8, 200]))
-        image.frame_id = rng.choice(["", "left", "right", "straight"])
-        if rng.random() < 0.9:
-            image.timestamp.FromNanoseconds(rng.choice([0, 5, 10**9, rng.randrange(2**61)]))
-        parts = [image.SerializeToString()]
-        if rng.random() < 0.2:  # time last, or another image after the first: the last one counts
-            parts.append(RawImage_pb2.RawImage(data=b"late").SerializeToString())
-            rng.shuffle(parts)
-        entries.append(b"".join(parts))
-    finder = PixelFinder("here")
-    for entry in entries:
-        assert finder.pixels(entry) == RawImage_pb2.RawImage.FromString(entry).data
-    with pytest.raises(LogDamagedError, match=r"here: not a foxglove\.RawImage message"):
-        finder.pixels(b"\x0a\xff")

@@ -22,7 +22,7 @@ from PIL import Image
 from video_packets import COUNT, FOXGLOVE, GROUP, foxglove, video
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.reading import MessageKind
+from recorder.images.decoding import MessageKind
 from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)

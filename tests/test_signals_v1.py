@@ -20,10 +20,10 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals, canonical_bytes
 from cdmisfa.experiments.resume import refuse_difference
+from replay.runs.codec import decode_signals, encode_signals
 from replay.runs.compare import first_difference
 from replay.runs.log import read_header
-from replay.runs.messages import decode_signals, encode_signals
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.layouts import panels
 from replay.view.layouts.of_run import run_layout

@@ -19,8 +19,7 @@ from web_server import serving
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from recorder.images.reading import MessageKind
-from recorder.images.stamps import stamp_of
+from recorder.images.decoding import MessageKind, stamp_of
 from replay.camera_logs.source import ForeignSource
 
 COUNT = 40

@@ -12,17 +12,16 @@ from run_data import read_signals, rows_of
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments import runs
+from cdmisfa.experiments import session
 from recorder.world.oscillatory import OscillatorySource
-from replay.runs.modules import save_modules
-from replay.runs.transformer import SlowFeatures
+from replay.runs.modules import SlowFeatures, save_modules
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run that saved a module of expanded frames, and went on."""
     out = tmp_path_factory.mktemp("run")
-    runs.run(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
+    session.run(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
     return out
 
 
@@ -94,7 +93,7 @@ def test_it_is_a_step_of_a_pipeline():
 
 def test_neither_learner_nor_sklearn_is_loaded():
     code = (
-        "import sys, replay.runs.transformer; "
+        "import sys, replay.runs.modules; "
         "print([m for m in sys.modules if m in ('cdmisfa.agents.learner', 'sklearn', 'rerun')])"
     )
     done = subprocess.run(

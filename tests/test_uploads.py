@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ from s3_server import buckets, serving_s3
 
 from cdmisfa.cli import run
 from cdmisfa.core.errors import CdmisfaError
+from replay.storage import uploads
 from replay.storage.location import Url
-from replay.storage.tries import UnreachableError
-from replay.uploads import objects
-from replay.uploads.results import fetch, upload
+from replay.storage.servers import UnreachableError
+from replay.storage.uploads import fetch, upload
 
 LEARN = ("learn", "oscillatory", "--no-rerun", "--json")
 
@@ -51,15 +51,32 @@ def stored(files: Any, below: str) -> dict[str, bytes]:
 def sent(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The calls that send bytes, as they are made."""
     calls: list[str] = []
-    ask = objects.ask_s3
 
-    def noted(url: Url, call: str, seconds: float, **words: Any) -> Any:
+    def noted(call: str, words: dict[str, Any]) -> None:
         if call in ("put_object", "upload_part"):
-            calls.append(str(url))
-        return ask(url, call, seconds, **words)
+            calls.append(f"s3://{words['Bucket']}/{words['Key']}")
 
-    monkeypatch.setattr(objects, "ask_s3", noted)
+    heard(monkeypatch, noted)
     return calls
+
+
+def heard(
+    patch: pytest.MonkeyPatch,
+    before: Callable[[str, dict[str, Any]], None] = lambda call, words: None,
+    after: Callable[[str, Any], None] = lambda call, answer: None,
+) -> None:
+    """Have each call of the S3 interface told of: it may change the call, or fail it."""
+    from s3fs import S3FileSystem
+
+    ask = S3FileSystem._call_s3
+
+    async def asked(self: Any, call: str, *kinds: Any, **words: Any) -> Any:
+        before(call, words)
+        answer = await ask(self, call, *kinds, **words)
+        after(call, answer)
+        return answer
+
+    patch.setattr(S3FileSystem, "_call_s3", asked)
 
 
 @pytest.mark.parametrize(
@@ -138,17 +155,12 @@ def test_what_is_there_is_kept_before_any_work(cdmisfa: Cdmisfa, s3: Any) -> Non
 def test_an_upload_that_fails_keeps_the_result_and_says_how_to_go_on(
     cdmisfa: Cdmisfa, s3: Any, monkeypatch: pytest.MonkeyPatch, sent: list[str]
 ) -> None:
-    ask, calls = objects.ask_s3, 0
-
-    def failing(url: Url, call: str, seconds: float, **words: Any) -> Any:
-        nonlocal calls
-        calls += call == "put_object"
-        if call == "put_object" and calls == 2:
-            raise UnreachableError(f"{url}: the server answers 503")
-        return ask(url, call, seconds, **words)
+    def failing(call: str, words: dict[str, Any]) -> None:
+        if call == "put_object" and words["Key"].endswith("x2.mcap"):
+            raise UnreachableError("the server answers 503")
 
     with monkeypatch.context() as patch:
-        patch.setattr(objects, "ask_s3", failing)
+        heard(patch, failing)
         done = cdmisfa("record", "oscillatory", "--frames", 20, "-o", "s3://lab/rec")
     assert done.code == 1
     again = "cdmisfa upload rec s3://lab/rec"
@@ -190,7 +202,7 @@ def test_a_run_whose_recording_ends_is_uploaded(cdmisfa: Cdmisfa, s3: Any, tmp_p
 def test_large_files_go_in_parts_and_come_back(
     s3: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sent: list[str]
 ) -> None:
-    monkeypatch.setattr(objects, "PART", 5 << 20)
+    monkeypatch.setattr(uploads, "PART", 5 << 20)
     data = np.random.default_rng(0).bytes((11 << 20) + 3)
     folder = tmp_path / "run" / "logs"
     folder.mkdir(parents=True)
@@ -202,31 +214,29 @@ def test_large_files_go_in_parts_and_come_back(
     assert s3.cat("lab/big/logs/big.mcap") == data
     assert upload(tmp_path / "run", url)[0] == 2
     assert len(sent) == 4
-    fetch(url, tmp_path / "back", objects.objects_below(url), lambda done, total: None)
+    fetch(url, tmp_path / "back", uploads.objects_below(url), lambda done, total: None)
     assert contents(tmp_path / "back") == contents(tmp_path / "run")
 
 
 def test_other_bytes_than_were_sent_are_found(
     s3: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ask = objects.ask_s3
     file, url = tmp_path / "a.csv", Url("s3://lab/a.csv")
     file.write_bytes(b"1,2,3")
 
-    def encrypted(url: Url, call: str, seconds: float, **words: Any) -> Any:
-        answer = ask(url, call, seconds, **words)
-        return {**answer, "ETag": '"0123"'} if call == "head_object" else answer
+    def encrypted(call: str, answer: Any) -> None:
+        if call == "head_object":
+            answer["ETag"] = '"no MD5 of it"'
 
-    monkeypatch.setattr(objects, "ask_s3", encrypted)
+    def lying(call: str, words: dict[str, Any]) -> None:
+        if call == "put_object":
+            del words["ContentMD5"]
+            words["Body"] = b"1,2,4"
+
+    heard(monkeypatch, after=encrypted)
     upload(file, url)  # read again, and found to be the same
     assert s3.cat("lab/a.csv") == b"1,2,3"
-
-    def lying(url: Url, call: str, seconds: float, **words: Any) -> Any:
-        if call == "put_object":
-            words = {"Bucket": words["Bucket"], "Key": words["Key"], "Body": b"1,2,4"}
-        return encrypted(url, call, seconds, **words)
-
-    monkeypatch.setattr(objects, "ask_s3", lying)
+    heard(monkeypatch, lying)
     s3.rm("lab/a.csv")
     with pytest.raises(CdmisfaError, match="the server has other bytes than were sent"):
         upload(file, url)

@@ -22,9 +22,10 @@ from video_packets import COUNT, ENCODERS, FOXGLOVE, GROUP, KINDS, video
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.testing.sources import SourceContract
-from recorder.cameras.words import LiveOptions, open_live
-from recorder.images.frames import frame_gray
-from recorder.images.reading import MessageKind
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.words import open_live
+from recorder.images.decoding import MessageKind
+from recorder.images.videos import frame_gray
 from replay.camera_logs.opening import open_images
 from replay.camera_logs.source import ForeignSource
 from replay.camera_logs.stream import ImageStream

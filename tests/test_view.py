@@ -21,7 +21,7 @@ from cdmisfa.core.signals import SIGNALS
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.modules import save_modules
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view import run as run_view
 from replay.view.build import build_view
 from replay.view.columns import ImageBatch, ImageColumn, TensorBatch, tensors
@@ -202,7 +202,7 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
 def test_the_share_of_the_recent_blocks_is_there(shown, monkeypatch):
     spec, records, _, folder = shown
     monkeypatch.setattr(run_view, "RECENT", 5)
-    monkeypatch.setattr("replay.runs.stretches.ITERATIONS", 4)
+    monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", 4)
     build_view(folder, folder / "short.rrd", every=20)
     found = scalars(rows_of(folder / "short.rrd")["/decision/attention"])
     streams = np.array([s.stream for s in records])

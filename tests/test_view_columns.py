@@ -6,26 +6,23 @@ import dataclasses
 
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from run_data import IMAGE, VECTOR, run_of, write_run
 
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.core.signals import SIGNALS
-from recorder.mcap.records import MalformedRecord
-from replay.runs import messages as codec
-from replay.runs import stretches as stretch
-from replay.runs.columns import columns_of_messages, columns_of_records
-from replay.runs.log import read_header
-from replay.runs.messages import (
-    alike,
+from replay.runs.codec import (
+    MATRIX_DEFINITION,
+    SIGNALS_DEFINITION,
+    decode_columns,
     decode_matrices,
     decode_matrix,
-    decode_signals,
     encode_matrix,
     encode_signals,
-    spans,
 )
-from replay.runs.outline import read_outline
-from replay.runs.stretches import read_stretches
+from replay.runs.columns import columns_of_records
+from replay.runs.log import read_batches, read_header
+from replay.runs.run import read_outline
 from replay.view.build import build_view
 
 ITERATIONS = 30
@@ -33,6 +30,15 @@ ITERATIONS = 30
 
 def records(outputs=1):
     return [s for s, _ in run_of(VECTOR, ITERATIONS, outputs=outputs, saves=True)]
+
+
+def rewritten(definition, data):
+    """A message as protobuf writes it, which knows it from the definition in the log alone."""
+    (file,) = descriptor_pb2.FileDescriptorSet.FromString(definition).file
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    kind = pool.FindMessageTypeByName(f"{file.package}.{file.message_type[0].name}")
+    return message_factory.GetMessageClass(kind).FromString(data).SerializeToString()
 
 
 def bits(value):
@@ -58,50 +64,27 @@ def same(columns, expected):
 def test_messages_become_columns_bit_for_bit(outputs):
     written = records(outputs)
     messages = [encode_signals(s) for s in written]
-    calls = []
-
-    def decode(data):
-        calls.append(data)
-        return decode_signals(data)
-
-    assert same(columns_of_messages(messages, decode), written) == 3  # 0, 1 and 2 modules
-    assert len(calls) == 3  # one of each layout was decoded by itself
+    assert same(decode_columns(messages), written) == 3  # 0, 1 and 2 modules
     assert same(columns_of_records(written), written) == 3
 
 
 def test_messages_laid_out_otherwise_are_decoded_one_by_one():
     """Protobuf allows fields in any order, and leaves out numbers that are zero."""
     written = records()[:8]
-    other = []
-    for i, signals in enumerate(written):
-        message = codec._SIGNALS.FromString(encode_signals(signals))
-        data = message.SerializeToString()
-        other.append(data if i % 2 else encode_signals(signals))
-    same(columns_of_messages(other, decode_signals), written)
-    turned = [encode_signals(s) for s in written]
-    first = spans(turned[0])[1]
-    turned[1] = turned[1][first[1] :] + turned[1][: first[1]]  # of the same size
-    assert len(turned[1]) == len(turned[0])
-    same(columns_of_messages(turned, decode_signals), written)
-
-
-def test_a_message_is_walked_over_and_damage_is_seen():
-    data = encode_matrix(7, np.ones((2, 3)))
-    assert spans(data) == {1: (1, 9), 2: (10, 14), 3: (20, 68)}
-    for broken in (data[:-1], b"\x08", b"\xff" * 12, b"\x0b\x00", b"\x08\x01\x08\x01"):
-        with pytest.raises(MalformedRecord):
-            spans(broken)
-    assert alike([data, data[:-1]], [(1, 9)]) is None
-    assert alike([data, encode_matrix(8, np.ones((2, 3)))], [(1, 9)]) is not None
-    assert alike([data, encode_matrix(8, np.ones((2, 3)))], [(20, 68)]) is None
+    ours = [encode_signals(s) for s in written]
+    theirs = [rewritten(SIGNALS_DEFINITION, data) for data in ours]
+    same(decode_columns([*ours[:3], *theirs[3:6], *ours[6:]]), written)
+    turned = [*ours]
+    turned[1] = ours[1][9:] + ours[1][:9]  # the iteration is last, and the size the same
+    same(decode_columns(turned), written)
 
 
 @pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
 def test_one_pass_reads_what_was_written(tmp_path, monkeypatch, spec):
-    monkeypatch.setattr(stretch, "ITERATIONS", 7)
+    monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", 7)
     log = tmp_path / "run.mcap"
     written = write_run(log, spec, ITERATIONS, phi_every=10)
-    found = list(read_stretches(log, read_header(log)))
+    found = list(read_batches(log, read_header(log)))
     assert [sum(map(len, s.signals)) for s in found] == [7, 7, 7, 7, 2]
     same((columns for s in found for columns in s.signals), written)
     blocks = [block for _, block in run_of(spec, ITERATIONS)]
@@ -117,7 +100,7 @@ def test_one_pass_reads_what_was_written(tmp_path, monkeypatch, spec):
         np.testing.assert_array_equal(np.concatenate([v for _, v in rows]), expected)
     assert [t for s in found for t, _ in s.phi] == [0, 400, 800]
     assert [e.iteration for s in found for e in s.events] == [ITERATIONS - 1]
-    some = read_stretches(log, read_header(log), every=30)
+    some = read_batches(log, read_header(log), every=30)
     times = [t for s in some for frames, _ in s.watched for t in frames.tolist()]
     assert times == list(range(0, ITERATIONS * 40, 30 if spec is IMAGE else 1))
 
@@ -128,7 +111,7 @@ def test_a_record_about_another_stream_is_damage(tmp_path):
     write_run(path, VECTOR, 5)
     header = dataclasses.replace(read_header(path), spec=spec)
     with pytest.raises(LogDamagedError, match="other streams"):
-        list(read_stretches(path, header))
+        list(read_batches(path, header))
 
 
 def test_an_outline_sums_the_records_up(tmp_path):
@@ -156,8 +139,8 @@ def test_matrices_of_one_size_are_read_bit_for_bit_however_they_are_laid_out():
     rows = rng.standard_normal((4, 5, 3))
     rows[1, 2] = np.array([0x7FF8_0000_0000_0001, 1 << 63, 0], np.uint64).view(np.float64)
     ours = [encode_matrix(5 * i, values) for i, values in enumerate(rows)]
-    plain = [codec._MATRIX.FromString(data).SerializeToString() for data in ours]
-    for messages, pieces in ((ours, 1), (plain[1:], 3), ([encode_matrix(7, rows[0, :0])] * 2, 1)):
+    plain = [rewritten(MATRIX_DEFINITION, data) for data in ours]
+    for messages, pieces in ((ours, 1), (plain[1:], 3), ([encode_matrix(7, rows[0, :0])] * 2, 2)):
         found = list(decode_matrices(messages))
         expected = [decode_matrix(data) for data in messages]
         assert len(found) == pieces

@@ -18,11 +18,11 @@ from recorder.log.viewfacts import Identity
 from recorder.log.viewlog import ViewLog
 from replay.recordings.source import RecordedSource
 from replay.runs.modules import save_modules
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
 from replay.view.columns import Column, line_column
-from replay.viewer.moments import frame_at
+from replay.viewer.headless import frame_at
 
 ITERATIONS, TAU, EVERY = 15, 40, 20
 GAP_AFTER, GAP = 4, 95

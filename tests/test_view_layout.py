@@ -17,7 +17,7 @@ from cdmisfa.core.errors import UsageError
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.palette import CYCLE, packed
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view import lanes
 from replay.view.build import build_view
 from replay.view.layouts.of_run import run_layout

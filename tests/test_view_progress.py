@@ -15,7 +15,7 @@ from run_data import IMAGE, VECTOR, parts_of, write_run
 from test_view_layout import Built
 
 from cdmisfa.core.signals import NO_STATE, SIGNALS
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view.build import build_view
 from replay.view.layouts import panels
 from replay.view.layouts.of_run import run_layout
@@ -86,7 +86,7 @@ def shown(request, tmp_path_factory):
     """The records of a run of the progress learner, its folder, and what its view holds."""
     folder = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("replay.runs.stretches.ITERATIONS", 7)  # lanes go on over pieces
+        patch.setattr("replay.runs.log.BATCH_ITERATIONS", 7)  # lanes go on over pieces
         patch.setenv("RERUN_STRICT", "1")
         records = write_run(
             folder / "run.mcap",

@@ -25,7 +25,7 @@ from recorder.world.icub.source import TRUTH, eye_matrix
 from replay.following import read_outputs
 from replay.palette import colour, packed
 from replay.runs.modules import save_modules
-from replay.runs.outline import read_outline
+from replay.runs.run import read_outline
 from replay.view.build import build_view
 from replay.view.world.known import PRESET, world_of_run
 from replay.view.world.wall import places
@@ -142,13 +142,11 @@ def test_the_recording_says_what_stood_where(tmp_path):
     assert world_of_run(header, tmp_path, sample) == (scenery_of(CONFIG), None)
 
 
-@pytest.mark.parametrize("most_heard", [10**6, 0])
-def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path, monkeypatch, most_heard):
+def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
     """Of a module whose stream is not watched after its save, it is what the module says.
 
     A run that is too long to be kept is read again.
     """
-    monkeypatch.setattr("replay.following.MOST_HEARD", most_heard)
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
     outline = read_outline(tmp_path)
     build_view(tmp_path, tmp_path / "run.rrd")
@@ -157,7 +155,7 @@ def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path, monkeypat
     assert set(outputs) == {1, 2, 3}
     for number in (1, 2):
         output = outputs[number]
-        found = output.follows(VECTOR.truth)
+        found = output.best_fit(VECTOR.truth)
         said = scalars(rows[f"/learned/{number}/output"])[:, 0]
         frames = np.array(rows[f"/learned/{number}/output"]["frame"])
         own = np.isfinite(said)

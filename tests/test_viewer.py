@@ -21,8 +21,8 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.view.bindings import viewer_program
 from replay.view.build import build_view, view_of
 from replay.view.layouts import panels
-from replay.viewer import display, headless, window
-from replay.viewer.moments import frame_at
+from replay.viewer import headless, program, window
+from replay.viewer.headless import frame_at
 from replay.viewer.program import (
     check_limit,
     environment,
@@ -40,7 +40,7 @@ def _strict(monkeypatch):
     monkeypatch.setenv("RERUN_STRICT", "1")
 
 
-needs_driver = pytest.mark.skipif(bool(display.missing_driver()), reason=display.missing_driver())
+needs_driver = pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
 
 
 @needs_driver

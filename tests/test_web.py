@@ -12,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -22,9 +23,8 @@ import pytest
 from PIL import Image
 from run_data import VECTOR, write_run
 
-from replay.viewer import webpage
-from replay.viewer.guarded import served
-from replay.viewer.webpage import POLICY, page_of
+from replay.viewer import web
+from replay.viewer.web import POLICY, page_of, served
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -189,15 +189,18 @@ def page():
 
     viewer = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Viewer)
     threading.Thread(target=viewer.serve_forever, args=(0.05,), daemon=True).start()
-    with served(page_of(io.BytesIO(RUN), viewer.server_port)) as address:
-        yield urlsplit(address), viewer
+    with tempfile.TemporaryFile() as run:
+        run.write(RUN)
+        run.flush()
+        with served(page_of(viewer.server_port, run)) as address:
+            yield urlsplit(address), viewer
     viewer.shutdown()
     viewer.server_close()
 
 
 def test_the_policy_goes_with_every_page(page, monkeypatch):
     address, viewer = page
-    monkeypatch.setattr(webpage, "START_SECONDS", 0.2)
+    monkeypatch.setattr(web, "START_SECONDS", 0.2)
     status, headers, body = asked(address.port, f"{address.path}?url=x")
     assert (status, body, headers["Content-Type"]) == (200, b"page", "text/html")
     assert headers["Content-Security-Policy"] == POLICY

@@ -32,7 +32,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "info": ("logs", "Say what is in a recording, a run, any MCAP file, or a camera log."),
     "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
-    "convert": ("convert", "Write camera logs of others as a recording."),
+    "convert": ("record", "Write camera logs of others as a recording."),
     "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),
     "check": (
         "moments",

@@ -1,27 +1,24 @@
-"""Options that several commands share, and how results are printed."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import json
-import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import click
 
+from cdmisfa.cli.making import Command, option, option_of, options_of, together
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments.documents import plain
-
-Command = TypeVar("Command", bound=Callable[..., Any])
+from recorder.cameras.options import LiveOptions
+from recorder.images.options import ImageOptions
+from replay.camera_logs.options import CameraOptions
+from replay.storage.location import Limits, limited, limits
 
 FETCHED = "cdmisfa.fetched"
 """Where a command's context keeps the paths of copies, and what they are copies of."""
-
-SCHEMA = 1
-"""Version of the JSON documents; rises when a key changes its meaning or goes away."""
 
 
 class LocalPath(click.Path):
@@ -40,33 +37,69 @@ OUT = LocalPath(path_type=Path)
 """Type of every option that says where something is written, and of what is read from no URL."""
 
 
-as_json = click.option(
+image_options = options_of(ImageOptions, "images")
+"""How images of cameras, live or stored, become frames."""
+
+log_options = options_of(CameraOptions, "cameras")
+"""What of camera logs becomes frames, and how."""
+
+look_options = options_of(CameraOptions, "cameras", "topics", "fields", "time", "rate", "depth")
+"""What of camera logs is shown or exported."""
+
+live_options = options_of(LiveOptions, "live", "hold", "on_loss", "stall")
+"""How live streams are put on one clock."""
+
+dry_run = option(
+    "--dry-run",
+    is_flag=True,
+    help="Say what would be read from camera logs, and write nothing.",
+    group="Source",
+)
+
+as_json = option(
     "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
 )
 
-seed = click.option(
+seed = option(
     "--seed",
     type=click.IntRange(0, 2**63 - 1),
     default=0,
     show_default=True,
     help="Seed of every random choice.",
+    group="Learner",
 )
 
-settings = click.option(
+settings = option(
     "--set",
     "settings",
     multiple=True,
     metavar="KEY=VALUE",
     help="Set a configuration key, as learner.nu=0.02; may be repeated.",
+    group="Learner",
 )
 
-preset = click.option(
+preset = option(
     "--preset",
     metavar="NAME",
     help="Preset (icub, oscillatory, cameras) or a .toml file; by default the one of the source.",
+    group="Learner",
 )
 
-keyframes = click.option(
+loop = option(
+    "--loop", is_flag=True, help="Start a recording or log again at its end.", group="Source"
+)
+
+salvage = option(
+    "--salvage", is_flag=True, help="Pass over damaged parts and images of a log.", group="Source"
+)
+
+no_rerun = option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+
+retry_failed = option(
+    "--retry-failed", is_flag=True, help="Compute trials again that failed before."
+)
+
+keyframes = option(
     "--keyframes",
     type=click.IntRange(1),
     metavar="N",
@@ -74,7 +107,7 @@ keyframes = click.option(
     "that they stay a small part of the log.",
 )
 
-fsync_every = click.option(
+fsync_every = option(
     "--fsync-every",
     type=click.FloatRange(0.0, 1e6),
     metavar="SECONDS",
@@ -82,9 +115,9 @@ fsync_every = click.option(
     "default the operating system decides until a file is finished.",
 )
 
-force = click.option("--force", is_flag=True, help="Overwrite what is already there.")
+force = option("--force", is_flag=True, help="Overwrite what is already there.")
 
-jobs = click.option(
+jobs = option(
     "--jobs",
     type=click.IntRange(1, 1024),
     default=1,
@@ -92,72 +125,40 @@ jobs = click.option(
     help="Parallel processes.",
 )
 
-
-def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Several options as one, in the order in which --help lists them."""
-    return lambda command: functools.reduce(lambda c, option: option(c), reversed(each), command)
-
-
-def one_of(
-    name: str, values: Sequence[str], meaning: str, *, argument: str | None = None
-) -> Callable[[Command], Command]:
-    """An option that is one of some values, by default the first.
-
-    Args:
-        name: of the option.
-        values: all there are.
-        meaning: for --help.
-        argument: name of the command's argument; by default the option's.
-    """
-    kind, named = click.Choice(list(values)), (name,) if argument is None else (name, argument)
-    return click.option(*named, type=kind, default=values[0], show_default=True, help=meaning)
+engine = together(
+    option(
+        "--engine",
+        type=click.Choice(["local", "dask"]),
+        default="local",
+        show_default=True,
+        help="Where to compute: in processes of this machine, or in workers of dask.",
+    ),
+    option("--scheduler", metavar="ADDRESS", help="Address of a dask scheduler that runs."),
+)
 
 
-def seconds(
-    name: str, default: float, meaning: str, *, least: float = 0.1, **how: Any
-) -> Callable[[Command], Command]:
-    """An option that is how long something may take."""
-    kind = click.FloatRange(least, 1e6)
-    told = {"metavar": "SECONDS", "help": meaning, **how}
-    return click.option(name, type=kind, default=default, show_default=True, **told)
+def end_after(what: str, meaning: str) -> Callable[[Command], Command]:
+    """`--max-iterations` or `--max-modules`."""
+    return option(f"--max-{what}", type=click.IntRange(1), help=meaning, group="Learner")
 
 
-def _limit(option: str, name: str, default: float, meaning: str) -> Callable[[Command], Command]:
-    """An option for one of the `Limits`, which hold while the command runs."""
-
-    def hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
-        from replay.storage.limits import limited, limits
-
-        ctx.with_resource(limited(dataclasses.replace(limits(), **{name: value})))
-
-    return seconds(option, default, meaning, callback=hold, is_eager=True, expose_value=False)
+def _hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
+    """Hold to a limit while the command runs; those of its arguments that are fetched, too."""
+    ctx.with_resource(limited(dataclasses.replace(limits(), **{str(param.name): value})))
 
 
 server_limits = together(
-    _limit(
-        *("--timeout", "total", 60.0),
-        "Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
-    ),
-    _limit(
-        *("--read-timeout", "read", 20.0),
-        "Ask a server again that sends nothing for so long.",
-    ),
+    *(
+        option_of(Limits, field, callback=_hold, is_eager=True, expose_value=False)
+        for field in dataclasses.fields(Limits)
+    )
 )
 """How long the servers of URLs are waited for; a command with a URL among its arguments has it."""
-
-engine = together(
-    one_of(
-        "--engine",
-        ("local", "dask"),
-        "Where to compute: in processes of this machine, or in workers of dask.",
-    ),
-    click.option("--scheduler", metavar="ADDRESS", help="Address of a dask scheduler that runs."),
-)
 
 
 def out(meaning: str, *, required: bool = False) -> Callable[[Command], Command]:
     """`-o`: where the result goes."""
-    return click.option("-o", "--out", type=OUT, required=required, help=meaning)
+    return option("-o", "--out", type=OUT, required=required, help=meaning)
 
 
 def path_argument(name: str) -> Callable[[Command], Command]:
@@ -207,7 +208,7 @@ def _matched(words: tuple[str, ...]) -> tuple[str, ...]:
     """Words with patterns as what matches them."""
     if not any(letter in word for word in words for letter in "*?["):
         return words
-    from replay.inputs.words import places
+    from replay.inputs import places
     from replay.storage.location import Url
 
     return tuple(p.address if isinstance(p, Url) else str(p) for p in places(words))
@@ -225,22 +226,3 @@ def _copy_of(ctx: click.Context, word: str) -> Path:
     names = ctx.meta.setdefault(FETCHED, [])
     names += [(str(copy), str(place)), (str(copy.parent), str(place.parent))]
     return copy
-
-
-def quoted(path: str | Path) -> str:
-    """A path as a shell takes it in a command to copy."""
-    return shlex.quote(str(path))
-
-
-def print_json(document: Mapping[str, Any]) -> None:
-    """One JSON document on stdout; see `plain`."""
-    click.echo(json.dumps(plain(document), allow_nan=False))
-
-
-def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Rows of cells in aligned columns under a ruled head, on stdout."""
-    cells = [[str(cell) for cell in row] for row in (head, *rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    cells.insert(1, ["-" * width for width in widths])
-    for row in cells:
-        click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())

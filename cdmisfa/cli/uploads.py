@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.options import Command
+from cdmisfa.cli.making import Command
+from cdmisfa.cli.printing import quoted
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 
@@ -98,8 +99,7 @@ def uploaded(
         CdmisfaError: it cannot be uploaded.
     """
     from replay.storage.location import Url, location
-    from replay.uploads.objects import objects_below
-    from replay.uploads.results import fetch
+    from replay.storage.uploads import fetch, objects_below
 
     url = location(address)
     assert isinstance(url, Url)
@@ -116,7 +116,7 @@ def uploaded(
             fetch(url, place, there, shown.update)
         click.echo(f"{place} was fetched from {url}", err=True)
     click.echo(f"written to {place}, and uploaded to {url} when it is finished", err=True)
-    again = f"cdmisfa upload {options.quoted(place)} {options.quoted(str(url))}"
+    again = f"cdmisfa upload {quoted(place)} {quoted(str(url))}"
     try:
         yield place
     except UsageError:
@@ -141,7 +141,7 @@ def upload_now(place: Path, url: Url, again: str) -> tuple[int, int]:
         url: where to.
         again: the command that does it again.
     """
-    from replay.uploads.results import upload
+    from replay.storage.uploads import upload
 
     try:
         with bar("uploading", "bytes") as shown:

@@ -1,8 +1,4 @@
-"""What a run is resumed from: the command that began it, and its log with its keyframes.
-
-A keyframe is a learner's state, which stands in the log after the iterations that led to it. So a
-run that was stopped anywhere is resumed from the newest keyframe that can be read.
-"""
+"""What a run continues from: the keyframes of its own log, or its parent's where it is a fork."""
 
 from __future__ import annotations
 
@@ -10,190 +6,50 @@ import dataclasses
 import itertools
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
-from cdmisfa.core.config import differences
+from cdmisfa.agents.learners import LEARNERS, open_learner
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.config import as_table, build, differences, parse_settings
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
-from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
-from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
-from cdmisfa.experiments.documents import versions
+from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
+from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
+from cdmisfa.experiments.command import COMMAND, SET_ASIDE, log_to_resume, read_command
 from cdmisfa.experiments.sources import CLOCK
-from recorder.cameras.words import is_live
-from recorder.log.begun import Begun, found_path, is_path, relative_path
-from recorder.log.whole import partial_path
 from recorder.world.scenes import SCENES
-from replay.camera_logs.options import CameraOptions
+from replay.runs.keyframes import read_keyframe
+from replay.runs.log import read_columns, read_header
+from replay.runs.run import known_to_both, stated_source
 
 if TYPE_CHECKING:
+    from cdmisfa.experiments.recompute import Recomputation
     from replay.runs.writer import RunWriter
 
-COMMAND = "command"
-"""Key of a manifest: the command that began the run, which may differ when it is resumed."""
-
 FORK = "fork"
-"""Key of a manifest: from which run and iteration a fork went on, and what it was told before."""
+"""Key of a manifest: from which run and iteration a fork continues, and its settings before."""
 
-CAMERAS = tuple(field.name for field in dataclasses.fields(CameraOptions))
-"""Options of a command that say how images of others become frames."""
-
-OPTIONS = (
-    "seed",
-    "preset",
-    "settings",
-    "algorithm",
-    "loop",
-    "salvage",
-    "follow",
-    *CAMERAS,
-    "max_iterations",
-    "max_modules",
-    "keyframes",
-)
-"""What of a command makes a run what it is, and where it ends, besides its source."""
-
-SET_ASIDE = "run.before.mcap.partial"
-"""The log of a run that is being resumed, until the new one has taken over what counts."""
-
-EVERY = 100
-"""Iterations between two keyframes, where nothing else is said and the log has room for them."""
-
-SHARE = 5
-"""A keyframe waits until the log has grown by so many times the size of the one before."""
+KEPT = ("algorithm", "expansion", "tau")
+"""Keys of a learner on which what it learned depends, whatever the shapes of its memory."""
 
 
-def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
-    """The command that begins a run, as JSON values; paths are kept relative to its folder.
-
-    Of the options of the command those in `OPTIONS` are kept.
-    """
-    kept = {name: options[name] for name in OPTIONS if name in options}
-    preset = kept.get("preset")
-    if preset is not None and preset.endswith(".toml"):
-        kept["preset"] = relative_path(preset, run)
-    names = [word for word in source if word in SCENES or is_live(word)]
-    return Begun(tuple(source), kept).as_json(run, names)
-
-
-def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """The command that began a run: its source and its options.
-
-    Raises:
-        UsageError: there is no run, it does not say, or its source is of a plugin that is gone.
-        LogDamagedError: its log cannot be read.
-    """
-    from replay.runs.log import read_header
-
-    log = log_to_resume(run)
-    kept = read_header(log).manifest.get(COMMAND)
-    begun = Begun.from_json(kept, run)
-    if begun is None:
-        raise UsageError(f"{run} does not say what it learns from: name its source")
-    for word in map(str, dict(kept or {})["source"]):
-        if not (is_path(word) or word in SCENES or is_live(word)):
-            raise UsageError(
-                f"{run} learns from {word}, which {_packages_gone(log)} brought: install it again"
-            )
-    options = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in begun.options.items()
-        if name in OPTIONS
-    }
-    preset = options.get("preset")
-    if preset is not None and str(preset).endswith(".toml"):
-        options["preset"] = found_path(str(preset), run)
-    return begun.source, options
-
-
-def _packages_gone(log: Path) -> str:
-    """The packages of plugins that a run used and that are not installed any more."""
-    from replay.runs.log import read_keyframe
-
-    keyframe = read_keyframe(log)
-    used = {} if keyframe is None else keyframe.versions
-    gone = [f"{name} {used[name]}" for name in sorted(used.keys() - versions().keys())]
-    return f"the plugin {' or '.join(gone)}" if gone else "a plugin"
-
-
-@dataclass(frozen=True, slots=True)
-class Fork:
-    """Where a run goes on from another one.
-
-    Attributes:
-        log: of the other run.
-        keyframe: where it goes on.
-        ancestry: what the manifest keeps of it: `parent`, `at`, `changed`, and as `before` what
-            the parent was told.
-    """
-
-    log: Path
-    keyframe: Keyframe
-    ancestry: Mapping[str, Any]
-
-
-class Keyframes(Sink):
-    """Writes where a run stands into its log, every so many iterations and at its end.
-
-    It comes after the log, which then holds every iteration before.
-
-    Args:
-        log: of the run.
-        source: what it learns from.
-        learner: what learns.
-        versions: of the packages that compute it.
-        every: iterations between two, 0 writes one at the end only; None for as often as
-            `EVERY` iterations, where they stay below a part in `SHARE` of the log before them.
-    """
-
-    def __init__(
-        self,
-        log: RunWriter,
-        source: FrameSource,
-        learner: Learner,
-        versions: Mapping[str, str],
-        every: int | None = None,
-    ) -> None:
-        self._log, self._source, self._learner = log, source, learner
-        self._versions = versions
-        self._every = EVERY if every is None else every
-        self._share = SHARE if every is None else 0
-        self._due = 0
-        self._t: int | None = None
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        self._t = self._source.t
-        if not self._every or learner.iteration % self._every:
-            return
-        self._log.flush()
-        before = self._log.size
-        if before < self._due:
-            return
-        keyframe = self._keyframe()
-        if not self._due:  # the first, of which nobody knows yet how small it is compressed
-            self._due = self._share * sum(a.nbytes for a in keyframe.state.arrays.values())
-            if before < self._due:
-                return
-        self._log.keyframe(keyframe)
-        self._due = self._log.size + self._share * (self._log.size - before)
-
-    def finish(self) -> None:
-        """See `Sink`."""
-        self._log.keyframe(self._keyframe())
-        self._log.sync()
-
-    def _keyframe(self) -> Keyframe:
-        learner, taken = self._learner, getattr(self._source, "taken", None)
-        # Cameras have moved on, where they ended or were stopped within the next block.
-        t = self._source.t if self._t is None else self._t
-        return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
+def has_header(log: Path) -> bool:
+    """Whether a log says what its run was begun with; one that was killed at once does not."""
+    try:
+        read_header(log)
+    except (LogDamagedError, UsageError):
+        return False
+    return True
 
 
 def restore(learner: Learner, keyframe: Keyframe) -> None:
-    """Put a learner where a keyframe of this configuration stands; of another: LogDamagedError."""
+    """Put a learner into the state of a keyframe.
+
+    Raises:
+        LogDamagedError: the keyframe is of another configuration.
+    """
     try:
         learner.restore(keyframe.state)
     except (LookupError, TypeError, ValueError) as error:
@@ -201,37 +57,24 @@ def restore(learner: Learner, keyframe: Keyframe) -> None:
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
 
 
-def take_over(
-    log: RunWriter, learner: Learner, source: Any, digest: SignalsHash, fork: Fork
-) -> None:
-    """Bring log, learner, source and digest to where a fork goes on."""
-    restore(learner, fork.keyframe)
-    for signals in log.take_over(fork.log, fork.keyframe.iteration):
-        digest.add(signals)
-    source.seek(fork.keyframe.t)
-    changed = [f"{key} is {new}, was {old}" for key, (old, new) in fork.ancestry["changed"].items()]
-    text = f"fork of {fork.ancestry['parent']} after {learner.iteration} iterations"
-    log.event(source.t, max(learner.iteration - 1, 0), "; ".join([text, *changed]))
-    log.keyframe(fork.keyframe, again=True)
-    log.sync()
-
-
-def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> Keyframe | None:
-    """Bring learner and source to where the newest keyframe of a log stands; writes nothing.
+def restore_from(
+    log: Path, learner: Learner, source: Any, forked_at: int | None
+) -> Keyframe | None:
+    """Put learner and source to the newest keyframe of a log that can be read.
 
     Args:
         log: of the run that is to be resumed.
         learner: of its configuration.
-        source: what it learns from; a LogDamagedError where it does not show that any more.
-        forked_at: the iteration from which on a fork is itself, None where it is none; a UsageError
-            where it was cut before.
+        source: what it learns from.
+        forked_at: the iteration where a fork leaves its parent's log; None where it is no fork.
 
     Returns:
-        The keyframe; None where the log has none, and all begins anew.
-    """
-    from replay.runs.log import read_keyframe
-    from replay.runs.stretches import read_columns
+        The keyframe; None where the log has none, and the run begins anew.
 
+    Raises:
+        UsageError: a fork was cut before the iteration where it begins.
+        LogDamagedError: the source does not show any more what was learned from.
+    """
     keyframe = read_keyframe(log)
     if forked_at is not None and (keyframe is None or keyframe.iteration < forked_at):
         raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
@@ -251,16 +94,19 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> 
     return keyframe
 
 
-def bring_back(
+def replay_log(
     log: RunWriter, keyframe: Keyframe | None, digest: SignalsHash, versions: Mapping[str, str]
 ) -> None:
-    """Write what a run that is resumed keeps: all until the keyframe that it went back to.
+    """Write what a run that is resumed keeps of its log: all until the keyframe.
 
     Args:
-        log: of the run; a LogWriteError where the disk does not take it.
-        keyframe: see `go_back`.
+        log: of the run.
+        keyframe: see `restore_from`.
         digest: of its signals, at their beginning.
         versions: of the packages that go on computing it.
+
+    Raises:
+        LogWriteError: the disk does not take it.
     """
     before = log.path.parent / SET_ASIDE
     if not before.exists():
@@ -284,80 +130,55 @@ def bring_back(
         raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
 
 
-def log_to_resume(run: Path) -> Path:
-    """The log of a run that was stopped, wherever it is; a UsageError where there is none."""
-    from replay.runs.folders import RUN_FILE
-
-    finished = run / RUN_FILE
-    for found in (run / SET_ASIDE, partial_path(finished), finished):
-        if found.is_file():
-            return found
-    raise UsageError(
-        f"{run} holds no {RUN_FILE}: there is no run to resume, begin one there with --force"
-    )
-
-
-def set_aside(
-    run: Path, spec: SourceSpec, manifest: Mapping[str, Any], going_back: Callable[[Path], None]
+def copy_parent_log(
+    log: RunWriter,
+    learner: Learner,
+    source: Any,
+    digest: SignalsHash,
+    fork: Fork,
+    versions: Mapping[str, str],
 ) -> None:
-    """Move the log of a run that is to be resumed out of the way, after checking that it may.
+    """Write the parent's iterations into the log of a fork; put learner and source behind them.
 
-    A log that said nothing before the run was stopped stays. Where learner or source cannot go
-    back to where the log stands, all stays as it is.
-
-    Raises:
-        UsageError: there is no run, or it was made with another configuration or source.
+    Args:
+        log: of the fork.
+        learner: of its configuration.
+        source: what it learns from.
+        digest: of its signals, at their beginning.
+        fork: what it continues from.
+        versions: of the packages that compute it.
     """
-    from replay.runs.folders import RUN_FILE
+    keyframe = Keyframe(fork.at, fork.t, fork.state, versions)
+    restore(learner, keyframe)
+    for signals in log.take_over(fork.log, fork.at):
+        digest.add(signals)
+    source.seek(fork.t)
+    log.event(fork.t, max(fork.at - 1, 0), fork.text)
+    log.keyframe(keyframe, again=True)
+    log.sync()
 
-    found = log_to_resume(run)
-    if found == partial_path(run / RUN_FILE) and not _has_header(found):
-        return
-    refuse_difference(run, found, spec, manifest)
-    going_back(found)
+
+def stated_before(folder: Path) -> tuple[Any, Mapping[str, Any] | None]:
+    """The source of a run that is to be resumed, and its fork; None where nothing states them.
+
+    What cannot be read is told where the run is resumed.
+    """
     try:
-        os.replace(found, run / SET_ASIDE)
-    except OSError as error:
-        raise LogWriteError(f"{found} cannot be set aside: {error.strerror}") from error
-
-
-def ancestry_of(run: Path | None) -> Mapping[str, Any] | None:
-    """Of which run a run that is to be resumed is a fork; None where it is none."""
-    from replay.runs.log import read_header
-
-    try:
-        ancestry = None if run is None else read_header(log_to_resume(run)).manifest.get(FORK)
-    except (LogDamagedError, UsageError):  # told where the run is resumed
-        return None
-    known = isinstance(ancestry, Mapping) and isinstance(ancestry.get("at"), int)
-    return ancestry if known else None
-
-
-def stated_whole(run: Path | None) -> bool:
-    """Whether a run that is to be resumed states the SHA-256 of all of a file."""
-    from replay.runs.final import stated_source, states_whole
-
-    try:
-        return run is not None and states_whole(stated_source(log_to_resume(run)))
-    except (LogDamagedError, UsageError):  # told where the run is resumed
-        return False
-
-
-def _has_header(log: Path) -> bool:
-    from replay.runs.log import read_header
-
-    try:
-        read_header(log)
+        log = log_to_resume(folder)
+        source, fork = stated_source(log), read_header(log).manifest.get(FORK)
     except (LogDamagedError, UsageError):
-        return False
-    return True
+        return None, None
+    known = isinstance(fork, Mapping) and isinstance(fork.get("at"), int)
+    return source, fork if known else None
 
 
 def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
-    """Refuse to resume with another configuration, seed or source, naming the first difference."""
-    from replay.runs.final import known_to_both, stated_source
-    from replay.runs.log import read_header
+    """Refuse to resume with another configuration, seed or source, naming the first difference.
 
+    Raises:
+        UsageError: there is one.
+        LogDamagedError: the log cannot be read.
+    """
     header = read_header(log)
     source_then, source_now = known_to_both(stated_source(log), _json(manifest["source"]))
     before = {
@@ -395,3 +216,146 @@ def _clock(spec: SourceSpec) -> list[Any]:
 
 def _json(value: Any) -> Any:
     return json.loads(json.dumps(value))
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigSpan:
+    """The configuration and seed of a run's learner from an iteration on; a fork begins one."""
+
+    start: int
+    config: Any
+    seed: int
+    reseeded: bool
+
+
+def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, ...]:
+    """The configurations of a run, in order.
+
+    Raises:
+        LogDamagedError: its manifest does not state them.
+    """
+    try:
+        table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
+        config = build(LEARNERS[table["algorithm"]].configuration, "learner", table)
+        if fork is None:
+            return (ConfigSpan(0, config, seed, reseeded=False),)
+        before = config_history(log, fork["before"])
+        reseeded = seed != before[-1].seed
+        return (*before, ConfigSpan(int(fork["at"]), config, seed, reseeded))
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise LogDamagedError(f"{log} does not say how its learner was configured") from error
+
+
+def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learner:
+    """A learner in the state of another one, with another configuration.
+
+    Raises:
+        ValueError: what was learned does not fit the configuration.
+    """
+    new, state = open_learner(span.config, spec, span.seed), learner.state
+    policy_rng = new.state.policy_rng if span.reseeded else state.policy_rng
+    new.restore(LearnerState(state.arrays, state.modules, policy_rng))
+    return new
+
+
+@dataclass(frozen=True, slots=True)
+class Fork:
+    """Where and how a run continues another one.
+
+    Attributes:
+        log: of the parent.
+        at: iterations kept of it.
+        t: the source's next frame.
+        state: of the learner.
+        config: of the learner from there on.
+        seed: of the random choices from there on.
+        sections: the parent's configuration tables besides the learner's.
+        words: the source, as the command of the fork names it; empty where nobody knows.
+        options: of that command.
+        ancestry: what the manifest states: `parent`, `at`, `changed`, and as `before` the
+            configuration, seed and ancestry of the parent.
+    """
+
+    log: Path
+    at: int
+    t: int
+    state: LearnerState
+    config: Any
+    seed: int
+    sections: Mapping[str, Any]
+    words: tuple[str, ...]
+    options: Mapping[str, Any]
+    ancestry: Mapping[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The fork in words."""
+        changes = self.ancestry["changed"].items()
+        changed = [f"{key} is {new}, was {old}" for key, (old, new) in changes]
+        return "; ".join(
+            [f"fork of {self.ancestry['parent']} after {self.at} iterations", *changed]
+        )
+
+
+def plan_fork(
+    parent: Recomputation,
+    folder: Path,
+    settings: Sequence[str],
+    seed: int | None,
+    source: Sequence[str],
+) -> Fork:
+    """What is needed to continue a run where it was computed again; see `Session.fork`.
+
+    Raises:
+        UsageError: a setting cannot change.
+    """
+    log, at, manifest = parent.log, parent.learner.iteration, parent.header.manifest
+    seed_before = int(manifest["seed"])
+    seed = seed_before if seed is None else seed
+    config = _config_of_fork(manifest["config"]["learner"], settings)
+    span = ConfigSpan(at, config, seed, reseeded=seed != seed_before)
+    try:
+        state = reconfigured(parent.learner, span, parent.header.spec).state
+    except (ValueError, UsageError) as error:
+        raise UsageError(
+            f"{' '.join(settings)}: what was learned does not fit it ({error}): fork with keys "
+            "that keep its shape"
+        ) from error
+    changes = differences(manifest["config"]["learner"], as_table(config))
+    changed = {f"learner.{key}": [old, new] for key, old, new in changes}
+    if span.reseeded:
+        changed["seed"] = [seed_before, seed]
+    ancestry = {
+        "parent": os.path.relpath(log.parent, folder),
+        "at": at,
+        "changed": changed,
+        "before": {key: manifest[key] for key in ("config", "seed", FORK) if key in manifest},
+    }
+    sections = {name: table for name, table in manifest["config"].items() if name != "learner"}
+    try:
+        words, options = read_command(log.parent)
+    except UsageError:
+        words, options = (), {}
+    world = sections.get("scene", {}).get("seed")
+    kept = () if world is None else (f"scene.seed={world}",)  # only the learner's changes
+    options |= {"settings": (*options.get("settings", ()), *kept, *settings), "seed": seed}
+    return Fork(
+        log, at, parent.t, state, config, seed, sections, tuple(source) or words, options, ancestry
+    )
+
+
+def _config_of_fork(before: Mapping[str, Any], settings: Sequence[str]) -> Any:
+    """The configuration of a fork's learner."""
+    words = parse_settings(settings)
+    other = next((section for section in words if section != "learner"), None)
+    if other is not None:
+        raise UsageError(f"{other}.* is the parent's and stays: a fork changes learner.* alone")
+    kind = LEARNERS[before["algorithm"]].configuration
+    config = build(kind, "learner", before, words.get("learner", {}))
+    for key, old, new in differences(as_table(build(kind, "learner", before)), as_table(config)):
+        if key in KEPT:
+            raise UsageError(
+                f"learner.{key} is {old} and stays: what was learned depends on it, so {new} is "
+                "for a run of its own"
+            )
+    return config

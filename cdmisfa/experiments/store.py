@@ -36,7 +36,7 @@ def code(*more: str) -> str:
     """Version of what a trial computes: the package's, and a hash of learner and recorder.
 
     Args:
-        more: further modules that decide it: "cdmisfa/arena/trial".
+        more: further modules that decide it: "cdmisfa/studies/arena/trial".
     """
     root = Path(__file__).parents[2]
     rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")

@@ -1,4 +1,4 @@
-/* Bytes of logs and of images on their way to frames. */
+/* Chunks of logs: their messages found, and the values in them copied. */
 
 enum { /* of a log's records: an opcode, and bytes of what stands before something */
   MESSAGE = 5,
@@ -57,67 +57,5 @@ int gather(const uint8_t *data, int64_t size, const message *messages, int64_t n
     for (int64_t r = 0; out && r < l->values; r++, out += l->width)
       memcpy(out, end - l->distances[r], (size_t)l->width);
   }
-  return 0;
-}
-
-/* A mean by a sum and the weight of each of its bytes, rounded as Pillow does it. */
-INLINE uint8_t mean_of(uint32_t total, uint32_t weight) {
-  return (uint8_t)((total * weight + (1u << 21)) >> 22);
-}
-
-/* One of so many, in 2^-22ths. */
-static uint32_t weight_of(int64_t count) {
-  return (uint32_t)(0.5 + 1.0 / (double)count * (1 << 22));
-}
-
-/* Sums over the areas of a row, (n,), of each in four parts of 16 bits.
- *
- * Eight bytes are summed at once; masks (words, n) say which of eight bytes after eight bytes are
- * in an area. Up to 8 words bytes behind the row are read, and masked.
- */
-static void sum_areas(const uint8_t *row, const areas *x, int64_t words, const uint64_t *masks,
-                      uint64_t *sums) {
-  const uint64_t even = 0x00ff00ff00ff00ff;
-  memset(sums, 0, (size_t)x->n * sizeof *sums);
-  for (int64_t j = 0; j < words; j++, row += 8, masks += x->n)
-    for (int64_t i = 0; i < x->n; i++) {
-      uint64_t bytes = number(row + x->starts[i], 8) & masks[i];
-      sums[i] += (bytes & even) + ((bytes >> 8) & even);
-    }
-}
-
-/* Means of the areas of an image: along its rows, rounded, and of those along the columns. */
-int average(const uint8_t *image, const areas *across, const areas *down, uint8_t *out) {
-  int64_t width = across->n, columns = across->pixels, rows = down->pixels;
-  int64_t words = (across->most + 7) / 8, padded = columns + 8 * words;
-  size_t numbers = (size_t)(width * (words + 2));
-  uint64_t *masks = calloc(numbers * sizeof *masks + (size_t)(padded + rows * width), 1);
-  if (!masks) return NO_MEMORY;
-  uint64_t *sums = masks + words * width;
-  uint32_t *weights = (uint32_t *)(sums + width), *totals = weights + width;
-  uint8_t *row = (uint8_t *)(totals + width), *means = row + padded;
-  for (int64_t x = 0; x < width; x++) {
-    weights[x] = weight_of(across->counts[x]);
-    for (int64_t k = 0; k < across->counts[x]; k++)
-      masks[k / 8 * width + x] |= (uint64_t)255 << k % 8 * 8;
-  }
-  for (int64_t y = 0; y < rows; y++) {
-    const uint8_t *from = image + y * columns;
-    if ((rows - y) * columns < padded) from = memcpy(row, from, (size_t)columns);
-    sum_areas(from, across, words, masks, sums);
-    for (int64_t x = 0; x < width; x++) {
-      uint64_t halves = sums[x] + (sums[x] >> 32);
-      means[y * width + x] = mean_of((halves + (halves >> 16)) & 0xffff, weights[x]);
-    }
-  }
-  for (int64_t y = 0; y < down->n; y++) {
-    uint32_t weight = weight_of(down->counts[y]);
-    const uint8_t *first = means + down->starts[y] * width;
-    memset(totals, 0, (size_t)width * sizeof *totals);
-    for (int64_t i = 0; i < down->counts[y]; i++)
-      for (int64_t x = 0; x < width; x++) totals[x] += first[i * width + x];
-    for (int64_t x = 0; x < width; x++) out[y * width + x] = mean_of(totals[x], weight);
-  }
-  free(masks);
   return 0;
 }

@@ -1,4 +1,4 @@
-"""Chunks of logs and images, as `frames.c` looks through and averages them."""
+"""Chunks of logs, as `frames.c` looks through them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import UsageError
-from cdmisfa.kernels import INT64, Struct, check, pointer, readable
+from cdmisfa.kernels import INT64, Struct, pointer, readable
 
 
 def _buffer(kind: str, data: Any) -> Any:
@@ -97,32 +97,3 @@ def gather(
     rows = _buffer("message[]", messages)
     code = kernels.lib.gather(_buffer("uint8_t[]", data), len(data), rows, n, held, into)
     return int(code) == 0
-
-
-MOST_AVERAGED = 256
-"""Most pixels of an area in a row or column: their sum fits 16 bits."""
-
-
-def areas(pixels: int, starts: Any, counts: Any) -> Struct:
-    """The areas (n,) that the pixels of a row or a column are averaged over, for `average`.
-
-    Raises:
-        UsageError: one lies outside of the pixels, or is empty or too large.
-    """
-    starts, counts = np.array(starts, np.int64), np.array(counts, np.int64)
-    sound = (starts >= 0) & (counts > 0) & (counts <= MOST_AVERAGED) & (starts <= pixels - counts)
-    if not sound.all():
-        raise UsageError(f"an area of {pixels} pixels is empty, too large, or outside of them")
-    arrays = {"starts": starts, "counts": counts}
-    pointers = {k: pointer(k, array, (len(starts),), INT64) for k, array in arrays.items()}
-    sizes = {"n": len(starts), "pixels": pixels, "most": counts.max(initial=0)}
-    return Struct("areas", sizes, pointers)
-
-
-def average(image: NDArray[np.uint8], across: Struct, down: Struct) -> NDArray[np.uint8]:
-    """Average the areas of an image (rows, columns), along its rows and then down its columns."""
-    out = np.empty((down.pointer.n, across.pointer.n), np.uint8)
-    pixels = readable("image", image, (down.pointer.pixels, across.pointer.pixels), UINT8)
-    into = _buffer("uint8_t[]", out)
-    check(kernels.lib.average(pixels, across.pointer, down.pointer, into), "image")
-    return out

@@ -151,13 +151,6 @@ typedef struct {
 int gather(const uint8_t *data, int64_t size, const message *messages, int64_t n, const layout *l,
            uint8_t *out);
 
-/* The areas that the pixels of a row or a column are averaged over, n of up to 256 each. */
-typedef struct {
-  int64_t n, pixels, most;        /* the most pixels of an area */
-  const int64_t *starts, *counts; /* (n,) its first pixel, and how many; within the pixels */
-} areas;
-int average(const uint8_t *image, const areas *across, const areas *down, uint8_t *out);
-
 /* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
 void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);
 

@@ -19,10 +19,10 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.cameras.video import Steady
-from recorder.images.decoding import Taken, decoder_of
+from recorder.images.decoding import MessageKind, Taken, decoder_of
 from recorder.images.messages import holds_distances
+from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
-from recorder.images.reading import IMAGES, MessageKind, Reading
 from recorder.images.videos import VideoPackets
 
 PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")

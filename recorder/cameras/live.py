@@ -23,11 +23,9 @@ from cdmisfa.core.blocks import (
 )
 from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS, time_of
 from cdmisfa.core.errors import LogExhaustedError, UsageError
+from recorder.cameras.options import HOLD
 from recorder.cameras.readers import Picture, Readers
 from recorder.images.pixels import Shown
-
-HOLD: Final = 0.25
-"""Seconds for which a picture stands for those that are missing."""
 
 PATIENCE: Final = 0.2
 """Seconds for which a tick waits for a picture that is on its way."""

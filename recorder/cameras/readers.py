@@ -7,19 +7,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
+from recorder.cameras.options import STALL, OnLoss
 from recorder.images.fields import rounded
-from recorder.images.framing import Fit, Framing, Size, Vector, framings, size_of
+from recorder.images.framing import Framing, Vector, framings, size_of
+from recorder.images.options import Fit, Size
 from recorder.images.pixels import Shown
-
-OnLoss = Literal["reconnect", "wait", "end"]
-"""What is done about a camera that stalls or goes away."""
-
-STALL: Final = 5.0
-"""Seconds without a picture after which a camera is said to have stalled."""
 
 QUEUE_BYTES: Final = 64 * 1024 * 1024
 """Most bytes of pictures that wait of one camera."""

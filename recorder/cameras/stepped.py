@@ -19,9 +19,10 @@ from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.blocks import Block, ForwardSource, SourceSpec, as_array, check_request, freeze
 from cdmisfa.core.clock import START_NS
 from cdmisfa.core.errors import LogExhaustedError, UsageError, one_line
-from recorder.images.frames import COLOR_RECIPE
-from recorder.images.framing import Fit, Size, framings
+from recorder.images.framing import framings
+from recorder.images.options import Fit, Size
 from recorder.images.pixels import RECIPE
+from recorder.images.videos import COLOR_RECIPE
 
 LARGEST_SEED: Final = 2**31 - 1
 

@@ -14,9 +14,8 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted.memory import BUDGET, budget
-from recorder.images.frames import frame_colors, frame_gray
 from recorder.images.pixels import MAX_PIXELS
-from recorder.images.videos import most_pixels, pyav
+from recorder.images.videos import frame_colors, frame_gray, most_pixels, pyav
 
 DRIFT: Final = 1e-3
 """Seconds a second by which a camera's clock may be slow."""

@@ -11,14 +11,14 @@ from urllib.parse import unquote, urlsplit
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from recorder.cameras.live import HOLD, LiveSource
-from recorder.cameras.readers import STALL, Camera, CameraFrames, OnLoss, Readers
+from recorder.cameras.live import LiveSource
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.readers import Camera, CameraFrames, Readers
 from recorder.config import view_names
 from recorder.images.fields import NUMBERS_RECIPE
-from recorder.images.frames import COLOR_RECIPE, VIDEO_RECIPE
-from recorder.images.framing import Fit, Size
-from recorder.images.pixels import RECIPE, Depth
-from recorder.images.reading import Reading
+from recorder.images.options import Reading
+from recorder.images.pixels import RECIPE
+from recorder.images.videos import COLOR_RECIPE, VIDEO_RECIPE
 
 PACKAGES: Final = "packages"
 """Key of what cameras of plugins say of themselves: the versions of their packages."""
@@ -72,36 +72,6 @@ CAMERAS: Registry[CameraKind] = Registry(
     group="cdmisfa.sources",
 )
 """What cameras' words begin with; `CAMERAS.add` and entry points `cdmisfa.sources` add others."""
-
-
-@dataclass(frozen=True, slots=True)
-class LiveOptions:
-    """How live streams become streams of frames.
-
-    Attributes:
-        size: (height, width) of a frame, or None for one from the first stream's images.
-        fit: how images of another aspect ratio become frames: see `fitted`.
-        depth: distances in metres that are shown black and white, and the range that numbers
-            are kept in; None for none.
-        fields: the numbers that are taken of messages instead of images; see `Field`.
-        color: whether frames show red, green and blue beside one another.
-        rate: frames a second; None for the first stream's.
-        hold: seconds for which a picture stands for those that are missing.
-        on_loss: what is done about a camera that stalls or goes away.
-        stall: seconds without a picture after which a camera has stalled.
-        seed: of simulated tasks.
-    """
-
-    size: Size | None = None
-    fit: Fit = "crop"
-    depth: Depth | None = None
-    fields: tuple[str, ...] = ()
-    color: bool = False
-    rate: float | None = None
-    hold: float = HOLD
-    on_loss: OnLoss = "reconnect"
-    stall: float = STALL
-    seed: int = 0
 
 
 def is_live(word: str) -> bool:

@@ -10,7 +10,8 @@ import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
-from recorder.images.pixels import Depth, MalformedImage
+from recorder.images.options import Depth
+from recorder.images.pixels import MalformedImage
 
 NUMBERS_RECIPE: Final = "numbers as they are, float64"
 """How numbers become a frame, for the record."""
@@ -22,6 +23,7 @@ EXACT: Final = 2.0**53
 """Up to here float64 holds every whole number."""
 
 _STEP: Final = re.compile(r"\.?([^.\[\]]+)|\[(\d{1,9})\]|\[(\d{0,9}):(\d{0,9})\]")
+_PATH: Final = re.compile(rf"[^.\[\]]+(?:\.[^.\[\]]+|{_STEP.pattern.partition('|')[2]})*")
 
 _Step = str | int | slice
 
@@ -31,43 +33,25 @@ class Field:
 
     What follows a list or a part of one is taken of each of its members.
 
+    Args:
+        path: as the user wrote it.
+        plain: it is a name, whatever that is made of.
+
     Raises:
         UsageError: it is no such path.
     """
 
-    def __init__(self, path: str) -> None:
-        self.path = path
-        self._steps: list[_Step] = []
-        at = 0
-        while at < len(path):
-            found = _STEP.match(path, at)
-            if found is None or (at == 0) != (path[at] not in ".["):
-                raise UsageError(
-                    f"--field {path} is no field: write names with dots, an index or a part of "
-                    "it, as pose.position.x or ranges[0:100]"
-                )
-            name, index, start, stop = found.groups()
-            if name is not None:
-                self._steps.append(name)
-            elif index is not None:
-                self._steps.append(int(index))
-            else:
-                self._steps.append(slice(int(start or 0), int(stop) if stop else None))
-            at = found.end()
-        if not self._steps:
+    def __init__(self, path: str, *, plain: bool = False) -> None:
+        if not path:
             raise UsageError("--field is empty: name a field of the messages")
-
-    @classmethod
-    def named(cls, name: str) -> Field:
-        """The field of this name, whatever its name is made of."""
-        field = cls.__new__(cls)
-        field.path, field._steps = name, [name]
-        return field
-
-    @property
-    def first(self) -> str:
-        """The name that it begins with."""
-        return str(self._steps[0])
+        if not plain and not _PATH.fullmatch(path):
+            raise UsageError(
+                f"--field {path} is no field: write names with dots, an index or a part of "
+                "it, as pose.position.x or ranges[0:100]"
+            )
+        self.path = path
+        self._steps: list[_Step] = [path] if plain else list(map(_step, _STEP.finditer(path)))
+        self.first = str(self._steps[0])
 
     def numbers(self, message: Any) -> list[float]:
         """What stands there in a message; NaN where that is null.
@@ -104,6 +88,13 @@ class Field:
             remedy = ", all of them are [0:]" if isinstance(step, slice) else ""
             raise UsageError(f"--field {self.path}: there are {len(value)} members only{remedy}")
         return value[step]
+
+
+def _step(found: re.Match[str]) -> _Step:
+    name, index, start, stop = found.groups()
+    if name is not None:
+        return str(name)
+    return int(index) if index is not None else slice(int(start or 0), int(stop) if stop else None)
 
 
 def numbers_of(fields: Iterable[Field], message: Any, bounds: Depth | None) -> FloatArray:

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError, are_for
+from recorder.images.options import Fit, Size
 from recorder.images.pixels import Shown, shrink
-
-Fit = Literal["crop", "pad", "stretch"]
-"""How an image of another ratio of the sides becomes a frame: see `fitted`."""
 
 FRAME_PIXELS: Final = 48 * 128
 """Most pixels of a frame where no size is given: those of the paper's."""
-
-Size = tuple[int, int]
-"""(height, width) in pixels."""
 
 
 @dataclass(frozen=True, slots=True)

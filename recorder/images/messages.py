@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import struct
 from collections.abc import Callable, Mapping
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
+from recorder.images.options import Depth
 from recorder.images.pixels import (
     DISTANCES,
-    Depth,
     MalformedImage,
     compressed_image,
     compressed_words,
@@ -35,6 +35,9 @@ Decoder = Callable[[bytes | memoryview], ByteArray]
 One that is `VideoPackets` has to be called with the messages in their order.
 """
 
+_DEPTH_HEADER: Final = struct.Struct("<iff")
+"""How compressed_depth_image_transport packed distances, and with which two numbers."""
+
 
 class Pixels(NamedTuple):
     """What a message with pixels says; see `raw_image`."""
@@ -46,6 +49,10 @@ class Pixels(NamedTuple):
     step: int
     big_endian: bool = False
 
+    def image(self, depth: Depth | None, *, color: bool) -> ByteArray:
+        """The image that they show; see `raw_image`."""
+        return raw_image(*self[:5], big_endian=self.big_endian, depth=depth, color=color)
+
 
 class Compressed(NamedTuple):
     """What a message with a JPEG or PNG says.
@@ -53,12 +60,27 @@ class Compressed(NamedTuple):
     Attributes:
         data: of the image; of compressed_depth_image_transport, behind a header.
         encoding: of the pixels that were compressed, where ROS says it; else nothing of use.
-        depth: whether it is of compressed_depth_image_transport.
+        packed_depth: whether it is of compressed_depth_image_transport.
     """
 
     data: bytes
     encoding: str = ""
-    depth: bool = False
+    packed_depth: bool = False
+
+    def image(self, depth: Depth | None, *, color: bool) -> ByteArray:
+        """The image that it shows; see `raw_image`."""
+        if self.encoding not in DISTANCES:
+            return compressed_image(self.data, color=color)
+        head = _DEPTH_HEADER.size if self.packed_depth else 0
+        words = compressed_words(self.data[head:])
+        distances: NDArray[Any] = words.astype("<u2")
+        if self.encoding == "32FC1":  # stored by their inverses, rounded; 0 where none was measured
+            _, scale, offset = _DEPTH_HEADER.unpack_from(self.data)
+            inverse = words.astype(np.float32) - np.float32(offset)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                distances = np.where(words > 0, np.float32(scale) / inverse, np.nan).astype("<f4")
+        height, width = words.shape
+        return raw_image(distances.tobytes(), height, width, self.encoding, depth=depth)
 
 
 def image_decoder(
@@ -72,88 +94,53 @@ def image_decoder(
         depth: how distances are shown; see `raw_image`.
         color: give what has colours as they are; see `raw_image`.
     """
-    if (pixels := _RAW.get((schema, encoding))) is not None:
-        return lambda data: raw_image(**pixels(data)._asdict(), depth=depth, color=color)
-    if (packet := _PACKETS.get((schema, encoding))) is not None:
-        return VideoPackets(packet, color=color)
-    if (packed := _COMPRESSED.get((schema, encoding))) is not None:
-        return lambda data: _unpacked(packed(data), depth, color=color)
-    return None
+    opened = _IMAGES.get((schema, encoding))
+    if opened is not None:
+        return lambda data: opened(data).image(depth, color=color)
+    packet = _VIDEOS.get((schema, encoding))
+    return None if packet is None else VideoPackets(packet, color=color)
 
 
 def holds_distances(schema: str, encoding: str, data: bytes | memoryview) -> bool:
     """Whether a message of such a kind holds distances; raises MalformedImage."""
-    found = _RAW.get((schema, encoding)) or _COMPRESSED.get((schema, encoding))
-    return found is not None and found(data).encoding in DISTANCES
+    opened = _IMAGES.get((schema, encoding))
+    return opened is not None and opened(data).encoding in DISTANCES
 
 
-def _foxglove_raw(data: bytes | memoryview) -> Pixels:
-    m = _parse(RawImage, data)
-    return Pixels(m.data, m.height, m.width, m.encoding, m.step)
+def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
+    """What opens Foxglove's images, of which logs need not state a definition; None of others."""
+    for kind in (RawImage, CompressedImage, CompressedVideo):
+        if (schema, encoding) == (kind.DESCRIPTOR.full_name, "protobuf"):
+            return partial(_protobuf, kind)
+    return None
 
 
-def _unpacked(image: Compressed, depth: Depth | None, *, color: bool) -> ByteArray:
-    """What a compressed image shows; see `raw_image`."""
-    if image.encoding not in DISTANCES:
-        return compressed_image(image.data, color=color)
-    words = compressed_words(image.data[_DEPTH_HEADER.size :] if image.depth else image.data)
-    distances: NDArray[Any] = words.astype("<u2")
-    if image.encoding == "32FC1":
-        distances = _metres(words, image.data).astype("<f4")
-    height, width = words.shape
-    return raw_image(distances.tobytes(), height, width, image.encoding, depth=depth)
+def ros_stamp(data: bytes | memoryview, *, ros1: bool) -> int:
+    """The time in the header that a ROS message begins with, nanoseconds."""
+    return _RosFields(data, ros1=ros1).stamp
 
 
-def _metres(words: NDArray[np.uint16], data: bytes) -> NDArray[np.float32]:
-    """Distances that were stored by their inverses, rounded; NaN where none was measured.
-
-    Source: compressed_depth_image_transport, whose header holds the two numbers of the rounding.
-    """
-    _, scale, offset = _DEPTH_HEADER.unpack_from(data)
-    inverse = words.astype(np.float32) - np.float32(offset)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(words > 0, np.float32(scale) / inverse, np.float32(np.nan))
-
-
-def _foxglove_compressed(data: bytes | memoryview) -> Compressed:
-    return Compressed(_parse(CompressedImage, data).data)
-
-
-def _parse(kind: Any, data: bytes | memoryview) -> Any:
+def _protobuf(kind: Any, data: bytes | memoryview) -> Any:
     try:
         return kind.FromString(data)
     except DecodeError:
         raise MalformedImage(f"a message is no foxglove.{kind.DESCRIPTOR.name}") from None
 
 
-def _json_raw(data: bytes | memoryview) -> Pixels:
-    fields = _json(data)
-    numbers = [fields.get(k) for k in ("height", "width", "step")]
-    if not all(isinstance(n, int) and 0 <= n < 2**32 for n in numbers):
-        raise MalformedImage("a JSON image needs whole height, width and step")
-    height, width, step = (int(n) for n in numbers if n is not None)
-    return Pixels(_base64(fields), height, width, str(fields.get("encoding")), step)
-
-
-def _json_compressed(data: bytes | memoryview) -> Compressed:
-    return Compressed(_base64(_json(data)))
-
-
-def _json(data: bytes | memoryview) -> Mapping[str, Any]:
+def _json(_: Any, data: bytes | memoryview) -> Any:
+    """The fields of a message of Foxglove in JSON, of which the data are in base64."""
     try:
         fields = json.loads(bytes(data))
     except (ValueError, RecursionError):
         raise MalformedImage("a message is no JSON") from None
     if not isinstance(fields, dict):
         raise MalformedImage("a message is no JSON object")
-    return fields
-
-
-def _base64(fields: Mapping[str, Any]) -> bytes:
     try:
-        return base64.b64decode(fields.get("data", ""), validate=True)
-    except (binascii.Error, ValueError, TypeError):
+        packed = base64.b64decode(fields.get("data", ""), validate=True)
+    except (ValueError, TypeError):
         raise MalformedImage("a JSON image's data is no base64") from None
+    names = ("height", "width", "step", "encoding", "format")
+    return SimpleNamespace(data=packed, **{name: fields.get(name) for name in names})
 
 
 class _RosFields:
@@ -164,13 +151,13 @@ class _RosFields:
         self.at = 0
         self._ros1 = ros1
         self._order = "<"
-        if not ros1:
+        if ros1:
+            self.u32()  # its number
+        else:
             head = bytes(self.take(4))
             if head[0] != 0 or head[1] not in (0, 1, 6, 7, 8, 9, 10, 11):
                 raise MalformedImage("a message is no CDR")
             self._order = "<" if head[1] & 1 else ">"
-        if ros1:
-            self.u32()  # its number
         self.stamp = self.u32() * NANOSECONDS + self.u32()
         self.text()
 
@@ -193,16 +180,20 @@ class _RosFields:
         return str(raw if self._ros1 else raw.removesuffix(b"\0"), "utf-8", "replace")
 
 
-def ros_stamp(data: bytes | memoryview, *, ros1: bool) -> int:
-    """The time in the header that a ROS message begins with, nanoseconds."""
-    return _RosFields(data, ros1=ros1).stamp
+def _foxglove(opened: Callable[[Any, bytes | memoryview], Any], kind: Any) -> Callable[..., Any]:
+    """What reads messages of Foxglove in protobuf, or in JSON."""
 
+    def read(data: bytes | memoryview) -> Pixels | Compressed | Packet:
+        m = opened(kind, data)
+        if kind is CompressedImage:
+            return Compressed(m.data)
+        if kind is CompressedVideo:
+            return Packet(m.data, str(m.format))
+        if not all(isinstance(n, int) and 0 <= n < 2**32 for n in (m.height, m.width, m.step)):
+            raise MalformedImage("a JSON image needs whole height, width and step")
+        return Pixels(m.data, m.height, m.width, str(m.encoding), m.step)
 
-def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
-    """What opens Foxglove's images, of which logs need not state a definition; None of others."""
-    kinds = (RawImage, CompressedImage, CompressedVideo)
-    kind = {kind.DESCRIPTOR.full_name: kind for kind in kinds}.get(schema)
-    return None if kind is None or encoding != "protobuf" else partial(_parse, kind)
+    return read
 
 
 def _ros_raw(data: bytes | memoryview, *, ros1: bool) -> Pixels:
@@ -224,16 +215,6 @@ def _ros_compressed(data: bytes | memoryview, *, ros1: bool) -> Compressed:
     return Compressed(packed, "" if plain else encoding.strip(), depth)
 
 
-def _foxglove_video(data: bytes | memoryview) -> Packet:
-    m = _parse(CompressedVideo, data)
-    return Packet(m.data, m.format)
-
-
-def _json_video(data: bytes | memoryview) -> Packet:
-    fields = _json(data)
-    return Packet(_base64(fields), str(fields.get("format")))
-
-
 def _ros_video(data: bytes | memoryview) -> Packet:
     fields = _RosFields(data, ros1=False)
     return Packet(bytes(fields.data()), fields.text())
@@ -247,31 +228,25 @@ def _ffmpeg_packet(data: bytes | memoryview) -> Packet:
     return Packet(bytes(fields.data()), codec)
 
 
-_RAW: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Pixels]]] = {
-    ("foxglove.RawImage", "protobuf"): _foxglove_raw,
-    ("foxglove.RawImage", "json"): _json_raw,
+_IMAGES: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Pixels | Compressed]]] = {
+    ("foxglove.RawImage", "protobuf"): _foxglove(_protobuf, RawImage),
+    ("foxglove.RawImage", "json"): _foxglove(_json, RawImage),
+    ("foxglove.CompressedImage", "protobuf"): _foxglove(_protobuf, CompressedImage),
+    ("foxglove.CompressedImage", "json"): _foxglove(_json, CompressedImage),
     ("sensor_msgs/msg/Image", "cdr"): partial(_ros_raw, ros1=False),
     ("sensor_msgs/Image", "ros1"): partial(_ros_raw, ros1=True),
-}
-"""What messages say that hold pixels, which may be distances."""
-
-_DEPTH_HEADER: Final = struct.Struct("<iff")
-"""How compressed_depth_image_transport packed distances, and with which two numbers."""
-
-_COMPRESSED: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Compressed]]] = {
-    ("foxglove.CompressedImage", "protobuf"): _foxglove_compressed,
-    ("foxglove.CompressedImage", "json"): _json_compressed,
     ("sensor_msgs/msg/CompressedImage", "cdr"): partial(_ros_compressed, ros1=False),
     ("sensor_msgs/CompressedImage", "ros1"): partial(_ros_compressed, ros1=True),
 }
+"""What messages say that hold images, which may be distances."""
 
-_PACKETS: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Packet]]] = {
-    ("foxglove.CompressedVideo", "protobuf"): _foxglove_video,
-    ("foxglove.CompressedVideo", "json"): _json_video,
+_VIDEOS: Final[Mapping[tuple[str, str], Callable[[bytes | memoryview], Packet]]] = {
+    ("foxglove.CompressedVideo", "protobuf"): _foxglove(_protobuf, CompressedVideo),
+    ("foxglove.CompressedVideo", "json"): _foxglove(_json, CompressedVideo),
     ("foxglove_msgs/msg/CompressedVideo", "cdr"): _ros_video,
     ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "cdr"): _ffmpeg_packet,
 }
 """What messages say that hold a picture of a video."""
 
-SCHEMAS: Final = tuple(sorted({schema for schema, _ in (*_RAW, *_COMPRESSED, *_PACKETS)}))
+SCHEMAS: Final = tuple(sorted({schema for schema, _ in (*_IMAGES, *_VIDEOS)}))
 """Message types that are read."""

@@ -1,10 +1,10 @@
-"""Images in other people's messages: found, decoded, made gray and small."""
+"""Pixels of any supported format, JPEG and PNG, as gray or coloured images; and made smaller."""
 
 from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, BinaryIO, Final
 
@@ -15,7 +15,7 @@ from PIL import Image
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.untrusted.memory import BUDGET, budget
-from recorder.images.areas import averaged
+from recorder.images.options import Depth
 
 Shown = NDArray[Any]
 """What one message shows: a gray image, (height, width) uint8, or one in colours, (height, width,
@@ -24,60 +24,48 @@ Shown = NDArray[Any]
 MAX_PIXELS: Final = 36_000_000
 """Largest image that is decoded, more than one of 7680x4320."""
 
-_BAND: Final = 1 << 20
-"""Pixels that are made gray at a time, for what is between takes several bytes each."""
-
 RECIPE: Final = (
     "gray: 16 bit by its high byte, colour as (19595 R + 38470 G + 7471 B + 32768) >> 16; "
     "size: area average (Pillow BOX); turned as the EXIF of a JPEG or PNG says"
 )
 """How any image becomes a frame, for the record."""
 
-_ORIENTATION: Final = 0x0112
-"""The tag of EXIF that says how a camera was held."""
-
-_TURNS: Final = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
+ENCODINGS: Final[Mapping[str, str]] = {
+    "mono8": "g",
+    "8UC1": "g",
+    "mono16": "gg",
+    "16UC1": "gg",
+    "rgb8": "rgb",
+    "8UC3": "bgr",
+    "bgr8": "bgr",
+    "rgba8": "rgbX",
+    "bgra8": "bgrX",
+    "8UC4": "bgrX",
 }
-"""What puts an image upright, by its orientation; 1 is."""
+"""Pixel formats that are read as they are, and what each byte of a pixel is."""
 
-_WORDS: Final = ("I;16", "I;16B", "I")
-"""Pillow's modes of 16 bit."""
-
-_LAYOUTS: Final[Mapping[str, tuple[int, str]]] = {
-    "mono8": (1, "gray"),
-    "8UC1": (1, "gray"),
-    "mono16": (2, "gray16"),
-    "16UC1": (2, "gray16"),
-    "rgb8": (3, "rgb"),
-    "8UC3": (3, "bgr"),
-    "bgr8": (3, "bgr"),
-    "rgba8": (4, "rgb"),
-    "bgra8": (4, "bgr"),
-    "8UC4": (4, "bgr"),
-}
 _BAYER: Final[Mapping[str, str]] = {
     f"bayer_{order}{bits}": order for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)
 }
 """Formats of one colour a pixel, and the colours of two by two of them, row by row."""
 
-_DEPTHS: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
+DISTANCES: Final[Mapping[str, tuple[str, float]]] = {"16UC1": ("u2", 0.001), "32FC1": ("f4", 1.0)}
 """Formats of distances: their numbers, and how many metres one is (REP 118)."""
 
-DISTANCES: Final = frozenset(_DEPTHS)
-"""Formats that hold distances."""
+_BAND: Final = 1 << 20
+"""Pixels that are converted at a time: what is between takes several bytes each."""
 
-ENCODINGS: Final = tuple(_LAYOUTS)
-"""Pixel formats that are read as they are."""
+_WORDS: Final = ("I;16", "I;16B", "I")
+"""Pillow's modes of 16 bit."""
 
-Depth = tuple[float, float]
-"""Distances, in metres, that are shown black and white."""
+_ORIENTATION: Final = 0x0112
+"""The tag of EXIF that says how a camera was held."""
+
+_TURNS: Final = (
+    *("FLIP_LEFT_RIGHT", "ROTATE_180", "FLIP_TOP_BOTTOM", "TRANSPOSE"),
+    *("ROTATE_270", "TRANSVERSE", "ROTATE_90"),
+)
+"""What puts an image upright, by its orientation from 2 on; 1 is."""
 
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
@@ -119,20 +107,18 @@ def raw_image(
         UnknownPixels: an unsupported format.
         MalformedImage: sizes that contradict the data.
     """
+    number, metres = DISTANCES.get(encoding, ("", 0.0))
     if encoding == "32FC1" and depth is None:
         raise UsageError("its images are distances (32FC1): say which to show, as --range 0.3:5")
-    if encoding in _BAYER:
-        layout: tuple[int, str] | None = (1, "bayer") if encoding.endswith("8") else (2, "bayer")
-    elif encoding in _DEPTHS and depth is not None:
-        layout = (int(_DEPTHS[encoding][0][1]), "depth")
+    if number and depth is not None:
+        size = int(number[1])
+    elif encoding in _BAYER:
+        size = 2 if encoding.endswith("16") else 1
+    elif encoding in ENCODINGS:
+        size = len(ENCODINGS[encoding])
     else:
-        layout = _LAYOUTS.get(encoding)
-    if layout is None:
-        raise UnknownPixels(
-            f"its pixel format {encoding[:40]!r} is not read: use one of "
-            f"{', '.join([*ENCODINGS, '32FC1', *_BAYER])}"
-        )
-    size, kind = layout
+        known = ", ".join([*ENCODINGS, "32FC1", *_BAYER])
+        raise UnknownPixels(f"its pixel format {encoding[:40]!r} is not read: use one of {known}")
     step = step or width * size
     if not 0 < height * width <= MAX_PIXELS:
         raise MalformedImage(f"an image of {height}x{width} pixels is not read")
@@ -142,56 +128,52 @@ def raw_image(
             f"fit its {len(data)} bytes"
         )
     raw = np.frombuffer(data, np.uint8)
-    rows = np.ndarray((height, width, size), np.uint8, raw, 0, (step, size, 1))
-    if kind == "depth" and depth is not None:
-        number, metres = _DEPTHS[encoding]
-        order = ">" if big_endian else "<"
-        values = np.ndarray((height, width), order + number, raw, 0, (step, size))
+    if number and depth is not None:
+        kind = (">" if big_endian else "<") + number
+        values = np.ndarray((height, width), kind, raw, 0, (step, size))
         return _shown_depth(values, metres, depth)
-    if kind == "bayer":
-        pattern, order = rows[:, :, 0 if big_endian else size - 1], _BAYER[encoding]
-        return _bayer_colors(pattern, order) if color else _bayer_gray(pattern, order)
-    if kind == "gray":
-        return np.ascontiguousarray(rows[:, :, 0])
-    if kind == "gray16":
-        return np.ascontiguousarray(rows[:, :, 0 if big_endian else 1])
+    rows = np.ndarray((height, width, size), np.uint8, raw, 0, (step, size, 1))
+    if size < 3:
+        high = rows[:, :, 0 if big_endian else size - 1]
+        order = _BAYER.get(encoding)
+        return np.ascontiguousarray(high) if order is None else _bayer(high, order, color=color)
+    bytes_are = ENCODINGS[encoding]
     if color:
-        return np.ascontiguousarray(rows[:, :, [kind.index(c) for c in "rgb"]])
-    found = np.empty((height, width), np.uint8)
-    for band in _bands(height, width):
-        part, order = rows[band], kind.upper() + "X" * (size - 3)
+        return np.ascontiguousarray(rows[:, :, [bytes_are.index(c) for c in "rgb"]])
+
+    def gray(part: ByteArray) -> Any:
         pixels = part.tobytes()  # without what is between the rows
-        colors = Image.frombuffer("RGB", (width, len(part)), pixels, "raw", order, 0, 1)
-        found[band] = np.asarray(colors.convert("L"))  # as in `RECIPE`
-    return found
+        shape, mode = (width, len(part)), bytes_are.upper()
+        colors = Image.frombuffer("RGB", shape, pixels, "raw", mode, 0, 1)
+        return np.asarray(colors.convert("L"))  # as in `RECIPE`
+
+    return _by_bands(rows, gray)
 
 
-def _bayer_gray(pixels: ByteArray, order: str) -> ByteArray:
-    """The grey of each two by two pixels of a Bayer pattern, without interpolation."""
-    height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
-    if not height * width:
-        raise MalformedImage("a Bayer pattern has two rows and columns at least")
-    weights = {"r": 19595, "g": 19235, "b": 7471}
+def _by_bands(pixels: NDArray[Any], convert: Callable[[NDArray[Any]], Any]) -> ByteArray:
+    """Convert rows of pixels (height, width, ...) to gray, some rows at a time."""
+    height, width = pixels.shape[:2]
     found = np.empty((height, width), np.uint8)
-    for band in _bands(height, width):
-        rows = pixels[2 * band.start : 2 * min(band.stop, height)]
-        total = np.full((len(rows) // 2, width), 32768, np.uint32)
-        for place, colour in enumerate(order):
-            cell = rows[place // 2 :: 2, place % 2 : 2 * width : 2]
-            total += weights[colour] * cell.astype(np.uint32)
-        found[band] = total >> 16
+    step = max(_BAND // width, 1)
+    for start in range(0, height, step):
+        found[start : start + step] = convert(pixels[start : start + step])
     return found
 
 
-def _bayer_colors(pixels: ByteArray, order: str) -> ByteArray:
-    """The colours of each two by two pixels of a Bayer pattern; green is the mean of its two."""
+def _bayer(pixels: ByteArray, order: str, *, color: bool) -> ByteArray:
+    """The gray or the colours of each two by two pixels; green is the mean of its two."""
     height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
     if not height * width:
         raise MalformedImage("a Bayer pattern has two rows and columns at least")
-    cells = [pixels[i // 2 : 2 * height : 2, i % 2 : 2 * width : 2] for i in range(4)]
-    one, two = (cells[i].astype(np.uint16) for i, colour in enumerate(order) if colour == "g")
-    green = ((one + two + 1) >> 1).astype(np.uint8)
-    return np.stack([cells[order.index("r")], green, cells[order.index("b")]], axis=2)
+    squares = pixels[: 2 * height, : 2 * width].reshape(height, 2, width, 2).swapaxes(1, 2)
+    cells = squares.reshape(height, width, 4)
+    greens = [place for place, colour in enumerate(order) if colour == "g"]
+    if color:
+        total = cells[:, :, greens[0]].astype(np.uint16) + cells[:, :, greens[1]]
+        green = ((total + 1) >> 1).astype(np.uint8)
+        return np.stack([cells[:, :, order.index("r")], green, cells[:, :, order.index("b")]], 2)
+    weights = np.array([{"r": 19595, "g": 19235, "b": 7471}[c] for c in order], np.uint32)
+    return _by_bands(cells, lambda part: (part @ weights + 32768) >> 16)
 
 
 def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray:
@@ -199,25 +181,13 @@ def _shown_depth(values: NDArray[Any], metres: float, depth: Depth) -> ByteArray
     near, far = depth
     if near < 0:
         raise UsageError("--range: no distance is below 0, write NEAR:FAR in metres, as 0.3:5")
-    found = np.empty(values.shape, np.uint8)
-    for band in _bands(*values.shape):
-        distance = values[band].astype(np.float64) * metres
+
+    def gray(part: NDArray[Any]) -> Any:
+        distance = part.astype(np.float64) * metres
         distance[~np.isfinite(distance) | (distance <= 0)] = near
-        shown = (np.clip(distance, near, far) - near) * (255 / (far - near))
-        found[band] = np.floor(shown + 0.5)
-    return found
+        return np.floor((np.clip(distance, near, far) - near) * (255 / (far - near)) + 0.5)
 
-
-def _bands(height: int, width: int) -> Iterator[slice]:
-    step = max(_BAND // width, 1)
-    return (slice(start, start + step) for start in range(0, height, step))
-
-
-def _high_bytes(pixels: NDArray[Any]) -> ByteArray:
-    found = np.empty(pixels.shape, np.uint8)
-    for band in _bands(*pixels.shape):
-        found[band] = (pixels[band].astype(np.int64) >> 8).clip(0, 255)
-    return found
+    return _by_bands(values, gray)
 
 
 def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) -> ByteArray:
@@ -239,8 +209,6 @@ def shrink(image: ByteArray, height: int, width: int, *, enlarge: bool = False) 
             f"an image of {image.shape[1]}x{image.shape[0]} is smaller than {width}x{height}: "
             "choose a smaller --size"
         )
-    if (found := averaged(image, height, width)) is not None:
-        return found
     small = Image.fromarray(image).resize((width, height), Image.Resampling.BOX)
     return np.asarray(small, np.uint8)
 
@@ -257,7 +225,8 @@ def compressed_image(data: bytes, *, color: bool = False) -> ByteArray:
     """
     with _opened(data) as image:
         if image.mode in _WORDS:
-            return _high_bytes(np.asarray(image))
+            words = np.asarray(image)
+            return _by_bands(words, lambda part: (part.astype(np.int64) >> 8).clip(0, 255))
         if image.mode not in ("L", "RGB"):
             image = image.convert("RGB")
         return np.array(image if color else image.convert("L"), np.uint8)
@@ -278,26 +247,27 @@ def compressed_words(data: bytes) -> NDArray[np.uint16]:
 @contextmanager
 def _opened(data: bytes) -> Iterator[Image.Image]:
     """A JPEG or PNG, upright; Pillow decodes it when it is asked for."""
+    limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
     try:
         with budget(), warnings.catch_warnings():
             warnings.simplefilter("error")
             image: Image.Image = Image.open(io.BytesIO(data), formats=["JPEG", "PNG"])
             if not 0 < image.width * image.height <= MAX_PIXELS:
                 raise MalformedImage(f"an image of {image.width}x{image.height} is not read")
-            if image.info.get("progressive") and _progressive_bytes(image) > BUDGET:
+            # Of a progressive JPEG all coefficients are held until its end.
+            held = image.width * image.height * (2 * len(image.getbands()) + 4)
+            if image.info.get("progressive") and held > BUDGET:
                 raise MalformedImage(
                     f"a progressive JPEG of {image.width}x{image.height} in {image.mode} takes "
-                    f"more than {BUDGET >> 20} MiB of memory, the limit"
+                    f"{limit}"
                 )
-            if (orientation := _orientation(image)) in _TURNS:
-                image = image.transpose(_TURNS[orientation])
+            if 2 <= (orientation := _orientation(image)) <= 8:
+                image = image.transpose(Image.Transpose[_TURNS[orientation - 2]])
             yield image
     except MalformedImage:
         raise
     except MemoryError:
-        raise MalformedImage(
-            f"its JPEG or PNG takes more than {BUDGET >> 20} MiB of memory, the limit"
-        ) from None
+        raise MalformedImage(f"its JPEG or PNG takes {limit}") from None
     except Exception as error:  # Pillow raises whatever its codecs raise
         raise MalformedImage(f"its JPEG or PNG is broken ({type(error).__name__})") from None
 
@@ -322,8 +292,3 @@ def _orientation(image: Image.Image) -> int:
             return int(image.getexif().get(_ORIENTATION, 1))
     except Exception:  # Pillow raises whatever its parser raises; the picture may be whole
         return 1
-
-
-def _progressive_bytes(image: Image.Image) -> int:
-    """Memory of decoding a progressive JPEG, whose coefficients are all held until its end."""
-    return image.width * image.height * (2 * len(image.getbands()) + 4)

@@ -222,7 +222,7 @@ def modules(history: History) -> Figure | None:
     if not history.outputs:
         return None
     spec = history.outline.header.spec
-    best = [output.follows(spec.truth) for output in history.outputs]
+    best = [output.best_fit(spec.truth) for output in history.outputs]
     ratios = (2, 1) if any(best) else (1,)  # one column where the world tells nothing
     figure = Figure(figsize=(INCHES, 1.7 * len(history.outputs)), layout="constrained")
     grid = figure.subplots(len(best), len(ratios), squeeze=False, width_ratios=ratios)

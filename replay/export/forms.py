@@ -13,11 +13,10 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from recorder.log.whole import refuse_special, whole
 from replay.camera_logs.options import CameraOptions
-from replay.export.images import write_images
+from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_lerobot
 from replay.export.tables import TABLES, export_signals
-from replay.export.videos import write_film, write_films
-from replay.inputs.opening import Logged, holds_run, open_to_look
+from replay.inputs import Logged, holds_run, open_to_look
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from replay.following import Output, read_outputs
-from replay.runs.log import WATCHED_TOPIC, RunHeader
-from replay.runs.outline import Outline, read_outline
-from replay.runs.stretches import read_columns, read_stretches
+from replay.following import OutputHistory, read_outputs
+from replay.runs.log import WATCHED_TOPIC, RunHeader, read_batches, read_columns
+from replay.runs.run import Outline, read_outline
 
 STRIP = 8
 """Pictures of each module."""
@@ -65,12 +64,12 @@ class History:
     error: FloatArray
     tested: FloatArray
     fitted: FloatArray
-    outputs: tuple[Output, ...]
+    outputs: tuple[OutputHistory, ...]
     pictures: tuple[Strip, ...]
 
 
 def read_history(path: Path) -> History:
-    """Read what a run's figures need; see `read_stretches`."""
+    """Read what a run's figures need; see `read_batches`."""
     outline = read_outline(path)
     header, n, shown = outline.header, outline.iterations, outline.streams(SHOWN)
     stream = np.empty(n, dtype=np.int64)
@@ -108,12 +107,12 @@ def read_history(path: Path) -> History:
     )
 
 
-def _pictures(path: Path, header: RunHeader, outputs: Sequence[Output]) -> tuple[Strip, ...]:
+def _pictures(path: Path, header: RunHeader, outputs: Sequence[OutputHistory]) -> tuple[Strip, ...]:
     """Images spread over the range of each module's output."""
     wanted = {o.module: dict(zip(o.t.tolist(), o.y.tolist(), strict=True)) for o in outputs}
     found: dict[int, list[tuple[int, NDArray[Any], float]]] = {o.module: [] for o in outputs}
-    for stretch in read_stretches(path, header, topics=(WATCHED_TOPIC,)):
-        for frames, images in stretch.watched:
+    for batch in read_batches(path, header, topics=(WATCHED_TOPIC,)):
+        for frames, images in batch.watched:
             for t, image in zip(frames.tolist(), images, strict=True):
                 for module, values in wanted.items():
                     if t in values:

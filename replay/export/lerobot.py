@@ -18,11 +18,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from replay.export.episodes import Stitched, shared_spans
-from replay.export.images import file_names, pieces
-from replay.export.videos import pixel_format, write_film
-from replay.inputs.opening import Logged
-from replay.stored import StoredSource
+from replay.export.frames import file_names, pieces, pixel_format, shared_spans, write_film
+from replay.inputs import Logged
+from replay.stored import Span
 
 VERSION = "v3.0"
 FILE = "chunk-000/file-000"
@@ -72,22 +70,24 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
             "change it with cdmisfa convert --rate"
         )
     spans = shared_spans(source)
-    whole = Stitched(source, spans) if len(spans) > 1 or source.gaps else source
     lengths = [high - low for low, high in spans]
-    columns, features = _columns(whole, lengths, fps)
+    columns, features = _columns(source, spans, fps)
     stats = {key: _number_stats(column) for key, column in columns.items()}
-    own = _stats_of_episodes(columns, lengths)
+    ends = np.cumsum(lengths)
+    own = [
+        {key: _number_stats(column[end - length : end]) for key, column in columns.items()}
+        for end, length in zip(ends, lengths, strict=True)
+    ]
     videos = []
-    if source.spec.images:
-        for stream, view in enumerate(file_names(source.spec)):
-            videos.append(key := f"observation.images.{view}")
-            file = _place(folder / "videos" / key, "mp4")
-            write_film(whole, stream, file, lossless=lossless, key_every=KEY_EVERY)
-            features[key] = _video_feature(source.spec.frame_shape, fps)
-            values = [_values_shown(Stitched(source, [span]), stream) for span in spans]
-            stats[key] = _image_stats(np.sum(values, axis=0), whole.frames)
-            for episode, counts, length in zip(own, values, lengths, strict=True):
-                episode[key] = _image_stats(counts, length)
+    for stream, view in enumerate(file_names(source.spec) if source.spec.images else ()):
+        videos.append(key := f"observation.images.{view}")
+        file = _place(folder / "videos" / key, "mp4")
+        write_film(source, stream, file, lossless=lossless, key_every=KEY_EVERY, spans=spans)
+        features[key] = _video_feature(source.spec.frame_shape, fps)
+        values = [_values_shown(source, stream, span) for span in spans]
+        stats[key] = _image_stats(np.sum(values, axis=0), sum(lengths))
+        for episode, counts, length in zip(own, values, lengths, strict=True):
+            episode[key] = _image_stats(counts, length)
     task = f"what {source.scene().get('scene', 'a recording')} shows"
     pq.write_table(_table(columns, features), _place(folder / "data", "parquet"))
     episodes = _episodes(lengths, fps, task, videos, own)
@@ -97,16 +97,16 @@ def write_lerobot(source: Logged, folder: Path, *, name: str, lossless: bool) ->
     _write_json(folder / "meta" / "stats.json", stats)
     many = "one episode" if len(spans) == 1 else f"{len(spans)} episodes, split at its gaps"
     about = {"name": name, "version": VERSION, "episodes": many, "state": STATE}
-    card = ABOUT.format(**about, frames=whole.frames, fps=fps)
+    card = ABOUT.format(**about, frames=sum(lengths), fps=fps)
     (folder / "README.md").write_text(card, "utf-8")
-    return whole.frames
+    return sum(lengths)
 
 
 def _columns(
-    source: StoredSource, lengths: Sequence[int], fps: int
+    source: Logged, spans: Sequence[Span], fps: int
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Feature]]:
     """All numbers, (n,) or (n, k), and what they are."""
-    spec, n = source.spec, source.frames
+    spec, lengths = source.spec, [high - low for low, high in spans]
     columns: dict[str, NDArray[Any]] = {}
     features: dict[str, Feature] = {}
 
@@ -117,20 +117,19 @@ def _columns(
         features[key] = {"dtype": str(values.dtype), "shape": shape, "names": names}
 
     if spec.truth:
-        truth = np.concatenate([block.truth for block in pieces(source, 0)])
+        truth = np.concatenate([block.truth for block in pieces(source, 0, spans)])
         add(STATE, truth.astype(np.float32), list(spec.truth))
     if not spec.images:
         for stream, view in enumerate(file_names(spec)):
-            frames = np.concatenate([block.frames for block in pieces(source, stream)])
+            frames = np.concatenate([block.frames for block in pieces(source, stream, spans)])
             names = [f"x{i + 1}" for i in range(frames.shape[1])]
             add(f"observation.{view}", frames.astype(np.float32), names)
-    index, zero = np.arange(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
     within = np.concatenate([np.arange(length, dtype=np.int64) for length in lengths])
     add("timestamp", (within / fps).astype(np.float32), None)
     add("frame_index", within, None)
     add("episode_index", np.repeat(np.arange(len(lengths), dtype=np.int64), lengths), None)
-    add("index", index, None)
-    add("task_index", zero, None)
+    add("index", np.arange(len(within), dtype=np.int64), None)
+    add("task_index", np.zeros(len(within), dtype=np.int64), None)
     return columns, features
 
 
@@ -166,20 +165,10 @@ def _number_stats(values: NDArray[Any]) -> Stats:
     return {key: value.tolist() for key, value in stats.items()}
 
 
-def _stats_of_episodes(
-    columns: Mapping[str, NDArray[Any]], lengths: Sequence[int]
-) -> list[dict[str, Stats]]:
-    """The statistics of the numbers of each episode."""
-    ends = np.cumsum(lengths)[:-1]
-    parts = {key: np.split(column, ends) for key, column in columns.items()}
-    each = range(len(lengths))
-    return [{key: _number_stats(part[i]) for key, part in parts.items()} for i in each]
-
-
-def _values_shown(source: StoredSource, stream: int) -> NDArray[np.int64]:
-    """How often each value is a pixel of a view, (256,)."""
+def _values_shown(source: Logged, stream: int, span: Span) -> NDArray[np.int64]:
+    """How often each value is a pixel of a view in some frames, (256,)."""
     counts = np.zeros(256, dtype=np.int64)
-    for block in pieces(source, stream):
+    for block in pieces(source, stream, [span]):
         counts += np.bincount(block.frames.reshape(-1), minlength=256)
     return counts
 

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS, Signal
 from recorder.log.whole import refuse_taken, whole
-from replay.runs.columns import joined, padded
-from replay.runs.log import RunHeader, read_header
-from replay.runs.stretches import read_columns
+from replay.runs.columns import padded, whole_signals
+from replay.runs.log import RunHeader, read_columns, read_header
 
 CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
 """Signals of every frame, for which a row an iteration has no room."""
@@ -111,7 +110,7 @@ def _write_batches(run: Path, header: RunHeader, writer: Any) -> int:
 
 
 def _write_npz(run: Path, header: RunHeader, out: Path) -> int:
-    arrays = joined(read_columns(run, header), tuple(SIGNALS))
+    arrays = whole_signals(read_columns(run, header), tuple(SIGNALS))
     about = {name: _about(signal) for name, signal in SIGNALS.items()}
     notes = {"_signals": np.array(json.dumps(about)), "_run": np.array(json.dumps(_run(header)))}
     with open(out, "wb") as file:

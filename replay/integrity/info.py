@@ -12,16 +12,14 @@ from typing import Any, Final
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, Problem
-from replay.camera_logs.catalogue import channels_of
-from replay.camera_logs.opening import only_foreign
-from replay.inputs.words import places
+from replay.camera_logs.opening import channels_of, only_foreign
+from replay.inputs import places
 from replay.integrity.survey import SCHEMA, Crc, Kind, survey
+from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
-from replay.runs.messages import missing
-from replay.storage.listing import log_files
 from replay.storage.location import Location
-from replay.storage.opening import open_store
+from replay.storage.opening import log_files, open_store
 
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
@@ -157,7 +155,7 @@ def _describe_file(path: Location) -> LogInfo:
             crc=surveyed.crc,
             problems=surveyed.problems,
             metadata={path.name: metadata},
-            signals=RecordInfo(version, missing(version)) if version else None,
+            signals=RecordInfo(version, missing_signals(version)) if version else None,
         )
 
 

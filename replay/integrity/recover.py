@@ -22,9 +22,8 @@ from recorder.mcap.store import PARTIAL
 from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import only_foreign
 from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
-from replay.storage.listing import log_files
 from replay.storage.location import Location, location
-from replay.storage.opening import fetched, open_store
+from replay.storage.opening import fetched, log_files, open_store
 
 
 @dataclass(slots=True)

@@ -14,11 +14,10 @@ from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem, Segment
 from replay.integrity.survey import said
-from replay.runs.final import facts_sha256
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
-from replay.runs.log import SIGNALS_TOPIC, read_header
+from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, read_header
 from replay.runs.modules import load_modules
-from replay.runs.stretches import Stretch, Stretches
+from replay.runs.run import facts_sha256
 from replay.storage.identity import file_sha256
 
 
@@ -37,26 +36,26 @@ class RunPass:
         self._document = read_run_json(log.parent) if beside else {}
         self._stated = self._stated_signals()
         self._hash, self._expected = SignalsHash(), 0
-        self._stretches: Stretches | None = None
+        self._batches: BatchReader | None = None
         self._found: list[Problem] = []
         with self._telling():
             header = read_header(log)
             if self._stated is not None and header.schema == SCHEMA_VERSION:
-                self._stretches = Stretches(log, header, reader.channels, topics=(SIGNALS_TOPIC,))
+                self._batches = BatchReader(log, header, reader.channels, topics=(SIGNALS_TOPIC,))
 
     def add(self, segment: Segment) -> None:
         """Take in the next chunk of the log."""
         table = self._reader.table(segment)
         with self._telling():
-            if self._stretches is not None and table is not None:
-                for stretch in self._stretches.take(table):
-                    self._add(stretch)
+            if self._batches is not None and table is not None:
+                for batch in self._batches.take(table):
+                    self._add(batch)
 
     def finish(self) -> None:
         """Hear that there is no further chunk."""
         with self._telling():
-            if self._stretches is not None:
-                self._add(self._stretches.rest())
+            if self._batches is not None:
+                self._add(self._batches.rest())
                 if self._hash.hexdigest() != self._stated:
                     what = f"its {self._hash.count} iterations are not those that the run had"
                     self._found.append(Problem(str(self._log), what))
@@ -92,8 +91,8 @@ class RunPass:
         result = self._document.get("result")
         return result.get("signals_sha256") if isinstance(result, Mapping) else None
 
-    def _add(self, stretch: Stretch) -> None:
-        for signals in (record for columns in stretch.signals for record in columns.records()):
+    def _add(self, batch: Batch) -> None:
+        for signals in (record for columns in batch.signals for record in columns.records()):
             if signals.iteration != self._expected:
                 what = f"iterations {self._expected} to {signals.iteration - 1} are missing"
                 self._found.append(Problem(str(self._log), what))
@@ -106,7 +105,7 @@ class RunPass:
             yield
         except CdmisfaError as error:
             self._found.append(said(self._log, error))
-            self._stretches = None
+            self._batches = None
 
 
 def view_again(run: Path) -> str:

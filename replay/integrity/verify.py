@@ -12,18 +12,16 @@ from typing import Any
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
-from replay.camera_logs.catalogue import channels_of
-from replay.camera_logs.formats.table import is_table, table_notes
-from replay.camera_logs.opening import only_foreign, open_images
+from replay.camera_logs.opening import channels_of, only_foreign, open_images
 from replay.camera_logs.stream import ImageStream
-from replay.inputs.words import places
+from replay.camera_logs.table import is_table, table_notes
+from replay.inputs import places
 from replay.integrity.run_files import RunPass
 from replay.integrity.survey import SCHEMA, Crc, kind_of, moved, said, survey
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
-from replay.storage.listing import log_files
 from replay.storage.location import Location, location
-from replay.storage.opening import fetched, open_store
+from replay.storage.opening import fetched, log_files, open_store
 
 
 @dataclass(frozen=True, slots=True)

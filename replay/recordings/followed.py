@@ -15,7 +15,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError
 from recorder.log.begun import read_recording
 from recorder.mcap.store import PARTIAL
 from replay.recordings.source import RecordedSource
-from replay.storage.listing import log_files
+from replay.storage.opening import log_files
 
 POLL: Final = 0.1
 """Seconds between two looks at the files."""

@@ -12,8 +12,7 @@ from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import LogDamagedError
 from recorder.log.messages import POSE_TOPIC, RECORDING_METADATA
 from recorder.mcap.reader import LogReader
-from replay.storage.listing import log_files
-from replay.storage.opening import open_store
+from replay.storage.opening import log_files, open_store
 
 
 def head_poses(path: Path) -> dict[str, HeadPose]:

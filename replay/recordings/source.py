@@ -18,10 +18,9 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import PARTIAL
 from replay.recordings.view_file import ViewFile, intersection
-from replay.storage.identity import Identity, LoggedSource
-from replay.storage.listing import log_files
+from replay.storage.identity import Identity, LoggedSource, log_identity
 from replay.storage.location import Location, Url
-from replay.storage.log_identity import log_identity
+from replay.storage.opening import log_files
 from replay.stored import joined
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")

@@ -6,14 +6,11 @@ __getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "replay.runs.folders": "is_run is_sweep run_log runs_in",
-        "replay.runs.log": "Event RunHeader read_header",
-        "replay.runs.run": "Run",
+        "replay.runs.log": "Event RunHeader read_batches read_columns read_header",
+        "replay.runs.run": "Outline Run read_outline",
         "replay.runs.writer": "RunWriter",
         "replay.runs.columns": "SignalColumns",
-        "replay.runs.stretches": "read_columns read_stretches",
-        "replay.runs.outline": "Outline read_outline",
         "replay.runs.compare": "Difference first_difference side_by_side",
-        "replay.runs.modules": "load_modules save_modules",
-        "replay.runs.transformer": "SlowFeatures",
+        "replay.runs.modules": "SlowFeatures load_modules save_modules",
     },
 )

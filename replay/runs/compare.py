@@ -14,11 +14,9 @@ from cdmisfa.core.config import differences
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.columns import SignalColumns
-from replay.runs.final import known_to_both, stated_source
 from replay.runs.folders import read_run_json, run_log
-from replay.runs.log import read_header
-from replay.runs.outline import Outline, read_outline
-from replay.runs.stretches import read_columns
+from replay.runs.log import read_columns, read_header
+from replay.runs.run import Outline, known_to_both, read_outline, stated_source
 
 FEW_VALUES = 4
 """Of a signal that is written out."""
@@ -81,14 +79,14 @@ def first_difference(first: Path, second: Path) -> Difference | None:
     """
     a, b = read_header(first), read_header(second)
     versions = a.schema, b.schema
-    found = first_of(read_columns(first, a), read_columns(second, b), min(versions))
+    found = first_differing(read_columns(first, a), read_columns(second, b), min(versions))
     if versions[0] == versions[1]:
         return found
     found = found or Difference(-1, "", (), f"version {versions[0]}", f"version {versions[1]}")
     return replace(found, versions=versions)
 
 
-def first_of(
+def first_differing(
     first: Iterator[SignalColumns],
     second: Iterator[SignalColumns],
     version: int,

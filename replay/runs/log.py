@@ -1,30 +1,43 @@
-"""run.mcap, the whole story of a run: what it was started with, and the topics of its messages."""
+"""Reading run.mcap: what a run was started with, and its messages in batches of iterations."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf import Log_pb2, RawImage_pb2
+from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.learning import ARITHMETIC, Keyframe
+from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.core.untrusted.memory import parse_json
 from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Channel
+from recorder.mcap.store import PARTIAL
+from recorder.mcap.tables import MessageTable
+from replay.runs.codec import (
+    decode_columns,
+    decode_matrices,
+    decode_matrix,
+    missing_signals,
+    parsed,
+)
+from replay.runs.columns import Blocks, SignalColumns
 from replay.runs.folders import RUN_FILE, RUN_METADATA, run_log
-from replay.runs.messages import decode_keyframe, missing
 
 SIGNALS_TOPIC = "/signals"
 WATCHED_TOPIC = "/watched"
 PHI_TOPIC = "/phi"
 TRUTH_TOPIC = "/truth"
 EVENT_TOPIC = "/event"
-KEYFRAME_TOPIC = "/keyframe"
 
 PHI_EVERY = 50
 """Iterations between two weights that a log keeps."""
@@ -48,7 +61,7 @@ class RunHeader:
     @property
     def missing(self) -> tuple[str, ...]:
         """Signals that this log lacks, being older: they are read as NaN."""
-        return missing(self.schema)
+        return missing_signals(self.schema)
 
     @property
     def delta(self) -> float | None:
@@ -132,54 +145,198 @@ def read_header(path: Path) -> RunHeader:
         raise LogDamagedError(f"{log}: its metadata {RUN_METADATA} is broken ({error})") from error
 
 
-def read_keyframe(path: Path, last: int | None = None) -> Keyframe | None:
-    """The newest keyframe of a run's log at or before so many iterations, None where there is none.
-
-    Only the chunks that hold keyframes are read. What is no keyframe of this version is passed
-    over.
-    """
-    newest = _keyframes(run_log(path), lambda k: last is None or k <= last, backwards=True)
-    return next(newest, None)
-
-
-def read_keyframes(path: Path, after: int) -> Iterator[Keyframe]:
-    """The keyframes of a run's log after more than so many iterations, in order.
-
-    Of two after the same iteration, as where a fork begins, the last one is the run's.
-    """
-    before: Keyframe | None = None
-    for keyframe in _keyframes(run_log(path), lambda k: k > after):
-        if before is not None and before.iteration != keyframe.iteration:
-            yield before
-        before = keyframe
-    if before is not None:
-        yield before
-
-
-def _keyframes(
-    log: Path, wanted: Callable[[int], bool], *, backwards: bool = False
-) -> Iterator[Keyframe]:
-    """Keyframes in the order of the file, or from its end on."""
-    step = -1 if backwards else 1
-    with LogReader(log) as reader:
-        own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
-        for segment in reader.segments[::step]:
-            counts = segment.channel_counts()
-            if counts is not None and not own & counts.keys():
-                continue
-            table = reader.table(segment)
-            if table is None:
-                continue
-            for row in np.flatnonzero(np.isin(table.channel, list(own)))[::step].tolist():
-                if not wanted(int(table.records["sequence"][row])):
-                    continue
-                with contextlib.suppress(LogDamagedError):
-                    keyframe = decode_keyframe(table.payload(row), f"{log} {KEYFRAME_TOPIC}")
-                    if wanted(keyframe.iteration):
-                        yield keyframe
-
-
 def record_version(metadata: Mapping[str, str]) -> int:
     """The version of the signals' record that a run's metadata names, 0 where it names none."""
     text = metadata.get("schema", "")
     return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else 0
+
+
+TOPICS = (SIGNALS_TOPIC, WATCHED_TOPIC, PHI_TOPIC, TRUTH_TOPIC, EVENT_TOPIC)
+
+BATCH_ITERATIONS = 500
+"""Most iterations of a batch."""
+
+MAX_BYTES = 16 * 1024 * 1024
+"""Bytes of messages after which a batch ends earlier."""
+
+Frames = tuple[IntArray, NDArray[Any]]
+"""(n,) frames and (n, ...) what belongs to them."""
+
+_ITERATION = re.compile(r"iteration (\d{1,18})")
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What a log holds of some consecutive iterations.
+
+    Attributes:
+        blocks: of the records, after the last one before them, which the first of the other
+            messages may belong to; none where no records were wanted.
+        truth: ground truth, (n, D).
+        phi: (t, (J, I)) weights of the abstraction.
+    """
+
+    signals: tuple[SignalColumns, ...]
+    blocks: Blocks
+    watched: tuple[Frames, ...]
+    truth: tuple[Frames, ...]
+    phi: tuple[tuple[int, FloatArray], ...]
+    events: tuple[Event, ...]
+
+
+def read_batches(
+    path: Path,
+    header: RunHeader | None = None,
+    *,
+    every: int = 1,
+    topics: Sequence[str] = TOPICS,
+    start: int = 0,
+) -> Iterator[Batch]:
+    """Read a run's log to the end, once.
+
+    Args:
+        path: the run's folder, or its log.
+        header: of its log, where that was read already.
+        every: decode images of every this many frames only.
+        topics: what is wanted of it.
+        start: the frame to begin at, the first of a block.
+
+    Raises:
+        UsageError: there is no such run, or it is of a later version of this software.
+        LogDamagedError: a message is damaged, or a finished file is cut short.
+    """
+    log = run_log(path)
+    header = header or read_header(log)
+    with LogReader(log) as reader:
+        batches = BatchReader(log, header, reader.channels, every=every, topics=topics)
+        since = header.spec.time_ns(start) if start else None
+        for _, table in reader.tables(ordered=False, start=since):
+            yield from batches.take(table)
+        yield batches.rest()
+        if not reader.complete and not log.name.endswith(PARTIAL):
+            raise LogDamagedError(f"{log} is cut short: save what is there with cdmisfa recover")
+
+
+def read_columns(
+    path: Path, header: RunHeader | None = None, *, start: int = 0
+) -> Iterator[SignalColumns]:
+    """The records of a run from a frame on, in order, as arrays; see `read_batches`."""
+    for batch in read_batches(path, header, topics=(SIGNALS_TOPIC,), start=start):
+        yield from batch.signals
+
+
+class BatchReader:
+    """Makes batches of a run's log from its chunks, which are given in file order.
+
+    Args:
+        log: of the run.
+        header: of the log.
+        channels: of the log.
+        every: see `read_batches`, as `topics`.
+    """
+
+    def __init__(
+        self,
+        log: Path,
+        header: RunHeader,
+        channels: Mapping[int, Channel],
+        *,
+        every: int = 1,
+        topics: Sequence[str] = TOPICS,
+    ) -> None:
+        self._log, self._spec, self._version, self._every = log, header.spec, header.schema, every
+        self._wanted = {n: c.topic for n, c in channels.items() if c.topic in topics}
+        self._begin(Blocks.concatenated(()))
+
+    def _begin(self, before: Blocks) -> None:
+        self._before = before
+        self._data: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
+        self._frames: dict[str, list[int]] = {topic: [] for topic in TOPICS}
+        self._bytes = 0
+
+    def take(self, table: MessageTable) -> Iterator[Batch]:
+        """Take the messages of the next chunk, and give the batches that end with them."""
+        wanted = np.isin(table.channel, list(self._wanted))
+        frames = self._spec.frames_at(table.log_time)
+        if self._spec.images and self._every > 1:
+            shown = [n for n, topic in self._wanted.items() if topic == WATCHED_TOPIC]
+            wanted &= ~np.isin(table.channel, shown) | (frames % self._every == 0)
+        if not wanted.all():
+            table, frames = table.select(wanted), frames[wanted]
+        data = memoryview(table.data.data)
+        columns = (table.channel, frames, table.at, table.size)
+        for number, t, at, size in zip(*(c.tolist() for c in columns), strict=True):
+            topic = self._wanted[number]
+            if self._is_full(topic):
+                yield self.rest()
+            self._data[topic].append(bytes(data[at : at + size]))
+            self._frames[topic].append(t)
+            self._bytes += size
+
+    def _is_full(self, topic: str) -> bool:
+        """Whether a batch ends before this message: where possible, with a whole iteration."""
+        if topic != SIGNALS_TOPIC:
+            return self._bytes >= 4 * MAX_BYTES
+        return self._bytes >= MAX_BYTES or len(self._data[topic]) >= BATCH_ITERATIONS
+
+    def rest(self) -> Batch:
+        """What was taken since the last batch ended, as one."""
+        spec, data = self._spec, self._data
+        watched = self._images() if spec.images else self._rows(WATCHED_TOPIC, spec.frame_shape)
+        signals = self._records()
+        blocks = Blocks.concatenated([self._before, *map(Blocks.of, signals)])
+        where = f"{self._log} {PHI_TOPIC}"
+        events = zip(data[EVENT_TOPIC], self._frames[EVENT_TOPIC], strict=True)
+        batch = Batch(
+            signals=signals,
+            blocks=blocks,
+            watched=watched,
+            truth=self._rows(TRUTH_TOPIC, (len(spec.truth),)),
+            phi=tuple(decode_matrix(message, where) for message in data[PHI_TOPIC]),
+            events=tuple(_event(message, t, self._log) for message, t in events),
+        )
+        self._begin(blocks.last())
+        return batch
+
+    def _records(self) -> tuple[SignalColumns, ...]:
+        where = f"{self._log} {SIGNALS_TOPIC}"
+        found = tuple(decode_columns(self._data[SIGNALS_TOPIC], where, self._version))
+        streams = len(self._spec.streams)
+        for columns in found:
+            watched, rewards = columns["stream"], columns["R"]
+            if (
+                watched.min() < 0
+                or watched.max() >= streams
+                or columns["policy"].shape[1] != streams
+                or columns["Q"].shape[1:] != (streams, 2)
+                or (rewards.size and rewards.shape[1:] != (streams, 2, streams))
+            ):
+                raise LogDamagedError(f"{where}: a record is about other streams than the run's")
+        return found
+
+    def _images(self) -> tuple[Frames, ...]:
+        where, shape = f"{self._log} {WATCHED_TOPIC}", self._spec.frame_shape
+        found = [parsed(RawImage_pb2.RawImage, m, where).data for m in self._data[WATCHED_TOPIC]]
+        if not found:
+            return ()
+        for pixels in found:
+            if len(pixels) != math.prod(shape):
+                raise LogDamagedError(f"{self._log}: {len(pixels)} values do not fill {shape}")
+        whole = np.frombuffer(b"".join(found), np.uint8).reshape(len(found), *shape)
+        return ((np.array(self._frames[WATCHED_TOPIC], dtype=np.int64), whole),)
+
+    def _rows(self, topic: str, shape: tuple[int, ...]) -> tuple[Frames, ...]:
+        """Rows of matrix messages, one per frame."""
+        found = []
+        for frames, values in decode_matrices(self._data[topic], f"{self._log} {topic}"):
+            if values.size != len(frames) * math.prod(shape):
+                raise LogDamagedError(f"{self._log}: {values.size} values do not fill {shape}")
+            found.append((frames, values.reshape(-1, *shape)))
+        return tuple(found)
+
+
+def _event(data: bytes, t: int, log: Path) -> Event:
+    entry = parsed(Log_pb2.Log, data, f"{log} {EVENT_TOPIC}")
+    match = _ITERATION.fullmatch(entry.name)
+    level = Log_pb2.Log.Level.Name(entry.level) if entry.level <= 5 else "INFO"
+    return Event(t, int(match[1]) if match else -1, entry.message, level)

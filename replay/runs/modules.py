@@ -1,4 +1,7 @@
-"""modules.npz: the frozen modules of a run, as plain arrays."""
+"""The frozen modules of a run: modules.npz as plain arrays, and scikit-learn style transformers.
+
+Neither the learner nor scikit-learn is needed to use what was learned.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +9,30 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.modules import Module
 from recorder.log.whole import whole
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
 
-Arrays = Mapping[str, NDArray[Any]]
-
 _NAME = re.compile(r"module([1-9]\d{0,8})_([a-z_]+)")
-_NUMBERS = ("index", "stream_index", "iteration")
-_OPTIONAL = ("centres", "counts", "expansion", "scale")  # not in every version's files
-_PLAIN = (("stream", "U", str), ("expansion", "U", str), ("scale", "f", float))
-_ARRAYS = tuple(
-    f.name
-    for f in dataclasses.fields(Module)
-    if f.name not in (*_NUMBERS, *(name for name, _, _ in _PLAIN))
-)
+_FIELDS = [field.name for field in dataclasses.fields(Module)]
+_SCALARS = {
+    **dict.fromkeys(("index", "stream_index", "iteration"), "iu"),
+    "stream": "U",
+    "expansion": "U",
+    "scale": "f",
+}
+"""Fields that are no arrays, and the kind of numpy type that each is stored as."""
 
-_FIELDS = {field.name for field in dataclasses.fields(Module)}
+_OPTIONAL = ("centres", "counts", "expansion", "scale", "stream")
+"""Fields that files of earlier versions lack."""
 
 
 def save_modules(path: Path, modules: Iterable[Module]) -> None:
@@ -40,8 +43,8 @@ def save_modules(path: Path, modules: Iterable[Module]) -> None:
     """
     arrays: dict[str, Any] = {}
     for module in modules:
-        for field in dataclasses.fields(Module):
-            arrays[_key(module.index, field.name)] = getattr(module, field.name)
+        for name in _FIELDS:
+            arrays[_key(module.index, name)] = getattr(module, name)
     with whole(Path(path)) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)
 
@@ -64,43 +67,31 @@ def load_modules(path: Path) -> tuple[Module, ...]:
         raise LogDamagedError(f"{path} holds no modules ({one_line(error)})") from error
 
 
-def _module(stored: Arrays, index: int) -> Module:
-    before_names = _key(index, "stream_index") not in stored  # then "stream" is the index
+def _module(stored: Mapping[str, NDArray[Any]], index: int) -> Module:
+    own = {name: array for name in _FIELDS if (array := stored.get(_key(index, name))) is not None}
+    if "stream_index" not in own:  # before streams had names, "stream" was the index
+        own["stream_index"] = own.pop("stream")
     values: dict[str, Any] = {"stream": ""}
-    for name in _NUMBERS:
-        kept = "stream" if before_names and name == "stream_index" else name
-        values[name] = int(stored[_key(index, kept)])
-    for name in _ARRAYS:
-        if name in _OPTIONAL and _key(index, name) not in stored:
+    for name in _FIELDS:
+        if name not in own and name in _OPTIONAL:
             continue
-        array = stored[_key(index, name)]
-        if array.dtype.kind not in "fi":
-            raise ValueError(f"{name} is no array of numbers")
-        values[name] = array
-    for name, kind, of_type in _PLAIN:
-        if _key(index, name) in stored and not (before_names and name == "stream"):
-            array = stored[_key(index, name)]
-            if array.dtype.kind != kind:
-                raise ValueError(f"{name} is no {of_type.__name__}")
-            values[name] = of_type(array.item())
+        array, kinds = own[name], _SCALARS.get(name, "fi")
+        if array.dtype.kind not in kinds:
+            raise ValueError(f"{name} is not of type {kinds}")
+        values[name] = array.item() if name in _SCALARS else array
     outputs, size = values["phi"].shape
-    for name, shape in {
-        "mean": (size,),
-        "band_mean": (outputs,),
-        "band_sd": (outputs,),
-        "eta": (outputs,),
-    }.items():
-        if values[name].shape != shape:
+    shapes = {"mean": size, "band_mean": outputs, "band_sd": outputs, "eta": outputs}
+    for name, length in shapes.items():
+        if values[name].shape != (length,):
             raise ValueError(f"{name} has shape {values[name].shape}")
     return Module(**values)
 
 
-def _indices(stored: Arrays) -> list[int]:
+def _indices(stored: Mapping[str, NDArray[Any]]) -> list[int]:
     """The modules' indices, of a file in which every name is that of a module's field.
 
-    A checksum protects what the arrays hold, but nothing their names and number. A later version
-    may add fields to those of this one; one that is unknown in place of one that is not there is
-    a damaged name.
+    A checksum protects the arrays' values, but nothing protects their names and number. A later
+    version may add fields; an unknown field in place of a missing one is a damaged name.
     """
     fields: dict[int, set[str]] = {}
     for name in stored:
@@ -113,8 +104,8 @@ def _indices(stored: Arrays) -> list[int]:
         raise ValueError(f"there are modules {indices}, one is missing")
     if any(fields[index] != fields[1] for index in indices):
         raise ValueError("a module lacks what another has")
-    unknown = sorted(fields[1] - _FIELDS) if indices else []
-    if unknown and not fields[1] > _FIELDS:
+    unknown = sorted(fields[1].difference(_FIELDS)) if indices else []
+    if unknown and not fields[1].issuperset(_FIELDS):
         raise ValueError(f"{unknown[0][:40]!r} is nothing of a module")
     if any(int(stored[_key(index, "index")]) != index for index in indices):
         raise ValueError("the numbers of modules are mixed up")
@@ -123,3 +114,96 @@ def _indices(stored: Arrays) -> list[int]:
 
 def _key(index: int, name: str) -> str:
     return f"module{index}_{name}"
+
+
+class SlowFeatures:
+    """Slow features of frames, as a frozen module gives them.
+
+    It comes fitted. In a pipeline that is to be fitted as a whole, put it into
+    scikit-learn's `FrozenEstimator`.
+
+    Args:
+        module: the frozen module.
+
+    Example:
+        >>> module = Module(1, 0, 9, np.eye(1, 2), np.zeros(2), *[np.zeros(1)] * 3, np.zeros(1))
+        >>> SlowFeatures(module).transform([[3.0, 4.0], [5.0, 6.0]]).ravel().tolist()
+        [3.0, 5.0]
+    """
+
+    def __init__(self, module: Module) -> None:
+        self.module = module
+
+    @classmethod
+    def load(cls, path: str | Path) -> tuple[Self, ...]:
+        """A transformer for each module of modules.npz, or of a run's folder, in order.
+
+        Raises:
+            UsageError: there is no such file.
+            LogDamagedError: it holds something else.
+        """
+        return tuple(cls(module) for module in load_modules(Path(path)))
+
+    @property
+    def components_(self) -> FloatArray:
+        """(J, I) weights, a row an output."""
+        return self.module.phi
+
+    @property
+    def mean_(self) -> FloatArray:
+        """(I,) mean of the input, after scaling and expansion."""
+        return self.module.mean
+
+    def transform(self, X: Any) -> FloatArray:
+        """Outputs of the module on frames, y = phi (x - mean).
+
+        Args:
+            X: (n, I) values, or (n, height, width) pixels, of which uint8 count 1/255 each
+                where it learned from pixels. They are expanded as they were for the learner.
+
+        Returns:
+            (n, J).
+
+        Raises:
+            UsageError: these are no frames as the module learned from.
+        """
+        return self.module.transform(X)
+
+    def fit(self, X: Any = None, y: Any = None) -> NoReturn:
+        """Refuse: a frozen module does not learn.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            "a frozen module is not fitted again: learn a new one with cdmisfa learn, or put this "
+            "one into sklearn.frozen.FrozenEstimator to keep it as it is in a pipeline"
+        )
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """What it was made with, as scikit-learn asks for it."""
+        return {"module": self.module}
+
+    def set_params(self, **params: Any) -> Self:
+        """Change what it was made with.
+
+        Raises:
+            UsageError: there is no such parameter.
+        """
+        if unknown := set(params) - {"module"}:
+            raise UsageError(f"no parameter {', '.join(sorted(unknown))}: there is module")
+        self.module = params.get("module", self.module)
+        return self
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return True
+
+    def __sklearn_tags__(self) -> Any:
+        from sklearn.utils import Tags, TargetTags, TransformerTags
+
+        return Tags(
+            estimator_type=None,
+            target_tags=TargetTags(required=False),
+            transformer_tags=TransformerTags(),
+            requires_fit=False,
+        )

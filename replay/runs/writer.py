@@ -17,11 +17,26 @@ from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from recorder.log.logfile import LogFile
 from recorder.log.messages import ENCODING, ImageEncoder, descriptor_set
 from recorder.mcap.reader import LogReader
-from replay.runs.columns import columns_of_messages
+from replay.runs.codec import (
+    MATRIX_DEFINITION,
+    MATRIX_SCHEMA,
+    SIGNALS_DEFINITION,
+    SIGNALS_SCHEMA,
+    decode_columns,
+    encode_matrix,
+    encode_signals,
+    iteration_of,
+)
 from replay.runs.folders import FINAL_METADATA, RUN_METADATA
-from replay.runs.log import (
-    EVENT_TOPIC,
+from replay.runs.keyframes import (
+    KEYFRAME_DEFINITION,
+    KEYFRAME_SCHEMA,
     KEYFRAME_TOPIC,
+    encode_keyframe,
+)
+from replay.runs.log import (
+    BATCH_ITERATIONS,
+    EVENT_TOPIC,
     PHI_EVERY,
     PHI_TOPIC,
     SIGNALS_TOPIC,
@@ -29,18 +44,6 @@ from replay.runs.log import (
     WATCHED_TOPIC,
     RunHeader,
 )
-from replay.runs.messages import (
-    KEYFRAME_SCHEMA,
-    MATRIX_SCHEMA,
-    SCHEMAS,
-    SIGNALS_SCHEMA,
-    decode_signals,
-    encode_keyframe,
-    encode_matrix,
-    encode_signals,
-    iteration_of,
-)
-from replay.runs.stretches import ITERATIONS
 
 NEVER_NS = 2**62
 """More log time than any run has."""
@@ -110,10 +113,11 @@ class RunWriter(Sink):
         self._last_keyframe = -1
         self._unweighed: tuple[int, int, int] | None = None
         self._channels: dict[str, int] = {}
-        self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA)
-        self._add_channel(PHI_TOPIC, MATRIX_SCHEMA)
-        self._add_channel(TRUTH_TOPIC, MATRIX_SCHEMA)
-        self._add_channel(KEYFRAME_TOPIC, KEYFRAME_SCHEMA)
+        matrix = MATRIX_SCHEMA, MATRIX_DEFINITION
+        self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA, SIGNALS_DEFINITION)
+        self._add_channel(PHI_TOPIC, *matrix)
+        self._add_channel(TRUTH_TOPIC, *matrix)
+        self._add_channel(KEYFRAME_TOPIC, KEYFRAME_SCHEMA, KEYFRAME_DEFINITION)
         self._add_channel(EVENT_TOPIC, "foxglove.Log", descriptor_set(Log_pb2.Log.DESCRIPTOR))
         self._images: list[ImageEncoder] = []
         if spec.images:
@@ -122,7 +126,7 @@ class RunWriter(Sink):
             encoder = self._images[0]
             self._add_channel(WATCHED_TOPIC, encoder.schema, encoder.schema_data())
         else:
-            self._add_channel(WATCHED_TOPIC, MATRIX_SCHEMA)
+            self._add_channel(WATCHED_TOPIC, *matrix)
 
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Write what one iteration gave; see `Sink`."""
@@ -206,7 +210,7 @@ class RunWriter(Sink):
                 elif topic == KEYFRAME_TOPIC:
                     self._last_keyframe = entry.sequence
                 self._log.write(self._channels[topic], entry.log_time, entry.data, entry.sequence)
-                if len(taken) >= ITERATIONS:
+                if len(taken) >= BATCH_ITERATIONS:
                     yield from _records(taken, where)
                     taken = []
         yield from _records(taken, where)
@@ -230,8 +234,8 @@ class RunWriter(Sink):
         """Leave a readable NAME.partial."""
         self._log.abandon()
 
-    def _add_channel(self, topic: str, name: str, definition: bytes = b"") -> None:
-        schema = self._log.add_schema(name, ENCODING, definition or SCHEMAS[name])
+    def _add_channel(self, topic: str, name: str, definition: bytes) -> None:
+        schema = self._log.add_schema(name, ENCODING, definition)
         self._channels[topic] = self._log.add_channel(topic, schema)
 
     def _write(self, topic: str, at: int, iteration: int, data: bytes) -> None:
@@ -239,5 +243,5 @@ class RunWriter(Sink):
 
 
 def _records(messages: Sequence[bytes], where: str) -> Iterator[BlockSignals]:
-    for columns in columns_of_messages(messages, lambda data: decode_signals(data, where)):
+    for columns in decode_columns(messages, where):
         yield from columns.records()

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Place
+from replay.storage.location import Url
 from replay.stored import StoredSource
 
 AT_ONCE: Final = 64 * 1024 * 1024
@@ -59,7 +61,7 @@ class Identity(ABC):
         """
 
 
-class ByteIdentity(Identity):
+class _ByteIdentity(Identity):
     """Identity of a log on this machine: SHA-256 of its bytes."""
 
     _sha256: str | None = None
@@ -97,7 +99,7 @@ class ByteIdentity(Identity):
         return LogDamagedError(f"{self.path}: it was changed while it was read; begin again")
 
 
-class FilesIdentity(ByteIdentity):
+class FilesIdentity(_ByteIdentity):
     """Identity of a file, or of files of a folder with their names.
 
     Args:
@@ -152,6 +154,61 @@ class FilesIdentity(ByteIdentity):
                 raise CdmisfaError(f"{path}: {error.strerror}") from None
             found.append((state.st_size, state.st_mtime_ns))
         return found
+
+
+def log_identity(*readers: LogReader) -> Identity:
+    """The identity of a log, given its readers, one at least.
+
+    Of a URL, so that not every byte is read, its size and `index_sha256`: over the file from
+    its data end record on, which holds the checksum of all data and where each chunk is. Where
+    the index does not account for every message, `sha256` over all of it, too.
+    """
+    return (_RemoteIdentity if isinstance(readers[0].path, Url) else _LogIdentity)(*readers)
+
+
+class _LogIdentity(_ByteIdentity):
+    """A log in a file, whose sample holds all from its data end record on."""
+
+    def __init__(self, reader: LogReader, *_: LogReader) -> None:
+        self.path, self.size = reader.path, reader.size
+        self._data = reader.data
+
+    def sample_sha256(self) -> str:
+        found = hashlib.sha256()
+        for place in sampled(self.size):
+            found.update(self._data.read(place, PIECE))
+        for block in self._data.tail():
+            found.update(block)
+        return found.hexdigest()
+
+    def sha256(self, counted: Counted) -> str:
+        return self._data.sha256(0, counted)
+
+    def changed(self) -> bool:
+        return self._data.changed()
+
+
+class _RemoteIdentity(Identity):
+    """A log behind a URL, of which not all is read."""
+
+    def __init__(self, *readers: LogReader) -> None:
+        self.path, self.size = readers[0].path, 0
+        self._readers = readers
+        self._known: dict[str, Any] | None = None
+
+    def sample(self) -> dict[str, Any]:
+        return self.whole(lambda count: None)
+
+    def whole(self, counted: Counted) -> dict[str, Any]:
+        reader = self._readers[0]
+        if self._known is None:
+            name = "index_sha256" if reader.by_index else "sha256"
+            known = {"file": self.path.name, "url": str(self.path), "bytes": reader.size}
+            self._known = {**known, name: reader.digest()}
+        else:
+            for reader in self._readers:
+                reader.confirm()
+        return self._known
 
 
 class LoggedSource(StoredSource):

@@ -1,14 +1,18 @@
-"""Where a log is: a path, or a URL."""
+"""Where a log is, a path or a URL, and how long its server is waited for."""
 
 from __future__ import annotations
 
+import contextlib
 import re
+from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 from urllib.parse import unquote, urlsplit
 
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.options import setting
 
 SCHEMES: Final = ("s3", "http", "https")
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
@@ -91,3 +95,50 @@ def location(value: str | Path | Url) -> Location:
     if not (parts.netloc and parts.path.strip("/")):
         raise UsageError(f"{value} names no file: a URL is like {scheme}://PLACE/PATH/left.mcap")
     return url
+
+
+_PART: Final = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Time limits for servers, in seconds; `total` is for tries and waits together."""
+
+    total: float = setting(
+        60.0,
+        "Give up on a part of a log at a URL (of a large one, on each MiB) after so long.",
+        unit="SECONDS",
+        name="timeout",
+        least=0.1,
+        most=1e6,
+    )
+    read: float = setting(
+        20.0,
+        "Ask a server again that sends nothing for so long.",
+        unit="SECONDS",
+        name="read-timeout",
+        least=0.1,
+        most=1e6,
+    )
+
+    def of(self, count: int) -> float:
+        """Seconds for `count` bytes."""
+        return self.total * max(1.0, count / _PART)
+
+
+_LIMITS: Final = ContextVar("limits", default=Limits())  # noqa: B039 - it is frozen
+
+
+def limits() -> Limits:
+    """Those that hold here."""
+    return _LIMITS.get()
+
+
+@contextlib.contextmanager
+def limited(chosen: Limits) -> Iterator[None]:
+    """Hold the servers that are connected to in the body to these limits."""
+    before = _LIMITS.set(chosen)
+    try:
+        yield
+    finally:
+        _LIMITS.reset(before)

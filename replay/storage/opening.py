@@ -1,17 +1,65 @@
-"""Opening what a path or a URL names: to read at any place of it, or as files of this machine."""
+"""Opening what paths and URLs name: to read at any place, or as files of this machine."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from cdmisfa.core.errors import CdmisfaError
-from recorder.mcap.store import FileStore, Store
-from replay.storage.listing import log_files
+from cdmisfa.core.errors import CdmisfaError, UsageError
+from recorder.mcap.records import MAGIC
+from recorder.mcap.store import PARTIAL, FileStore, Store
 from replay.storage.location import Location, Url, location
+
+
+def log_files(paths: str | Location | Iterable[str | Location]) -> list[Location]:
+    """List the MCAP files of folders and of S3 prefixes, and files that are named.
+
+    In a folder a `.partial` counts where the finished file is not there.
+
+    Raises:
+        UsageError: there is none.
+        LogDamagedError: a server does not list it.
+    """
+    if isinstance(paths, str | Path | Url):
+        paths = [paths]
+    files: list[Location] = []
+    for path in map(location, paths):
+        if isinstance(path, Url):
+            files += _listed(path)
+        elif path.is_dir():
+            whole = sorted(path.glob("*.mcap"))
+            cut = sorted(path.glob(f"*.mcap{PARTIAL}"))
+            found = whole + [p for p in cut if p.with_suffix("") not in whole]
+            if not found:
+                raise UsageError(
+                    f"{path}: no .mcap file in this folder; record or learn first, or name each "
+                    "video, bag or folder of pictures in it"
+                )
+            files += found
+        elif path.exists():
+            files.append(path)
+        else:
+            raise UsageError(f"{path}: no such file or folder")
+    if not files:
+        raise UsageError("no log was named")
+    return files
+
+
+def _listed(url: Url) -> list[Location]:
+    """The logs right below an S3 prefix, as those of a folder; any other URL as itself."""
+    if not url.folder:
+        return [url]
+    from replay.storage.servers import ask_s3
+
+    entries = ask_s3(url, lambda files: files._ls(url.address, detail=True, refresh=True))
+    names = sorted(str(entry["name"]) for entry in entries)
+    logs = [n for n in names if n.removesuffix(PARTIAL).endswith(".mcap")]
+    if not logs:
+        raise UsageError(f"{url}: no .mcap file below this prefix")
+    return [Url(f"s3://{n}") for n in logs if n.removesuffix(PARTIAL) not in {*logs} - {n}]
 
 
 def open_store(place: str | Location) -> Store:
@@ -28,6 +76,19 @@ def open_store(place: str | Location) -> Store:
     from replay.storage.remote import RemoteStore
 
     return RemoteStore(place)
+
+
+def starts_as_log(path: Path) -> bool:
+    """Whether a file begins as every MCAP file does.
+
+    Raises:
+        CdmisfaError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError as error:
+        raise CdmisfaError(f"{path}: {error.strerror}") from None
 
 
 @contextlib.contextmanager

@@ -1,27 +1,38 @@
-"""Servers that logs lie on, through fsspec: parts of an object, and what an S3 prefix lists.
+"""Servers of logs and results, through fsspec; every answer must be the part that was asked for.
 
-Every answer must be the part that was asked for.
+What may be a passing fault is asked for again, within the limits of `replay.storage.location`.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import random
 import re
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from typing import Any, Final, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.storage.limits import limits
-from replay.storage.location import Location, Url
-from replay.storage.tries import Again, UnreachableError, asked_wait, patiently
+from replay.storage.location import Url, limits
 
-SPARE_SECONDS: Final = 5.0
+TRIES: Final = 6
+FIRST_WAIT = 0.5
+"""Seconds before the second try; each further wait is twice as long."""
+
+_JITTER: Final = random.Random()
+"""Keeps clients that failed together from coming back together; nothing else draws from it."""
+
+_SPARE_SECONDS: Final = 5.0
 """For what is waited for on another thread to end by itself, after its time."""
 
-_LISTED: Final = 1 << 20
 _LENGTH: Final = re.compile(r"\d{1,19}", re.ASCII)
 _RANGE: Final = re.compile(r"bytes (\d{1,19})-(\d{1,19})/(\d{1,19})", re.ASCII)
+_NOTHING: Final = re.compile(r"bytes \*/0+", re.ASCII)
 _BROKEN_OFF: Final = (
     "ClientPayloadError",
     "ConnectionClosedError",
@@ -31,13 +42,25 @@ _BROKEN_OFF: Final = (
     "ResponseStreamingError",
     "SocketTimeoutError",
 )
-_NOTHING: Final = re.compile(r"bytes \*/0+", re.ASCII)
+"""What aiohttp and botocore call a connection that broke."""
 
 Value = TypeVar("Value")
 
 
 class RemoteError(LogDamagedError):
     """A server that sends less than it says, or not the log that was opened."""
+
+
+class UnreachableError(CdmisfaError):
+    """A server that cannot be reached, or does not give parts of the log."""
+
+
+class Again(Exception):  # noqa: N818 - asks for another try
+    """What may go better the next time, after the seconds that the server asks for."""
+
+    def __init__(self, reason: str = "", after: float = 0.0) -> None:
+        super().__init__(reason)
+        self.after = after
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +72,33 @@ class Part:
     tag: str
 
 
-class _HttpServer:
-    """An object of a web server; `part` fetches its bytes [start, stop), or up to the end."""
+class Server(ABC):
+    """The server of an object, which is not asked for anything yet.
+
+    Args:
+        url: of the object.
+        files: what fsspec has for it.
+    """
+
+    def __init__(self, url: Url, files: Any) -> None:
+        self._url, self._files, self._limits = url, files, limits()
+
+    @abstractmethod
+    async def part(self, start: int, stop: int) -> Part:
+        """The bytes [start, stop), or up to the end; raises `Again` where it may go better."""
+
+    def begin(self, start: int, stop: int) -> Future[Part]:
+        """Ask for the bytes [start, stop), without waiting for them."""
+        asked = patiently(lambda: self.part(start, stop), self._limits.of(stop - start))
+        return asyncio.run_coroutine_threadsafe(asked, self._files.loop)
+
+    def wait(self, coming: Future[Part], count: int) -> Part:
+        """The `count` bytes that were asked for; raises as `_answer`."""
+        return _answer(self._url, coming, self._limits.of(count))
+
+
+class _HttpServer(Server):
+    """An object of a web server."""
 
     def __init__(self, url: Url) -> None:
         import aiohttp
@@ -59,11 +107,10 @@ class _HttpServer:
 
         # Unpacking on the way would make other bytes of the parts, without a limit.
         settings = {"auto_decompress": False}
-        self._files = fsspec.filesystem(url.scheme, client_kwargs=settings)
+        super().__init__(url, fsspec.filesystem(url.scheme, client_kwargs=settings))
         self._timeout = aiohttp.ClientTimeout(
             total=None, sock_connect=limits().read, sock_read=limits().read
         )
-        self.loop = self._files.loop
         self._address = URL(url.address, encoded="%" in url.address)
         self._reached = False
 
@@ -75,8 +122,12 @@ class _HttpServer:
         try:
             async with session.get(self._address, headers=headers, timeout=self._timeout) as answer:
                 self._reached = True
-                self._check_way(answer)
-                return await self._taken(answer, start, stop)
+                ways = {step.url.scheme for step in (*answer.history, answer)}
+                if self._address.scheme == "https" and ways != {"https"}:
+                    raise UnreachableError("the server sends us from https to http")
+                total, count = _stated(answer, start, stop)
+                data = await answer.content.readexactly(count)
+                return Part(data, total, _tag(answer.headers))
         except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError):
             raise UnreachableError("the server sends us to what is no http address") from None
         except aiohttp.TooManyRedirects:
@@ -91,44 +142,41 @@ class _HttpServer:
         except (aiohttp.ClientError, asyncio.IncompleteReadError, TimeoutError) as error:
             raise Again from error
 
-    def _check_way(self, answer: Any) -> None:
-        """Refuse to be sent from an encrypted to an open address."""
-        ways = {step.url.scheme for step in (*answer.history, answer)}
-        if self._address.scheme == "https" and ways != {"https"}:
-            raise UnreachableError("the server sends us from https to http")
 
-    async def _taken(self, answer: Any, start: int, stop: int) -> Part:
-        headers = answer.headers
-        tag = headers.get("ETag") or headers.get("Last-Modified") or ""
-        if _passing(answer.status):
-            wait = asked_wait(headers.get("Retry-After", ""))
-            raise Again(f"the server answers {answer.status} {answer.reason}", wait)
-        if answer.status == 416 and _NOTHING.fullmatch(headers.get("Content-Range", "")):
-            return Part(b"", 0, tag)
-        if answer.status in (404, 410):
-            raise UsageError(f"the server answers {answer.status} {answer.reason}")
-        if answer.status not in (200, 206):
-            raise UnreachableError(f"the server answers {answer.status} {answer.reason}")
-        if headers.get("Content-Encoding", "identity") != "identity":
-            raise UnreachableError("the server packs it on the way: download it first")
-        if answer.status == 200:
-            length = headers.get("Content-Length", "")
-            if start or not _LENGTH.fullmatch(length) or int(length) > stop:
-                raise UnreachableError(
-                    "the server sends no parts of a file (range requests): download it first, "
-                    "or put av: before the address of a camera"
-                )
-            return Part(await answer.content.readexactly(int(length)), int(length), tag)
-        total, count = _range_of(headers.get("Content-Range", ""), start, stop)
-        return Part(await answer.content.readexactly(count), total, tag)
+def _tag(headers: Any) -> str:
+    return str(headers.get("ETag") or headers.get("Last-Modified") or "")
 
 
-class _S3Server:
-    """An object of an S3 bucket, as `_HttpServer`."""
+def _stated(answer: Any, start: int, stop: int) -> tuple[int, int]:
+    """Total size, and bytes of the answer of a web server, which must be the part asked for."""
+    headers, status = answer.headers, answer.status
+    said = f"the server answers {status} {answer.reason}"
+    if _passing(status):
+        raise Again(said, asked_wait(headers.get("Retry-After", "")))
+    if status == 416 and _NOTHING.fullmatch(headers.get("Content-Range", "")):
+        return 0, 0
+    if status in (404, 410):
+        raise UsageError(said)
+    if status not in (200, 206):
+        raise UnreachableError(said)
+    if headers.get("Content-Encoding", "identity") != "identity":
+        raise UnreachableError("the server packs it on the way: download it first")
+    if status == 206:
+        return _range_of(headers.get("Content-Range", ""), start, stop)
+    length = headers.get("Content-Length", "")
+    if start or not _LENGTH.fullmatch(length) or int(length) > stop:
+        raise UnreachableError(
+            "the server sends no parts of a file (range requests): download it first, "
+            "or put av: before the address of a camera"
+        )
+    return int(length), int(length)
+
+
+class _S3Server(Server):
+    """An object of an S3 bucket."""
 
     def __init__(self, url: Url) -> None:
-        self._files = _s3()
-        self.loop = self._files.loop
+        super().__init__(url, s3_files())
         self._bucket, self._key, _ = self._files.split_path(url.address)
 
     async def part(self, start: int, stop: int) -> Part:
@@ -136,21 +184,122 @@ class _S3Server:
         span = f"bytes={start}-{stop - 1}"
         try:
             answer = await self._files._call_s3("get_object", **place, Range=span)
-        except Exception as error:
-            if "InvalidRange" in f"{error} {error.__cause__!r}" and not start:
-                return Part(b"", 0, "")
-            _ask_again(error)
-            raise
-        total, count = _range_of(answer.get("ContentRange", ""), start, stop)
-        data = bytearray()
-        try:
+            total, count = _range_of(answer.get("ContentRange", ""), start, stop)
+            data = bytearray()
             async with answer["Body"] as body:
                 while len(data) < count and (more := await body.read(count - len(data))):
                     data += more
         except Exception as error:
-            _ask_again(error)
+            if "InvalidRange" in f"{error} {error.__cause__!r}" and not start:
+                return Part(b"", 0, "")
+            _raise_again(error)
             raise
         return Part(bytes(data), total, answer.get("ETag", ""))
+
+
+def connect(url: Url) -> Server:
+    """The server of an object.
+
+    Raises:
+        CdmisfaError: what reads URLs is not installed.
+    """
+    return _importing(lambda: _S3Server(url) if url.scheme == "s3" else _HttpServer(url))
+
+
+def s3_files() -> Any:
+    """What s3fs has for buckets; tries are counted and spread by `patiently` alone."""
+    import fsspec
+
+    seconds = limits().read
+    settings = {
+        "connect_timeout": seconds,
+        "read_timeout": seconds,
+        "retries": {"total_max_attempts": 1, "mode": "standard"},
+    }
+    files = fsspec.filesystem("s3", use_listings_cache=False, config_kwargs=settings)
+    files.retries = 1
+    return files
+
+
+def ask_s3(url: Url, ask: Callable[[Any], Awaitable[Value]], count: int = 0) -> Value:
+    """What is answered to a question about a bucket, asked again after a passing fault.
+
+    Args:
+        url: what the question is about, for messages.
+        ask: asks what s3fs has for buckets.
+        count: bytes that are sent with it.
+
+    Raises:
+        UsageError: there is no such object or bucket.
+        UnreachableError: the server refuses it, or cannot be reached in time.
+        CdmisfaError: what reads URLs is not installed.
+    """
+    files, seconds = _importing(s3_files), limits().of(count)
+
+    async def once() -> Value:
+        try:
+            return await ask(files)
+        except Exception as error:
+            _raise_again(error)
+            raise
+
+    asked = asyncio.run_coroutine_threadsafe(patiently(once, seconds), files.loop)
+    return _answer(url, asked, seconds)
+
+
+def _importing(make: Callable[[], Value]) -> Value:
+    try:
+        return make()
+    except ImportError:
+        raise CdmisfaError(
+            "reading URLs needs packages that are not installed: pip install 'cdmisfa[cloud]'"
+        ) from None
+
+
+async def patiently(ask: Callable[[], Awaitable[Value]], seconds: float) -> Value:
+    """Ask until there is an answer: up to `TRIES` times, and no longer than `seconds`.
+
+    Raises:
+        UnreachableError: there was none in time.
+        Again: the last try failed, too.
+    """
+    clock = asyncio.get_running_loop().time
+    end = clock() + seconds
+    try:
+        async with asyncio.timeout_at(end):
+            for attempt in range(TRIES - 1):
+                try:
+                    return await ask()
+                except Again as error:
+                    wait = max(error.after, backoff(attempt))
+                    if clock() + wait >= end:
+                        if error.after < wait:
+                            raise
+                        raise UnreachableError(
+                            f"{error} and asks for {error.after:.0f} s, longer than --timeout "
+                            f"leaves of {seconds:g} s"
+                        ) from error
+                await asyncio.sleep(wait)
+            return await ask()
+    except TimeoutError:
+        raise UnreachableError(
+            f"the server took longer than {seconds:g} s: raise --timeout, or download it first"
+        ) from None
+
+
+def backoff(attempt: int) -> float:
+    """Seconds to wait after so many failed tries (0 the first), with jitter."""
+    return FIRST_WAIT * 2.0**attempt * _JITTER.uniform(0.5, 1.0)
+
+
+def asked_wait(retry_after: str) -> float:
+    """Seconds that a `Retry-After` header asks for: a number or a date; 0 where it is neither."""
+    text = retry_after.strip()
+    if text.isascii() and text.isdigit():
+        return float(text[:12])
+    with contextlib.suppress(ValueError, OverflowError):
+        return max(parsedate_to_datetime(text).timestamp() - time.time(), 0.0)
+    return 0.0
 
 
 def _passing(status: int) -> bool:
@@ -158,83 +307,17 @@ def _passing(status: int) -> bool:
     return status in (408, 429) or (status >= 500 and status != 501)
 
 
-def _ask_again(error: Exception) -> None:
+def _raise_again(error: BaseException | None) -> None:
     """Ask for another try after what may be a passing fault of an S3 server."""
-    found: BaseException | None = error
-    while found is not None:
-        facts = getattr(found, "response", None)
+    while error is not None:
+        facts = getattr(error, "response", None)
         said = facts.get("ResponseMetadata", {}) if isinstance(facts, dict) else {}
         if _passing(int(said.get("HTTPStatusCode", 0))):
             wait = asked_wait(str(said.get("HTTPHeaders", {}).get("retry-after", "")))
             raise Again(f"the server answers {said['HTTPStatusCode']}", wait) from error
-        if type(found).__name__ in _BROKEN_OFF:
+        if type(error).__name__ in _BROKEN_OFF:
             raise Again from error
-        found = found.__cause__
-
-
-def listed(url: Url) -> list[Url]:
-    """The logs right below an S3 prefix, finished or `.partial`, by name.
-
-    Raises:
-        UsageError: there is none.
-        UnreachableError: the server does not list it.
-    """
-
-    async def keys(files: Any) -> list[str]:
-        entries = await files._ls(url.address, detail=True, refresh=True)
-        return [str(entry["name"]) for entry in entries]
-
-    names = _asked(url, keys, limits().of(_LISTED))
-    logs = [Url(f"s3://{n}") for n in sorted(names) if n.endswith((".mcap", ".mcap.partial"))]
-    if not logs:
-        raise UsageError(f"{url}: no .mcap file below this prefix")
-    return logs
-
-
-def s3_place(url: Url) -> tuple[str, str]:
-    """Bucket and key of an s3:// address.
-
-    Raises:
-        UsageError: it names no place in a bucket.
-        CdmisfaError: what reads URLs is not installed.
-    """
-    bucket, key, _ = _importing(_s3).split_path(url.address)
-    if not (bucket and key):
-        raise UsageError(f"{url} names no place in a bucket: write s3://BUCKET/NAME")
-    return str(bucket), str(key).rstrip("/")
-
-
-def ask_s3(url: Url, call: str, seconds: float, **words: Any) -> Any:
-    """The answer to a call of the S3 interface, asked again after what may be a passing fault.
-
-    Args:
-        url: what the call is about, for messages.
-        call: its name: "put_object".
-        seconds: tries and waits together.
-        words: of the call.
-
-    Raises:
-        UsageError: there is no such object or bucket.
-        UnreachableError: the server refuses it, or cannot be reached in time.
-    """
-    return _asked(url, lambda files: files._call_s3(call, **words), seconds)
-
-
-def _asked(url: Url, ask: Callable[[Any], Awaitable[Value]], seconds: float) -> Value:
-    files = _importing(_s3)
-
-    async def once() -> Value:
-        try:
-            return await ask(files)
-        except Exception as error:
-            _ask_again(error)
-            raise
-
-    try:
-        asked = asyncio.run_coroutine_threadsafe(patiently(once, seconds), files.loop)
-        return asked.result(seconds + SPARE_SECONDS)
-    except Exception as error:
-        raise refusal(url, error) from None
+        error = error.__cause__
 
 
 def _range_of(text: str, start: int, stop: int) -> tuple[int, int]:
@@ -248,64 +331,46 @@ def _range_of(text: str, start: int, stop: int) -> tuple[int, int]:
     return total, last + 1 - first
 
 
-def connect(url: Url) -> _S3Server | _HttpServer:
-    """The server of an object, which is not asked for anything yet."""
-    return _importing(lambda: _S3Server(url) if url.scheme == "s3" else _HttpServer(url))
+def _answer(url: Url, coming: Future[Value], seconds: float) -> Value:
+    """What was asked for, or what the server has against us, in one line.
 
-
-def _s3() -> Any:
-    import fsspec
-
-    seconds = limits().read
-    settings = {  # tries are counted and spread by `patiently` alone
-        "connect_timeout": seconds,
-        "read_timeout": seconds,
-        "retries": {"total_max_attempts": 1, "mode": "standard"},
-    }
-    files = fsspec.filesystem("s3", use_listings_cache=False, config_kwargs=settings)
-    files.retries = 1
-    return files
-
-
-def _importing(make: Callable[[], Value]) -> Value:
+    Raises:
+        UsageError: there is no such object.
+        RemoteError: it came short, or not as it was said.
+        UnreachableError: it did not come.
+    """
     try:
-        return make()
-    except ImportError:
-        raise CdmisfaError(
-            "reading URLs needs packages that are not installed: pip install 'cdmisfa[cloud]'"
-        ) from None
+        return coming.result(seconds + _SPARE_SECONDS)
+    except Again as error:
+        kind, words = _refusal(error.__cause__ or error)
+    except Exception as error:
+        kind, words = _refusal(error)
+    plain = "".join(letter if letter.isprintable() else "?" for letter in words)
+    raise kind(f"{url}: {plain[:300]}")
 
 
-def refusal(url: Location, error: BaseException) -> CdmisfaError:
-    """What to raise: there is no such object, it came short or changed, or not at all."""
-    kind: type[CdmisfaError] = UnreachableError
+def _refusal(error: BaseException) -> tuple[type[CdmisfaError], str]:
+    """What to raise instead of an error, and its words."""
     if isinstance(error, CdmisfaError):
-        kind = type(error)
-    elif isinstance(error, FileNotFoundError):
-        kind = UsageError
-    elif isinstance(error, asyncio.IncompleteReadError) or "Payload" in type(error).__name__:
-        kind = RemoteError
-    words = "".join(letter if letter.isprintable() else "?" for letter in _words(error))
-    return kind(f"{url}: {words[:300]}")
-
-
-def _words(error: BaseException) -> str:
-    """What a server, or the way to it, has against us, in one line."""
-    if isinstance(error, CdmisfaError | Again):
-        return str(error)
-    if type(error).__name__ == "NoCredentialsError":
-        return (
+        return type(error), str(error)
+    if isinstance(error, FileNotFoundError):
+        return UsageError, "there is no such object"
+    if isinstance(error, asyncio.IncompleteReadError):
+        words = f"the server sent {len(error.partial)} bytes of {error.expected} and went away"
+        return RemoteError, words
+    if "Payload" in type(error).__name__:
+        return RemoteError, "the server sent fewer bytes than it said, and went away"
+    if isinstance(error, Again):
+        words = str(error)
+    elif type(error).__name__ == "NoCredentialsError":
+        words = (
             "no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
             "FSSPEC_S3_ANON=true for a public bucket"
         )
-    if isinstance(error, FileNotFoundError):
-        return "there is no such object"
-    if isinstance(error, PermissionError):
-        return f"the server refuses it ({str(error)[:100]})"
-    if isinstance(error, TimeoutError):
-        return "the server does not answer in time"
-    if isinstance(error, asyncio.IncompleteReadError):
-        return f"the server sent {len(error.partial)} bytes of {error.expected} and went away"
-    if "Payload" in type(error).__name__:
-        return "the server sent fewer bytes than it said, and went away"
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    elif isinstance(error, PermissionError):
+        words = f"the server refuses it ({str(error)[:100]})"
+    elif isinstance(error, TimeoutError):
+        words = "the server does not answer in time"
+    else:
+        words = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    return UnreachableError, words

@@ -16,13 +16,11 @@ from rerun.chunk import Chunk
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, whole
 from replay.camera_logs.options import CameraOptions
-from replay.following import Heard
-from replay.inputs.opening import holds_run
+from replay.inputs import holds_run
 from replay.runs.folders import MODULES_FILE, run_log
-from replay.runs.log import read_header
+from replay.runs.log import Frames, read_batches, read_header
 from replay.runs.modules import load_modules
-from replay.runs.outline import Tally, read_outline
-from replay.runs.stretches import Frames, read_stretches
+from replay.runs.run import Tally, read_outline
 from replay.view.labels import label
 from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_STREAMS
@@ -31,7 +29,7 @@ from replay.view.recording import write_recording, write_unwatched
 from replay.view.run import RunView
 from replay.view.summary import summary_text
 from replay.view.world.first import WorldView
-from replay.view.world.learned import MOST, write_learned
+from replay.view.world.learned import write_learned
 
 FLUSH_SECONDS = 60.0
 
@@ -157,18 +155,16 @@ def _write_run(
     tally, view = Tally(header), RunView(recording, header, streams, every)
     world = WorldView(recording, header, folder, streams, every, all_views, body=body)
     truth: list[Frames] = []
-    heard = Heard(MOST)
     for note in world.notes:
         view.event(0, 0, note, "WARN")
     events: list[str] = []
-    for stretch in read_stretches(log, header, every=every):
-        for columns in stretch.signals:
+    for batch in read_batches(log, header, every=every):
+        for columns in batch.signals:
             tally.add(columns)
-            heard.add(columns)
-        view.take(stretch)
-        world.take(stretch)
-        truth += stretch.truth
-        events += [event.text for event in stretch.events]
+        view.take(batch)
+        world.take(batch)
+        truth += batch.truth
+        events += [event.text for event in batch.events]
     outline = tally.outline()
     view.finish(outline, load_modules(folder) if (folder / MODULES_FILE).is_file() else ())
     # Not as `AnyValues`, which lose a value of another type than the process's first of its name.
@@ -177,7 +173,7 @@ def _write_run(
     recording.log("summary", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
     head = all_views is not None and write_unwatched(recording, all_views, log, outline, every)
     world.flush()
-    first = world.first(write_learned(recording, log, outline, truth, heard))
+    first = world.first(write_learned(recording, log, outline, truth))
     recording.send_blueprint(
         run_layout(outline, first, all_views=all_views is not None, head=head, tab=tab)
     )

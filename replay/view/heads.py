@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from cdmisfa.core.blocks import HeadPose
 from replay.palette import colour, packed_all, pale
 from replay.recordings.poses import yaw_of
-from replay.runs.outline import Outline
+from replay.runs.run import Outline
 from replay.view.columns import line_column, time_columns
 from replay.view.labels import label, part
 

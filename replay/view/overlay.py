@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from replay.palette import Rgb, colour
 from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
-from replay.runs.stretches import read_columns
+from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, Column, line_column, power_of_ten
 from replay.view.labels import label, part

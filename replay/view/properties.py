@@ -20,7 +20,7 @@ from replay.view.bindings import Chunk, ChunkStore, ComponentDescriptor
 from replay.view.labels import label
 
 if TYPE_CHECKING:
-    from replay.runs.outline import Outline
+    from replay.runs.run import Outline
 
 APPLICATION = "cdmisfa"
 """Rerun's application id: one layout is remembered for it."""
@@ -80,7 +80,7 @@ def read_properties(run: Path) -> Sections:
         learned = [str(module["stream"]) for module in found["modules"]]
         counts = int(document["seed"]), int(found["iterations"]), int(found["frames"])
     except (KeyError, TypeError, ValueError):
-        from replay.runs.outline import read_outline  # only where there is no result
+        from replay.runs.run import read_outline  # only where there is no result
 
         return properties_of(read_outline(run), run)
     return {**_configuration(document), "result": _result(counts, learned, document)}

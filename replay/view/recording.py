@@ -14,12 +14,11 @@ import rerun.blueprint as rrb
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged, open_to_look
+from replay.inputs import Logged, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
 from replay.runs.columns import Blocks
-from replay.runs.final import stated_source, states_whole
-from replay.runs.outline import Outline
+from replay.runs.run import Outline, stated_source, states_whole
 from replay.view.columns import FRAME, frames_column, line_column
 from replay.view.heads import gaze, write_gaze, write_heads
 from replay.view.labels import label, part

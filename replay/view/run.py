@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS, Signal
-from replay.palette import BRICK, GREY, MIST, Rgb, colour, dim, packed, packed_all, pale, shade
-from replay.runs.columns import Blocks, SignalColumns, told
-from replay.runs.log import RunHeader
-from replay.runs.outline import Outline
-from replay.runs.stretches import Stretch
+from replay.palette import BRICK, GREY, MIST, Rgb, colour, darker, packed, packed_all, pale, shade
+from replay.runs.columns import Blocks, SignalColumns, has_values
+from replay.runs.log import Batch, RunHeader
+from replay.runs.run import Outline
 from replay.view.columns import (
     FRAME,
     ITERATION,
@@ -102,7 +101,7 @@ class RunView:
         self._spec = header.spec
         self._columns: dict[str, Column] = {}
         self._streams = streams
-        self._blocks = Blocks.joined(())
+        self._blocks = Blocks.concatenated(())
         self._recent = np.zeros((0, len(streams)), dtype=bool)
         self._stream_of: dict[int, int] = {}
         self._named = -1
@@ -110,19 +109,19 @@ class RunView:
             recording, self._spec, streams, by_progress=header.by_progress, piece=piece
         )
 
-    def take(self, stretch: Stretch) -> None:
+    def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
-        self._blocks = stretch.blocks
-        for columns in stretch.signals:
+        self._blocks = batch.blocks
+        for columns in batch.signals:
             self._add(columns)
-        for frames, watched in stretch.watched:
+        for frames, watched in batch.watched:
             self._watched(frames, watched)
-        for frames, truth in stretch.truth:
+        for frames, truth in batch.truth:
             self._truth(frames, truth)
-        for t, phi in stretch.phi:
-            (iteration,) = stretch.blocks.iteration(np.array([t])).tolist()
+        for t, phi in batch.phi:
+            (iteration,) = batch.blocks.iteration(np.array([t])).tolist()
             self.weights("abstraction/phi", t, iteration, phi)
-        for event in stretch.events:
+        for event in batch.events:
             self.event(event.t, event.iteration, event.text, event.level)
 
     def finish(self, outline: Outline, modules: Sequence[Module]) -> None:
@@ -200,7 +199,7 @@ class RunView:
             if signal.name in TIMELINE_SIGNALS:
                 continue
             value, path = columns[signal.name], f"signals/{signal.name}"
-            if value.dtype.kind == "i" and not told(signal.name, value):
+            if value.dtype.kind == "i" and not has_values(signal.name, value):
                 continue
             every_frame = "T" in signal.dims
             frames, iterations = columns.times(every_frame)
@@ -265,7 +264,7 @@ class RunView:
             return None
         rgb = colour(self._stream_of[module])
         one = len(set(labels)) == 1
-        return [rgb if one or i == 0 else dim(rgb) for i in range(len(labels))]
+        return [rgb if one or i == 0 else darker(rgb) for i in range(len(labels))]
 
     def _attention(self, columns: SignalColumns) -> None:
         """How much of the recent blocks each shown stream was watched."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from cdmisfa.core.signals import SIGNALS
-from replay.palette import colour, dim
+from replay.palette import colour, darker
 from replay.runs.columns import SignalColumns
 from replay.runs.log import RunHeader
 from replay.view.columns import Column, power_of_ten
@@ -43,7 +43,7 @@ def add_streams(
         own, place = columns["stream"] == s, part(names, s)
         frames, iterations = columns.times()
         for name in WATCHED if own.any() else ():
-            rgb = dim(colour(s)) if name in DIM else colour(s)
+            rgb = darker(colour(s)) if name in DIM else colour(s)
             label = f"{SIGNALS[name].symbol} {names[s]}"
             values = np.where(np.isnan(columns["tested"][own]), np.nan, columns[name][own])
             if name in POWERS:

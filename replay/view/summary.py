@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import ACTIONS, STATES
-from replay.runs.outline import Outline
+from replay.runs.run import Outline
 from replay.view.layouts.panels import MOST_STREAMS
 
 ENDED = "ended:"

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import threading
+import time
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 
 import rerun as rr
 
 from cdmisfa.core.errors import CdmisfaError
-from replay.viewer.guarded import served
-from replay.viewer.stream import Stream
+from replay.viewer.web import served
+
+FIRST = 2
+"""Pieces at the beginning, which name the recording and its lines, and never go."""
 
 LAST_SECONDS = 5.0
 """Longest wait for viewers to take the last piece."""
@@ -38,13 +43,9 @@ class Broadcast:
             raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
         self._recording, self._name = recording, name
         self._encoded = rr.binary_stream(recording)
-        self._stream = Stream(MEMORY)
+        self._pieces = Pieces(MEMORY)
         self._serving = contextlib.ExitStack()
-        try:
-            address = self._serving.enter_context(served(self._answer, port))
-        except OSError as error:
-            raise CdmisfaError(f"no live view at port {port}: {error.strerror}") from error
-        self.address = f"{address}{name}"
+        self.address = f"{self._serving.enter_context(served(self._answer, port))}{name}"
 
     def _answer(self, request: BaseHTTPRequestHandler, path: str) -> None:
         if path != self._name:
@@ -54,17 +55,81 @@ class Broadcast:
         request.send_header("Content-Type", "application/octet-stream")
         request.send_header("Cache-Control", "no-store")
         request.end_headers()
-        for piece in self._stream.read():
+        for piece in self._pieces.read():
             request.wfile.write(piece)
 
     def hand_over(self) -> None:
         """Let viewers have what the recording was given."""
         if piece := self._encoded.read(flush=True):
-            self._stream.add(piece)
+            self._pieces.add(piece)
 
     def close(self) -> None:
         """Hand over the rest and stop serving; a viewer keeps what it has."""
         self.hand_over()
-        self._stream.end(LAST_SECONDS)
+        self._pieces.end(LAST_SECONDS)
         self._serving.close()
         self._recording.disconnect()
+
+
+class Pieces:
+    """Pieces of a recording that grows, for readers that come when they like.
+
+    No reader is waited for; the oldest pieces go where memory ends.
+
+    Args:
+        most: bytes that are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._pieces: dict[int, bytes] = {}
+        self._count = self._held = self._readers = 0
+        self._oldest = FIRST
+        self._ended = False
+        self._changed = threading.Condition()
+
+    def add(self, piece: bytes) -> None:
+        """Hand over a piece, which is a whole recording: viewers take one after the other."""
+        with self._changed:
+            self._pieces[self._count] = piece
+            self._count += 1
+            self._held += len(piece)
+            while self._held > self._most and self._oldest < self._count - 1:
+                self._held -= len(self._pieces.pop(self._oldest))
+                self._oldest += 1
+            self._changed.notify_all()
+
+    def end(self, seconds: float) -> None:
+        """No more comes; wait so long for readers to take the rest."""
+        until = time.monotonic() + seconds
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+            while self._readers and (left := until - time.monotonic()) > 0:
+                self._changed.wait(left)
+
+    def read(self) -> Iterator[bytes]:
+        """Every piece that is kept, and those that come, until the end."""
+        with self._changed:
+            self._readers += 1
+        try:
+            number = 0
+            while (found := self._piece(number)) is not None:
+                number, piece = found
+                yield piece
+        finally:
+            with self._changed:
+                self._readers -= 1
+                self._changed.notify_all()
+
+    def _piece(self, number: int) -> tuple[int, bytes] | None:
+        """A piece by its number, or the oldest after it; and the number of the next one."""
+        with self._changed:
+            while True:
+                if number >= FIRST:
+                    number = max(number, self._oldest)
+                if number < self._count:
+                    return number + 1, self._pieces[number]
+                if self._ended:
+                    return None
+                self._changed.wait()

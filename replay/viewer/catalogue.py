@@ -24,10 +24,16 @@ from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.runs.folders import VIEW_FILE, run_log, runs_in
 from replay.view.bindings import CatalogueClient, RrdReader
 from replay.view.properties import APPLICATION, read_properties, run_identity, write_rows
-from replay.viewer.display import has_display
-from replay.viewer.guarded import served_at
-from replay.viewer.program import Program, free_port, open_address, private_host, running
-from replay.viewer.webpage import page_for, page_server
+from replay.viewer.program import (
+    REFUSALS,
+    Program,
+    free_port,
+    has_display,
+    open_privately,
+    private_host,
+    running,
+)
+from replay.viewer.web import page_of, page_server, served
 
 ROWS = "base"
 """Name of the layer of rows."""
@@ -48,9 +54,6 @@ LAST_SECONDS = 5.0
 """Longest wait, at the end, for the view that is being built."""
 
 Progress = Callable[[int, int], None]
-
-REFUSALS = (OSError, RuntimeError, ValueError)
-"""What Rerun's client raises when the server refuses, or is not there."""
 
 
 def ready_view(run: Path) -> Path:
@@ -163,7 +166,7 @@ def serve_catalogue(
             shown = f"{table.rows} runs at {page}"
         print(shown, file=sys.stderr, flush=True)
         if has_display() and not web:
-            open_address(table.address)
+            open_privately(table.address)
         follow = threading.Thread(target=_follow, args=(table, tab, progress, ended), daemon=True)
         follow.start()
         try:
@@ -179,7 +182,7 @@ def _served_page(table: str, port: int | None) -> Iterator[str]:
     viewer_port, place = free_port(), table.removeprefix("rerun+").partition("/entry/")[0]
     with (
         running(page_server(viewer_port)),
-        served_at(page_for(place, viewer_port), port) as address,
+        served(page_of(viewer_port, data=place), port) as address,
     ):
         yield f"{address}?url={quote(table, safe='')}"
 
@@ -230,7 +233,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         UsageError: there is no such tab.
         LogDamagedError: that run cannot be read.
     """
-    from replay.runs.outline import read_outline
+    from replay.runs.run import read_outline
 
     # These take half a second: only once the table is there.
     from replay.view.layouts.of_run import run_layout

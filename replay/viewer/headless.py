@@ -1,22 +1,37 @@
-"""The viewer without a window: pictures without a screen."""
+"""Pictures of a view without a screen, at a moment of a run: a frame, iteration or event."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.errors import CdmisfaError
+from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.log.whole import refuse_taken, refuse_unless_png, whole
+from replay.camera_logs.source import ForeignSource
+from replay.inputs import holds_run, open_to_look
+from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
 from replay.view.bindings import viewer_client
 from replay.view.build import view_of
 from replay.view.columns import FRAME
 from replay.viewer.catalogue import served_table
-from replay.viewer.display import missing_driver
-from replay.viewer.moments import frame_at
-from replay.viewer.program import Program, check_size, free_port, private_host, running
+from replay.viewer.program import (
+    REFUSALS,
+    Program,
+    check_window,
+    free_port,
+    missing_driver,
+    private_host,
+    running,
+)
+
+ITERATION = re.compile(r"(?:iteration|iter|i)\s*(\d+)", re.IGNORECASE)
+
+TOLD = 3
+"""Events that a refusal names."""
 
 WINDOW = "1600x1000"
 SETTLE = 6.0
@@ -54,28 +69,17 @@ def screenshot(
             tab, or no such size.
         CdmisfaError: no driver, or the viewer failed.
     """
-    refuse_unless_png(out)
-    refuse_taken(out, force=force)
-    check_size(window)
+    _refuse(out, window, force=force)
     frame = None if at is None else frame_at(path, str(at))
-    if missing_driver():
-        raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
-    with view_of(path, every, all_views, tab) as view:
-        png = _draw(view, frame, window)
-    with whole(out) as partial:
-        partial.write_bytes(png)
-
-
-def _draw(view: Path, at: int | None, window: str) -> bytes:
-    """A PNG of the whole window, once everything in it is loaded."""
-    with headless_viewer(window) as viewer:
+    _refuse_without_driver(out)
+    with view_of(path, every, all_views, tab) as view, headless_viewer(window) as viewer:
         viewer.ask(lambda client: client.open(str(view)))
         viewer.ask(lambda client: _painted(client.get_state()))
-        if at is not None:
-            viewer.go_to(at)
+        if frame is not None:
+            viewer.go_to(frame)
         time.sleep(SETTLE)
         viewer.ask(lambda client: _painted(client.get_state()))
-        return bytes(viewer.ask(lambda client: client.take_screenshot()))
+        viewer.draw(out)
 
 
 def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WINDOW) -> None:
@@ -93,19 +97,25 @@ def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WI
         LogDamagedError: a run without a run.json cannot be read.
         CdmisfaError: no driver, or the viewer or the server failed.
     """
-    refuse_unless_png(out)
-    refuse_taken(out, force=force)
-    check_size(window)
-    if missing_driver():
-        raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
+    _refuse(out, window, force=force)
+    _refuse_without_driver(out)
     with served_table(folder) as table, headless_viewer(window) as viewer:
         if table is None:
             raise CdmisfaError(f"{out} cannot be drawn: the server of runs has ended")
         viewer.ask(lambda client: client.open(table.address) or True)
         time.sleep(SETTLE)
-        png = bytes(viewer.ask(lambda client: client.take_screenshot()))
-    with whole(out) as partial:
-        partial.write_bytes(png)
+        viewer.draw(out)
+
+
+def _refuse(out: Path, window: str, *, force: bool) -> None:
+    refuse_unless_png(out)
+    refuse_taken(out, force=force)
+    check_window(window)
+
+
+def _refuse_without_driver(out: Path) -> None:
+    if missing_driver():
+        raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
 
 
 def _painted(state: Any) -> bool:
@@ -148,7 +158,7 @@ class HeadlessViewer:
                 answer = question(self._client)
                 if answer:
                     return answer
-            except (OSError, RuntimeError, ValueError) as error:
+            except REFUSALS as error:
                 refusal = f": {error}".splitlines()[0]
             if self._process.poll() is not None:
                 raise CdmisfaError(f"the viewer ended: {self._process.last_words()}")
@@ -164,6 +174,12 @@ class HeadlessViewer:
 
         self.ask(move)
 
+    def draw(self, out: Path) -> None:
+        """Write the window as a PNG, whole or not at all."""
+        png = bytes(self.ask(lambda client: client.take_screenshot()))
+        with whole(out) as partial:
+            partial.write_bytes(png)
+
 
 @contextlib.contextmanager
 def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
@@ -177,3 +193,57 @@ def headless_viewer(window: str = WINDOW) -> Iterator[HeadlessViewer]:
     place = ["--port", str(port), "--bind", host, "--window-size", window]
     with running(["--headless", "--hide-welcome-screen", *place]) as process:
         yield HeadlessViewer(process, f"{host}:{port}")
+
+
+def frame_at(path: Path, at: str) -> int:
+    """The frame of a moment.
+
+    Args:
+        path: a run or recording, or an .rrd file.
+        at: a frame, as "20000"; of a run also an iteration, as "iteration 500", or words of an
+            event, as "module 2": the first one that has them.
+
+    Raises:
+        UsageError: there is no such moment.
+        LogDamagedError: the log cannot be read.
+    """
+    if at.isdecimal():
+        frame = int(at)
+        if path.suffix != ".rrd" and frame > (last := _last_frame(path)):
+            raise UsageError(f"--at {at}: there is no such frame, the last of {path} is {last}")
+        return frame
+    if path.suffix == ".rrd" or not holds_run(path):
+        raise UsageError(f"--at {at}: only a run has iterations and events, say a frame")
+    found = ITERATION.fullmatch(at.strip())
+    return _of_iteration(path, int(found[1])) if found else _of_event(path, at)
+
+
+def _of_iteration(run: Path, iteration: int) -> int:
+    last = -1
+    for columns in read_columns(run):
+        last = int(columns.iterations[-1])
+        if iteration <= last:
+            return int(columns.frames[columns.iterations.tolist().index(iteration)])
+    raise UsageError(f"--at iteration {iteration}: the last of {run} is {last}")
+
+
+def _of_event(run: Path, words: str) -> int:
+    wanted = re.compile(rf"(?<!\w){re.escape(words.strip())}(?!\w)", re.IGNORECASE)
+    told: list[str] = []
+    for batch in read_batches(run, read_header(run), topics=(EVENT_TOPIC,)):
+        for event in batch.events:
+            if wanted.search(event.text):
+                return int(event.t)
+            told.append(event.text)
+    some = "; ".join(told[:TOLD]) or "none"
+    raise UsageError(f"--at {words!r} is no frame, iteration or event of {run}; events: {some}")
+
+
+def _last_frame(path: Path) -> int:
+    if holds_run(path):
+        ends = (int(piece.frames[-1]) + piece.tau - 1 for piece in read_columns(path))
+        return max(ends, default=0)
+    with contextlib.closing(open_to_look([path], salvage=True)) as source:
+        if isinstance(source, ForeignSource):
+            return source.frames - 1
+        return max(ranges[-1][1] for ranges in source.coverage().values() if ranges) - 1

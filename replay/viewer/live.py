@@ -22,9 +22,8 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.learning import Learner, Sink, weights_after
 from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
-from replay.runs.log import RunHeader
-from replay.runs.outline import LINES, Outline
-from replay.runs.stretches import Frames, Stretch, read_stretches
+from replay.runs.log import Batch, Frames, RunHeader, read_batches
+from replay.runs.run import LINES, Outline
 from replay.view.layouts.of_run import run_layout
 from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
 from replay.view.properties import APPLICATION
@@ -119,10 +118,10 @@ class LiveView(Sink):
             UsageError: there is no such run.
             LogDamagedError: its log cannot be read.
         """
-        for stretch in read_stretches(run):
+        for batch in read_batches(run):
             if self._images:
-                stretch = replace(stretch, watched=_first_of_blocks(stretch))
-            self._show(stretch)
+                batch = replace(batch, watched=_first_of_blocks(batch))
+            self._show(batch)
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Say in words what happened; see `Sink`."""
@@ -140,9 +139,9 @@ class LiveView(Sink):
             at = starts if self._images else every
             signals = tuple(columns_of_records(self._records))
             self._show(
-                Stretch(
+                Batch(
                     signals=signals,
-                    blocks=Blocks.joined([*map(Blocks.of, signals)]),
+                    blocks=Blocks.concatenated([*map(Blocks.of, signals)]),
                     watched=((at, np.concatenate(self._watched)),),
                     truth=((every, np.concatenate(self._truth)),),
                     phi=tuple(self._phi),
@@ -152,11 +151,11 @@ class LiveView(Sink):
             self._forget()
         self._next = time.monotonic() + EVERY_SECONDS
 
-    def _show(self, stretch: Stretch) -> None:
-        self._view.take(stretch)
-        self._world.take(stretch)
-        weights = dict(stretch.phi)
-        for columns in stretch.signals:
+    def _show(self, batch: Batch) -> None:
+        self._view.take(batch)
+        self._world.take(batch)
+        weights = dict(batch.phi)
+        for columns in batch.signals:
             self._view.threshold(columns.frames[-1:], columns.iterations[-1:])
             for i in np.flatnonzero(columns["saved"]).tolist():
                 t, iteration = int(columns.frames[i]), int(columns.iterations[i])
@@ -184,9 +183,9 @@ class LiveView(Sink):
         self.close()
 
 
-def _first_of_blocks(stretch: Stretch) -> tuple[Frames, ...]:
+def _first_of_blocks(batch: Batch) -> tuple[Frames, ...]:
     """Of each block's pictures the first one that its log has, wherever the block begins."""
-    pieces = ((np.diff(stretch.blocks.places(at), prepend=-1), at, p) for at, p in stretch.watched)
+    pieces = ((np.diff(batch.blocks.places(at), prepend=-1), at, p) for at, p in batch.watched)
     return tuple((at[begins != 0], pictures[begins != 0]) for begins, at, pictures in pieces)
 
 
@@ -197,7 +196,7 @@ def _nothing_yet(header: RunHeader, tau: int, outputs: int) -> Outline:
         header=header,
         iterations=0,
         frames=0,
-        blocks=Blocks.joined(()),
+        blocks=Blocks.concatenated(()),
         end=0,
         tau=tau,
         outputs=outputs,

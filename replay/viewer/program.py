@@ -1,4 +1,4 @@
-"""Rerun's viewer as a program of its own: it is started with its telemetry switched off."""
+"""Rerun's viewer as a program: started with its telemetry off, and what it needs to be shown."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
@@ -25,6 +26,12 @@ SIZE = re.compile(r"[1-9]\d{2,3}x[1-9]\d{2,3}")
 
 LIMIT = re.compile(r"\d+(%|B|[kMGT]B|[KMGT]iB)")
 """What Rerun takes for a limit of memory; another makes it panic."""
+
+INSTALL = "apt-get install mesa-vulkan-drivers libvulkan1"
+"""What gives a machine without a graphics card a driver."""
+
+REFUSALS = (OSError, RuntimeError, ValueError)
+"""What Rerun's clients raise when the viewer or its server refuses, or is not there."""
 
 TOLD_SECONDS = 30.0
 """Longest wait for a viewer that is starting to take an address."""
@@ -46,7 +53,7 @@ def check_limit(limit: str) -> str:
     return limit
 
 
-def check_size(size: str) -> str:
+def check_window(size: str) -> str:
     """A size of a window that the viewer takes.
 
     Raises:
@@ -145,42 +152,33 @@ def ends_with_parent() -> Callable[[], None] | None:
     return ask
 
 
-def open_address(address: str, memory_limit: str = "2GB") -> None:
-    """Open a viewer on what is served at an address; it stays open when we have ended."""
-    _detached(["--connect", address, "--memory-limit", memory_limit])
-
-
 def open_privately(address: str, memory_limit: str = "2GB") -> None:
-    """Open a viewer on what is served at a secret address; it stays open when we have ended.
+    """Open a viewer on what is served at an address; it stays open when we have ended.
 
     It is told the address once it runs: others can see a program's arguments.
     """
     host = private_host()
     port = str(free_port(host))
     place = ["--bind", host, "--port", port, "--expect-data-soon"]
-    viewer = _detached([*place, "--memory-limit", memory_limit])
-
-    def tell() -> None:
-        end = time.monotonic() + TOLD_SECONDS
-        while viewer.poll() is None and time.monotonic() < end:
-            with contextlib.suppress(OSError, RuntimeError, ValueError):  # it is starting
-                viewer_client().connect(f"rerun+http://{host}:{port}/proxy").open(address)
-                break
-            time.sleep(0.1)
-        viewer.wait()
-
-    threading.Thread(target=tell, daemon=True).start()
-
-
-def _detached(arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [str(viewer_program()), *arguments],
+    viewer = subprocess.Popen(
+        [str(viewer_program()), *place, "--memory-limit", memory_limit],
         env=environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+
+    def tell() -> None:
+        end = time.monotonic() + TOLD_SECONDS
+        while viewer.poll() is None and time.monotonic() < end:
+            with contextlib.suppress(*REFUSALS):  # it is starting
+                viewer_client().connect(f"rerun+http://{host}:{port}/proxy").open(address)
+                break
+            time.sleep(0.1)
+        viewer.wait()
+
+    threading.Thread(target=tell, daemon=True).start()
 
 
 def private_host() -> str:
@@ -199,3 +197,28 @@ def free_port(host: str = "127.0.0.1") -> int:
     with socket.socket() as probe:
         probe.bind((host, 0))
         return int(probe.getsockname()[1])
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return not sys.platform.startswith("linux") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
+
+
+def vulkan_drivers() -> Iterator[Path]:
+    """Manifests of the Vulkan drivers that a loader would find."""
+    chosen = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    if chosen:
+        yield from (p for p in map(Path, chosen.split(os.pathsep)) if p.exists())
+        return
+    shared = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    for folder in ("/etc", *shared.split(os.pathsep)):
+        yield from Path(folder, "vulkan", "icd.d").glob("*.json")
+
+
+def missing_driver() -> str:
+    """Why no picture can be drawn without a screen here, or "" where it can."""
+    if sys.platform.startswith("linux") and not any(vulkan_drivers()):
+        return f"no Vulkan driver is installed: {INSTALL}"
+    return ""

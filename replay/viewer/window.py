@@ -11,10 +11,15 @@ from typing import BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError
 from replay.view.build import view_of
-from replay.viewer.display import has_display
-from replay.viewer.guarded import served_at
-from replay.viewer.program import check_limit, check_size, free_port, private_host, run_program
-from replay.viewer.webpage import page_of, page_server, shown_at
+from replay.viewer.program import (
+    check_limit,
+    check_window,
+    free_port,
+    has_display,
+    private_host,
+    run_program,
+)
+from replay.viewer.web import page_of, page_server, served, shown_at
 
 
 def open_window(
@@ -33,7 +38,7 @@ def open_window(
         CdmisfaError: there is no display, or the viewer ended with an error.
     """
     check_limit(memory_limit)
-    window = [] if size is None else ["--window-size", check_size(size)]
+    window = [] if size is None else ["--window-size", check_window(size)]
     if path.exists() and not has_display():  # a wrong path is said first, below
         raise CdmisfaError(
             "no display (neither DISPLAY nor WAYLAND_DISPLAY is set): use --web, --save or "
@@ -67,7 +72,7 @@ def serve(
     with contextlib.ExitStack() as opened:
         name, file = opened.enter_context(_opened(path, every, all_views, tab))
         view = file or opened.enter_context(open(name, "rb"))
-        address = opened.enter_context(served_at(page_of(view, viewer_port), port))
+        address = opened.enter_context(served(page_of(viewer_port, view), port))
         print(shown_at(address), file=sys.stderr, flush=True)
         run_program(page_server(viewer_port))
 

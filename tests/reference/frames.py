@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 
 def number(data: bytes, at: int, width: int) -> int:
     """The unsigned little-endian number of `width` bytes at a place."""
@@ -40,15 +38,3 @@ def gather(data: bytes, spans, least, places, marks, distances, width: int):
             return None
         values += [data[end - d : end - d + width] for d in distances]
     return b"".join(values)
-
-
-def average(image, across, down):
-    """Means of the areas (start, count) of an image's rows, and of those along its columns."""
-    rows = np.stack([_mean(image[:, at : at + n], 1) for at, n in across], axis=1)
-    return np.stack([_mean(rows[at : at + n], 0) for at, n in down], axis=0)
-
-
-def _mean(pixels, axis: int):
-    """By weights of 2^-22ths, as Pillow has them."""
-    weight = int(0.5 + 1 / pixels.shape[axis] * (1 << 22))
-    return ((pixels.astype(np.int64).sum(axis) * weight + (1 << 21)) >> 22).astype(np.uint8)

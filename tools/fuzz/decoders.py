@@ -34,8 +34,8 @@ from cdmisfa.core.learning import Keyframe
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.sources import configure
 from cdmisfa.experiments.store import DONE, ROWS
+from recorder.images.decoding import MessageKind
 from recorder.images.messages import image_decoder
-from recorder.images.reading import MessageKind
 from recorder.images.videos import VideoPackets
 from recorder.log.begun import read_recording
 from recorder.log.folder import RECORDING
@@ -43,17 +43,11 @@ from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
 from replay.export.lerobot import write_lerobot
 from replay.recordings.source import RecordedSource
-from replay.runs.final import facts_sha256
+from replay.runs.codec import decode_matrix, decode_signals, encode_matrix, encode_signals
 from replay.runs.folders import REQUEST, RUN_JSON, read_run_json
-from replay.runs.messages import (
-    decode_keyframe,
-    decode_matrix,
-    decode_signals,
-    encode_keyframe,
-    encode_matrix,
-    encode_signals,
-)
+from replay.runs.keyframes import decode_keyframe, encode_keyframe
 from replay.runs.modules import load_modules, save_modules
+from replay.runs.run import facts_sha256
 from tools.torture.mutations import BYTES, TEXT
 
 from . import datasets, mutations

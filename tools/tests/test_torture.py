@@ -220,7 +220,7 @@ def test_every_campaign_is_what_the_harness_takes(name: str) -> None:
 def test_an_unknown_campaign_is_refused() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tools.torture", "kittens"],
-        cwd=Path(__file__).parents[1],
+        cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
         timeout=60,

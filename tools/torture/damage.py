@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from replay.runs.final import facts_sha256
+from replay.runs.run import facts_sha256
 
 from .commands import Ran, here, judge, worst
 from .materials import MAKERS, missing

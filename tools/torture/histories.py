@@ -27,7 +27,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
-from cdmisfa.experiments.runs import RunExhaustedError, RunResult, run
+from cdmisfa.experiments.run_folder import RunExhaustedError, RunResult
+from cdmisfa.experiments.session import run
 from recorder.log.split import Split
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatoryConfig
@@ -35,8 +36,7 @@ from recorder.world.scenes import open_scene
 from replay.integrity.verify import check_log
 from replay.recordings.followed import FollowedSource
 from replay.recordings.source import RecordedSource
-from replay.runs.log import read_header
-from replay.runs.stretches import read_columns
+from replay.runs.log import read_columns, read_header
 
 from .calls import Call, watched
 from .outcomes import MIXED, RIGHT, WRONG, Defect, Job, Limits, Outcome

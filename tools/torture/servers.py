@@ -7,7 +7,7 @@ from pathlib import Path
 from server_cases import CASES, Given, WrongError, check
 from server_cases import prepare as made
 
-from replay.storage import tries
+from replay.storage import servers
 
 from .outcomes import CLEAR_ERROR, RIGHT, Defect, Job, Limits, Outcome
 
@@ -21,7 +21,7 @@ def prepare(folder: Path) -> Given:
 
 def case(job: Job) -> Outcome:
     """One lie, about one log, to one command."""
-    tries.FIRST_WAIT = 0.02
+    servers.FIRST_WAIT = 0.02
     chosen = CASES[job.seed % len(CASES)]
     try:
         told = check(chosen, job.given, job.folder / "out", job.seed)

@@ -22,12 +22,12 @@ from camera_files import write_cameras
 
 from cdmisfa.cli import run
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments.resume import log_to_resume
+from cdmisfa.experiments.command import log_to_resume
 from cdmisfa.experiments.store import read_rows
 from recorder.log.resume import frames_held
 from recorder.mcap.reader import LogReader
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON
-from replay.runs.log import read_keyframe
+from replay.runs.keyframes import read_keyframe
 from replay.runs.modules import load_modules
 
 from .calls import Refusal, watched

@@ -27,7 +27,7 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
     """
 
     def tweak() -> None:
-        from cdmisfa.experiments import runs
+        from cdmisfa.experiments import session
         from recorder.log.viewlog import ViewParts
         from replay.runs.writer import RunWriter
 
@@ -48,8 +48,8 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
 
         after(ViewParts, "write", lambda log, block: (log._view, log.t))
         after(RunWriter, "block", lambda log, block, signals, learner: ("run", learner.iteration))
-        kept = runs.Keyframes
-        runs.Keyframes = lambda *given: kept(*given[:-1], KEYFRAMES)  # type: ignore
+        kept = session.Keyframes
+        session.Keyframes = lambda *given: kept(*given[:-1], KEYFRAMES)  # type: ignore
 
     return tweak
 

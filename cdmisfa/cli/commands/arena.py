@@ -9,6 +9,8 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.commands.sweep import parse_seeds
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import SCHEMA, print_json, print_table
 from cdmisfa.cli.progress import bar
 
 ALL = "all"
@@ -16,8 +18,8 @@ ALL = "all"
 
 @click.command("arena")
 @click.argument("sets", nargs=-1, metavar="[SET]...")
-@click.option("--learners", metavar="NAME,...", help="Which learners [default: all].")
-@click.option(
+@option("--learners", metavar="NAME,...", help="Which learners [default: all].")
+@option(
     "--seeds",
     default="0:10",
     show_default=True,
@@ -26,8 +28,8 @@ ALL = "all"
     "1,5,9.",
 )
 @options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
-@click.option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")
-@click.option(
+@option("--streams", type=options.OUT, help="Folder of the streams [default: OUT/streams].")
+@option(
     "--frames",
     type=click.IntRange(1),
     help="Stop a run after so many frames, instead of the set's number.",
@@ -35,8 +37,8 @@ ALL = "all"
 @options.settings
 @options.jobs
 @options.engine
-@click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
-@click.option("--page", type=options.OUT, help="Write this Markdown page of all results in OUT.")
+@options.retry_failed
+@option("--page", type=options.OUT, help="Write this Markdown page of all results in OUT.")
 @options.as_json
 @click.pass_context
 def arena_command(
@@ -56,18 +58,20 @@ def arena_command(
     are run, or, with --page, the page made from the results that are there. Most sets need the
     extra [arena]; the set small needs nothing.
     """
-    from cdmisfa.arena.page import draw, table, write_page
-    from cdmisfa.arena.results import write_results
+    from cdmisfa.studies.arena.page import arena_table, draw_curves, write_arena_page
+    from cdmisfa.studies.arena.results import arena_results
 
     folder = out or Path("arena")
     failed = () if page is not None and not sets else _run(folder, sets, learners, seeds, each)
-    document = write_page(folder, page) if page is not None else write_results(folder)
-    figure, _ = draw(document, folder)
+    document = arena_results(folder)
+    figure, _ = draw_curves(document, folder)
+    if page is not None:
+        write_arena_page(document, figure, page)
     click.echo(f"figure {figure}" + (f", page {page}" if page is not None else ""), err=True)
     if as_json:
-        options.print_json(document | {"schema": options.SCHEMA, "folder": folder})
+        print_json(document | {"schema": SCHEMA, "folder": folder})
     else:
-        options.print_table(*table(document))
+        print_table(*arena_table(document))
     for row in failed:
         at = " ".join(f"{key}={value}" for key, value in row["point"].items())
         click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=True)
@@ -79,13 +83,13 @@ def _run(
     folder: Path, sets: tuple[str, ...], learners: str | None, seeds: str, each: dict[str, Any]
 ) -> Any:
     """Compute what is missing; the rows of the trials that failed."""
-    from cdmisfa.arena.arena import arena
-    from cdmisfa.arena.sets import SETS, SUITE
+    from cdmisfa.studies.arena.arena import run_arena
+    from cdmisfa.studies.arena.streams import SETS, SUITE
 
     names = [name for word in sets for name in (SETS if word == ALL else (word,))]
     chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
     with bar("arena", "trials") as shown:
-        report = arena(
+        report = run_arena(
             folder,
             names or SUITE,
             chosen,

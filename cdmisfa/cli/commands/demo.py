@@ -11,13 +11,15 @@ from pathlib import Path
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import print_json, print_table, quoted
 from cdmisfa.cli.progress import Bar, bar
 
 
 @click.command("demo")
 @options.out("Folder of the recordings and runs; by default the one you are in.")
 @options.seed
-@click.option(
+@option(
     "--frames", type=click.IntRange(400), default=16000, show_default=True, help="Frames a view."
 )
 @options.jobs
@@ -27,13 +29,13 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
 
     What an earlier demo left in the same folder is replaced.
     """
-    from cdmisfa.paper.demo import demo
+    from cdmisfa.studies.demo import demo
 
     report = demo(out or Path(), seed=seed, frames=frames, jobs=jobs, stage=_stage)
     if as_json:
-        options.print_json(report.as_json())
+        print_json(report.as_json())
         return
-    options.print_table(
+    print_table(
         ("module", "view", "policy", "iteration", "follows", "correlation"),
         [
             (m.module, m.view, " ".join(m.policy), m.iteration, m.follows, f"{m.correlation:.3f}")
@@ -44,7 +46,7 @@ def demo_command(out: Path | None, seed: int, frames: int, jobs: int, as_json: b
     for figure in report.figures:
         if figure.suffix == ".png":
             click.echo(f"figure     {figure}")
-    click.echo(f"look at it {options.quoted(sys.argv[0])} view {options.quoted(report.run)}")
+    click.echo(f"look at it {quoted(sys.argv[0])} view {quoted(report.run)}")
 
 
 @contextmanager

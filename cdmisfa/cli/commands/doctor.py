@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
+from cdmisfa.cli.printing import SCHEMA, print_json, print_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import GROUPS, Registry, find, plugins
 
@@ -56,10 +57,10 @@ def doctor_command(ctx: click.Context, as_json: bool) -> None:
     ok = all(check.ok or check.needed_for for check in checks)
     if as_json:
         rows = [asdict(check) for check in checks]
-        options.print_json({"schema": options.SCHEMA, "ok": ok, "checks": rows})
+        print_json({"schema": SCHEMA, "ok": ok, "checks": rows})
     else:
         words = [(("missing", "ok")[c.ok], c.what, c.detail, c.needed_for) for c in checks]
-        options.print_table(("", "what", "detail", "needed for"), words)
+        print_table(("", "what", "detail", "needed for"), words)
     if not ok:
         ctx.exit(1)
 
@@ -134,7 +135,7 @@ def _kernels() -> Iterator[Check]:
 
 
 def _vulkan() -> Iterator[Check]:
-    from replay.viewer.display import vulkan_drivers
+    from replay.viewer.program import vulkan_drivers
 
     drivers = sorted(vulkan_drivers())
     detail = ", ".join(d.stem for d in drivers) or "apt-get install mesa-vulkan-drivers"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,26 +13,30 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import (
-    camera_options,
-    live_options,
-    live_source,
-    live_streams,
+from cdmisfa.cli.cameras import live_source
+from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.printing import (
+    print_json,
     print_plan,
+    print_table,
+    quoted,
     say_about,
     say_changes,
 )
-from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 
 if TYPE_CHECKING:
+    from cdmisfa.cli.interrupts import Stop
     from cdmisfa.core.blocks import Block, FrameSource
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
-    from cdmisfa.experiments.runs import RunResult
-    from recorder.cameras.readers import OnLoss
+    from cdmisfa.experiments.run_folder import RunResult
+    from cdmisfa.experiments.sources import Configuration
+    from recorder.cameras.options import LiveOptions
+    from replay.camera_logs.options import CameraOptions
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 
@@ -39,44 +44,59 @@ TICK = 0.1
 """Seconds between two updates of the bar: a block may take only microseconds."""
 
 
-@click.command("learn")
+@grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
 @uploads.out("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed
 @options.preset
 @options.settings
-@click.option(
+@option(
     "--algorithm",
     metavar="NAME",
     help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
+    group="Learner",
 )
-@click.option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
-@click.option("--max-iterations", type=click.IntRange(1), help="End after so many iterations.")
-@click.option(
-    "--max-modules",
-    type=click.IntRange(1),
-    help="End after so many modules; by default the paper's learners end after as many as there "
-    "are streams.",
+@option("--portable", is_flag=True, expose_value=False, hidden=True)  # of older scripts
+@options.end_after("iterations", "End after so many iterations.")
+@options.end_after(
+    "modules",
+    "End after so many modules; by default the paper's learners end after as many as there are "
+    "streams.",
 )
-@click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
-@click.option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
-@click.option("--salvage", is_flag=True, help="Pass over damaged parts and images of a log.")
-@click.option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
-@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
-@click.option("--follow", is_flag=True, help="Wait for the frames of a recording being written.")
-@options.seconds("--follow-timeout", 60.0, "With --follow, give up when no frame came for so long.")
-@click.option(
+@options.loop
+@option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
+@options.salvage
+@option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
+@options.no_rerun
+@option(
+    "--follow",
+    is_flag=True,
+    help="Wait for the frames of a recording being written.",
+    group="Source",
+)
+@option(
+    "--follow-timeout",
+    type=click.FloatRange(0.1, 1e6),
+    default=60.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="With --follow, give up when no frame came for so long.",
+    group="Source",
+)
+@option(
     "--record",
     "record_to",
     type=options.OUT,
     metavar="DIR",
     help="Record what every live stream shows while learning, to learn the same from it again.",
+    group="Live streams",
 )
 @options.keyframes
 @options.fsync_every
-@camera_options
-@live_options
+@options.log_options
+@options.dry_run
+@options.live_options
 @options.server_limits
 @options.force
 @options.as_json
@@ -86,29 +106,15 @@ def learn_command(
     /,
     source: tuple[str, ...],
     out: Path | None,
-    seed: int,
-    preset: str | None,
-    settings: tuple[str, ...],
-    algorithm: str | None,
-    max_iterations: int | None,
-    max_modules: int | None,
-    loop: bool,
     resume: bool,
-    salvage: bool,
-    live_view: bool,
-    no_rerun: bool,
-    follow: bool,
-    follow_timeout: float,
-    record_to: Path | None,
-    keyframes: int | None,
-    fsync_every: float | None,
     force: bool,
     as_json: bool,
     dry_run: bool,
-    hold: float,
-    lost: OnLoss,
-    stall: float,
-    **cameras: Any,
+    no_rerun: bool,
+    live_view: bool,
+    live: LiveOptions,
+    cameras: CameraOptions,
+    **told: Any,
 ) -> None:
     """Learn slow feature modules from a scene, a recording, logs or cameras.
 
@@ -131,99 +137,127 @@ def learn_command(
     if not source:
         learn_as_begun(ctx, out if resume else None)
         return
+    from cdmisfa.experiments.command import command_of
     from cdmisfa.experiments.loop import INTERRUPTED
-    from cdmisfa.experiments.resume import command_of
-    from cdmisfa.experiments.runs import RunExhaustedError, run
-    from cdmisfa.experiments.sources import open_source, refuse_keys_of_scenes
+    from cdmisfa.experiments.session import run
     from recorder.cameras.words import is_live
-    from replay.camera_logs.options import CameraOptions
 
-    frames: FrameSource
-    if algorithm is not None:
-        settings = (*settings, f"learner.algorithm={algorithm}")
-    if not resume:
-        refuse_keys_of_scenes(settings, source[0])
-    with contextlib.ExitStack() as stack:
-        if any(map(is_live, source)):
-            if resume or loop or salvage or follow or dry_run:
-                raise UsageError(
-                    "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
-                    "and --dry-run, or learn from a recording of them"
-                )
-            opened = live_source(
-                source,
-                live_streams(hold, lost, stall, seed=seed),
-                CameraOptions(**cameras),
+    of_cameras = any(map(is_live, source))
+    if of_cameras:
+        opened = opened_live(ctx.params, source, live, cameras)
+    else:
+        opened = opened_logs(ctx.params, source, cameras)
+    with opened as (frames, configuration):
+        if dry_run:
+            print_plan(frames, as_json=as_json)
+            return
+        with learning(told["max_iterations"], as_json=as_json) as (stop, reporter):
+            if hasattr(frames, "stop"):
+                frames.stop = stop  # waiting for frames ends with a signal, too
+            kept = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
+            result = run(
+                frames,
+                configuration.learner,
                 out,
-                record_to,
-                preset=preset,
-                settings=settings,
-                fsync_every=fsync_every,
+                sections=configuration.tables(),
+                command=command_of(source, ctx.params, out or Path()),
                 force=force,
+                resume=resume,
+                rerun=not no_rerun,
+                live=live_view,
+                announce=announce,
+                sinks=(reporter,),
+                stop=stop,
+                hashing=reporter.hashing,
+                **{name: told[name] for name in kept},
             )
-            frames, configuration = stack.enter_context(opened)
-        else:
-            if record_to is not None:
-                raise UsageError(
-                    "--record is for live streams: leave it out, or see cdmisfa record"
-                )
-            frames, configuration = open_source(
-                source,
-                preset=preset,
-                settings=settings,
-                seed=seed,
-                loop=loop,
-                salvage=salvage,
-                cameras=CameraOptions(**cameras),
-                follow=follow_timeout if follow else None,
-            )
-            stack.callback(frames.close)
-            if dry_run:
-                print_plan(frames, as_json=as_json)
-                return
-            say_about(frames)
-            stack.callback(say_changes, frames)
-        try:
-            with bar("learning", "blocks") as shown, stoppable() as stop:
-                if hasattr(frames, "stop"):
-                    frames.stop = stop  # waiting for frames ends with a signal, too
-                reporter = Reporter(shown, max_iterations)
-                result = run(
-                    frames,
-                    configuration.learner,
-                    out,
-                    seed=seed,
-                    max_iterations=max_iterations,
-                    max_modules=max_modules,
-                    sections=configuration.tables(),
-                    force=force,
-                    rerun=not no_rerun,
-                    sinks=(reporter,),
-                    stop=stop,
-                    resume=resume,
-                    keyframes=keyframes,
-                    fsync_every=fsync_every,
-                    live=live_view,
-                    announce=announce,
-                    command=command_of(source, ctx.params, out or Path()),
-                    hashing=reporter.hashing,
-                )
-        except RunExhaustedError as error:
-            show(error.result, as_json=as_json)
-            raise
     if resume and not reporter.told and not stop():
         click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)
     if result.ended == INTERRUPTED:
-        if result.run is not None and not any(map(is_live, source)):
-            again = f"cdmisfa learn --resume -o {options.quoted(result.run)}"
+        if result.run is not None and not of_cameras:
+            again = f"cdmisfa learn --resume -o {quoted(result.run)}"
             click.echo(f"go on with {again}", err=True)
         ctx.exit(stop.exit_code)
 
 
+@contextlib.contextmanager
+def opened_logs(
+    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions
+) -> Iterator[tuple[FrameSource, Configuration]]:
+    """A scene, a recording or logs, and what is said of them before and after.
+
+    Args:
+        told: the options of the command.
+        source: its words.
+        cameras: how images of others become frames.
+    """
+    from cdmisfa.experiments.sources import open_source
+
+    if told["record_to"] is not None:
+        raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
+    frames, configuration = open_source(
+        source,
+        settings=settings_of(told),
+        cameras=cameras,
+        follow=told["follow_timeout"] if told["follow"] else None,
+        resumed=told["resume"],
+        **{name: told[name] for name in ("preset", "seed", "loop", "salvage")},
+    )
+    with contextlib.closing(frames):
+        if told["dry_run"]:
+            yield frames, configuration
+            return
+        say_about(frames)
+        try:
+            yield frames, configuration
+        finally:
+            say_changes(frames)
+
+
+def opened_live(
+    told: Mapping[str, Any], source: tuple[str, ...], live: LiveOptions, cameras: CameraOptions
+) -> contextlib.AbstractContextManager[tuple[FrameSource, Configuration]]:
+    """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
+    if any(told[name] for name in ("resume", "loop", "salvage", "follow", "dry_run")):
+        raise UsageError(
+            "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
+            "and --dry-run, or learn from a recording of them"
+        )
+    return live_source(
+        source,
+        replace(live, seed=told["seed"]),
+        cameras,
+        told["out"],
+        told["record_to"],
+        settings=settings_of(told),
+        **{name: told[name] for name in ("preset", "fsync_every", "force")},
+    )
+
+
+def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
+    """The settings of a command, --algorithm among them."""
+    algorithm = told["algorithm"]
+    named = () if algorithm is None else (f"learner.algorithm={algorithm}",)
+    return (*told["settings"], *named)
+
+
+@contextlib.contextmanager
+def learning(max_iterations: int | None, *, as_json: bool) -> Iterator[tuple[Stop, Reporter]]:
+    """Show the progress of a run, end it at a signal, and print its result if its source ended."""
+    from cdmisfa.experiments.run_folder import RunExhaustedError
+
+    try:
+        with bar("learning", "blocks") as shown, stoppable() as stop:
+            yield stop, Reporter(shown, max_iterations)
+    except RunExhaustedError as error:
+        show(error.result, as_json=as_json)
+        raise
+
+
 def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
     """Resume a run with the command that began it; options that are given win."""
-    from cdmisfa.experiments.resume import read_command
+    from cdmisfa.experiments.command import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")
@@ -239,8 +273,7 @@ def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
 
 def announce(address: str) -> None:
     """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.display import has_display
-    from replay.viewer.program import open_privately
+    from replay.viewer.program import has_display, open_privately
 
     click.echo(f"live view {address}    look at it: rerun {address}", err=True)
     if has_display():
@@ -302,7 +335,7 @@ def show(result: RunResult, *, as_json: bool) -> None:
     from cdmisfa.experiments.loop import ENDINGS
 
     if as_json:
-        options.print_json(result.as_json())
+        print_json(result.as_json())
         return
     rows = [
         (
@@ -315,10 +348,10 @@ def show(result: RunResult, *, as_json: bool) -> None:
         for module in result.modules
     ]
     if rows and "streams" not in result.summary:
-        options.print_table(("module", "stream", "iteration", "policy", "eta"), rows)
+        print_table(("module", "stream", "iteration", "policy", "eta"), rows)
     elif rows:  # no policy led to them
         plain = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
-        options.print_table(("module", "stream", "iteration", "eta"), plain)
+        print_table(("module", "stream", "iteration", "eta"), plain)
     else:
         click.echo("no module was learned")
     for outcome in result.summary.get("streams", ()):
@@ -326,5 +359,5 @@ def show(result: RunResult, *, as_json: bool) -> None:
     click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
     click.echo(f"signals sha256 {result.signals_sha256}")
     if result.run is not None:
-        look = f"look at it: cdmisfa view {options.quoted(result.run)}"
+        look = f"look at it: cdmisfa view {quoted(result.run)}"
         click.echo(f"run {result.run}    {look}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from cdmisfa.cli import options, uploads
+from cdmisfa.cli.printing import SCHEMA, print_json, print_table
 from cdmisfa.core.errors import LogDamagedError, UsageError
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def info_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> No
 
     found = describe(*path)
     if as_json:
-        options.print_json(found.as_json())
+        print_json(found.as_json())
     else:
         _print_info(found)
     if found.crc == "bad":
@@ -58,7 +59,7 @@ def _print_info(found: LogInfo) -> None:
     files = [(c.file,) for c in found.channels]
     if len(set(files)) > 1:
         head, rows = (*head, "file"), [(*row, *file) for row, file in zip(rows, files, strict=True)]
-    options.print_table(head, rows)
+    print_table(head, rows)
 
 
 def _clock(ns: int | None) -> str:
@@ -85,13 +86,13 @@ def verify_command(ctx: click.Context, path: tuple[str, ...], as_json: bool) -> 
 
     found = check_logs(*path)
     if as_json:
-        options.print_json(found.as_json())
+        print_json(found.as_json())
     elif found.ok:
         click.echo(f"{' '.join(path)}: whole")
         for note in found.notes:
             click.echo(note)
     else:
-        options.print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
+        print_table(("where", "what"), [(p.where, p.what) for p in found.problems])
     if not found.ok:
         ctx.exit(LogDamagedError.exit_code)
 
@@ -113,14 +114,14 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
 
     found = recover_log(path, out, force=force)
     if as_json:
-        options.print_json(found.as_json())
+        print_json(found.as_json())
     else:
-        options.print_table(
+        print_table(
             ("topic", "kept", "lost"),
             [(c.topic, c.kept, "unknown" if c.lost is None else c.lost) for c in found.channels],
         )
         if found.lost:
-            options.print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
+            print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
         for mended in found.mended:
             click.echo(f"{mended.where}: {mended.what}", err=True)
         click.echo(f"written {out}")
@@ -146,5 +147,5 @@ def upload_command(result: Path, url: str, as_json: bool) -> None:
         raise UsageError(f"{url} is no s3:// address: write s3://BUCKET/NAME")
     files, size = uploads.upload_now(result, to, "the same command")
     if as_json:
-        document = {"schema": options.SCHEMA, "url": str(to), "files": files, "bytes": size}
-        options.print_json(document)
+        document = {"schema": SCHEMA, "url": str(to), "files": files, "bytes": size}
+        print_json(document)

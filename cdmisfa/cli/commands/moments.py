@@ -9,14 +9,14 @@ from typing import Any, TypeVar
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.learn import Reporter, outcome_line, show
-from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.commands.learn import learning, outcome_line, show
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import SCHEMA, print_json, quoted
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-source = click.option(
+source = option(
     "--source",
     multiple=True,
     metavar="SOURCE",
@@ -28,7 +28,7 @@ source = click.option(
 @click.command("at")
 @options.path_argument("run")
 @click.argument("iterations", metavar="K", type=click.IntRange(0))
-@click.option(
+@option(
     "--save-module",
     type=options.OUT,
     metavar="F.npz",
@@ -53,19 +53,19 @@ def at_command(
     keyframe no source is needed. --json prints all of its memory.
     """
     from cdmisfa.core.signals import ACTIONS
-    from cdmisfa.experiments.recompute.check import learner_after
-    from cdmisfa.experiments.runs import module_table
-    from replay.runs.folders import run_log
+    from cdmisfa.experiments.run_folder import module_table
+    from cdmisfa.experiments.session import Session
 
-    learner, t = learner_after(run, iterations, source)
+    with Session.at(run, iterations, source) as again:
+        log, learner, t = again.log, again.learner, again.t
     state, streams = learner.state, learner.spec.streams  # type: ignore[attr-defined]
     if save_module is not None:
         _save_unfinished(learner, save_module, force=force)
     if as_json:
-        options.print_json(
+        print_json(
             {
-                "schema": options.SCHEMA,
-                "run": str(run_log(run).parent),
+                "schema": SCHEMA,
+                "run": str(log.parent),
                 "iterations": iterations,
                 "t": t,
                 "stream": streams[learner.stream],
@@ -107,10 +107,8 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
 
 @click.command("check")
 @options.path_argument("run")
-@click.option(
-    "--from", "start", type=click.IntRange(0), default=0, metavar="K", help="First iteration."
-)
-@click.option(
+@option("--from", "start", type=click.IntRange(0), default=0, metavar="K", help="First iteration.")
+@option(
     "--to",
     "stop",
     type=click.IntRange(1),
@@ -135,11 +133,11 @@ def check_command(
     files are no longer those it learned from, and exits with 4 if there are any. A part begins at
     the newest keyframe before it.
     """
-    from cdmisfa.experiments.recompute.check import check_run
+    from cdmisfa.experiments.session import Session
 
-    checked = check_run(run, source, start, stop)
+    checked = Session.check(run, source, start, stop)
     if as_json:
-        options.print_json({"schema": options.SCHEMA, "run": str(run), **checked.as_json()})
+        print_json({"schema": SCHEMA, "run": str(run), **checked.as_json()})
     else:
         click.echo(str(checked))
     if not checked.holds:
@@ -148,7 +146,7 @@ def check_command(
 
 @click.command("fork")
 @options.path_argument("run")
-@click.option(
+@option(
     "--at",
     type=click.IntRange(0),
     required=True,
@@ -156,30 +154,22 @@ def check_command(
     help="Go on after so many iterations of the run.",
 )
 @options.out("Folder of the fork.", required=True)
-@click.option(
+@option(
     "--set",
     "settings",
     multiple=True,
     metavar="learner.KEY=VALUE",
     help="What the learner is told from there on; may be repeated.",
 )
-@click.option(
+@option(
     "--seed",
     type=click.IntRange(0, 2**63 - 1),
     help="Seed of the random choices from there on; the world stays.",
 )
-@click.option(
-    "--max-iterations",
-    type=click.IntRange(1),
-    help="End after so many iterations in all; by default as the run.",
-)
-@click.option(
-    "--max-modules",
-    type=click.IntRange(1),
-    help="End after so many modules in all; by default as the run.",
-)
+@options.end_after("iterations", "End after so many iterations in all; by default as the run.")
+@options.end_after("modules", "End after so many modules in all; by default as the run.")
 @source
-@click.option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
+@options.no_rerun
 @options.keyframes
 @options.fsync_every
 @options.server_limits
@@ -188,53 +178,40 @@ def check_command(
 @click.pass_context
 def fork_command(
     ctx: click.Context,
+    /,
     run: Path,
-    at: int,
     out: Path,
-    settings: tuple[str, ...],
-    seed: int | None,
     max_iterations: int | None,
     max_modules: int | None,
-    source: tuple[str, ...],
     no_rerun: bool,
     keyframes: int | None,
     fsync_every: float | None,
-    force: bool,
     as_json: bool,
+    **told: Any,
 ) -> None:
     """Go on from some iteration of a run with other settings, as a run of its own.
 
     It has the run's first K iterations as they are; resume, check and view it like any run.
     """
     from cdmisfa.experiments.loop import INTERRUPTED
-    from cdmisfa.experiments.recompute.forks import fork_run
-    from cdmisfa.experiments.runs import RunExhaustedError
+    from cdmisfa.experiments.session import Session
 
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            reporter = Reporter(shown, max_iterations)
-            result = fork_run(
-                run,
-                at,
-                out,
-                settings=settings,
-                seed=seed,
-                source=source,
-                limits={name: value for name, value in given.items() if value is not None},
-                force=force,
-                rerun=not no_rerun,
-                sinks=(reporter,),
-                stop=stop,
-                keyframes=keyframes,
-                fsync_every=fsync_every,
-                hashing=reporter.hashing,
-            )
-    except RunExhaustedError as error:
-        show(error.result, as_json=as_json)
-        raise
+    limits = {name: value for name, value in given.items() if value is not None}
+    with (
+        learning(max_iterations, as_json=as_json) as (stop, reporter),
+        Session.fork(run, folder=out, limits=limits, **told) as session,
+    ):
+        result = session.learn(
+            sinks=(reporter,),
+            stop=stop,
+            keyframes=keyframes,
+            fsync_every=fsync_every,
+            rerun=not no_rerun,
+            hashing=reporter.hashing,
+        )
     show(result, as_json=as_json)
-    both = f"cdmisfa compare {options.quoted(run)} {options.quoted(out)} --save both.rrd"
+    both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
     click.echo(f"both in one view: {both}", err=True)
     if result.ended == INTERRUPTED:
         ctx.exit(stop.exit_code)

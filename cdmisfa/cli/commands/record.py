@@ -1,10 +1,11 @@
-"""`cdmisfa record`: write what a scene or cameras show."""
+"""`cdmisfa record` and `convert`: write recordings of scenes, of cameras, of logs of others."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +13,24 @@ import click
 from click.core import ParameterSource
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import frame_options, live_options, live_streams, say_counts, tell
 from cdmisfa.cli.interrupts import Stop, stoppable
+from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.printing import (
+    print_document,
+    print_plan,
+    print_table,
+    say_about,
+    say_changes,
+    say_counts,
+    tell,
+)
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from recorder.cameras.readers import OnLoss
-    from recorder.cameras.words import LiveOptions
+    from recorder.cameras.options import LiveOptions
+    from recorder.images.options import ImageOptions
+    from recorder.log.begun import Begun
     from recorder.recording import ViewRecording
     from replay.camera_logs.options import CameraOptions
 
@@ -30,36 +41,43 @@ LIVE = ("cameras", "gym")
 """What it names where it is of live streams."""
 
 
-@click.command("record")
+@grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
 @click.argument("source", nargs=-1)
 @uploads.out("Folder of the recording, or s3://...")
-@click.option(
+@option(
     "--frames",
     type=click.IntRange(1),
     help="Frames of each view; by default 1000, with --resume as many as first asked for, of "
     "cameras until Ctrl-C.",
 )
 @options.seed
-@click.option("--view", "views", multiple=True, metavar="NAME", help="Only this view; repeatable.")
+@option(
+    "--view",
+    "views",
+    multiple=True,
+    metavar="NAME",
+    help="Only this view; repeatable.",
+    group="Source",
+)
 @options.jobs
 @options.preset
 @options.settings
-@click.option(
+@option(
     "--scene-picture",
     type=options.OUT,
     metavar="F.png",
     help="Draw the scene from outside instead of recording it.",
 )
-@click.option("--resume", is_flag=True, help="Resume an interrupted recording.")
-@click.option(
+@option("--resume", is_flag=True, help="Resume an interrupted recording.")
+@option(
     "--split",
     metavar="LIMIT",
     help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
     "--resume as first asked for.",
 )
 @options.fsync_every
-@frame_options
-@live_options
+@options.image_options
+@options.live_options
 @options.force
 @options.as_json
 @click.pass_context
@@ -68,22 +86,14 @@ def record_command(
     /,
     source: tuple[str, ...],
     out: Path | None,
-    frames: int,
     seed: int,
-    views: tuple[str, ...],
-    jobs: int,
     preset: str | None,
     settings: tuple[str, ...],
     scene_picture: Path | None,
-    fsync_every: float | None,
-    force: bool,
-    resume: bool,
-    split: str | None,
     as_json: bool,
-    hold: float,
-    lost: OnLoss,
-    stall: float,
-    **framing: Any,
+    images: ImageOptions,
+    live: LiveOptions,
+    **writing: Any,
 ) -> None:
     """Record what a scene or cameras show, one MCAP file per view.
 
@@ -95,106 +105,69 @@ def record_command(
     """
     from cdmisfa.experiments.sources import configure, is_scene
     from recorder.cameras.words import is_live
-    from recorder.log.begun import Begun, read_recording
+    from recorder.log.begun import Begun
+    from recorder.recording import recorded, save_picture
     from recorder.world.scenes import SCENES
-    from replay.camera_logs.options import CameraOptions
 
-    cameras = CameraOptions(**framing)
     if any(map(is_live, source)):
+        views, jobs, resume = (writing.pop(name) for name in ("views", "jobs", "resume"))
         if resume or views or jobs > 1 or scene_picture is not None:
             raise UsageError(
                 "live streams cannot go back, and are recorded all: leave out --resume, --view, "
                 "--jobs and --scene-picture"
             )
-        if out is None:
-            raise click.UsageError("say -o FOLDER, where the recording goes")
-        record_streams(
-            ctx,
-            source,
-            out,
-            frames=frames,
-            split=split,
-            fsync_every=fsync_every,
-            force=force,
-            as_json=as_json,
-            live=live_streams(hold, lost, stall, seed=seed),
-            cameras=cameras,
-            preset=preset,
-            settings=settings,
-        )
+        live = dataclasses.replace(live, seed=seed)
+        writing |= {"preset": preset, "settings": settings, "as_json": as_json}
+        record_streams(ctx, source, _folder(out), live, images, **writing)
         return
     _refuse_logs(source)
-    begun = read_recording(out) if resume and out is not None else Begun()
-    if begun.source and begun.source[0] in LIVE:
-        raise UsageError(
-            f"{out} is of live streams, which cannot go back: what is recorded can be read, record "
-            "the rest into another folder"
-        )
-    if begun.source == CONVERTED:
-        command = f"cdmisfa convert SOURCE -o {shlex.quote(str(out))} --resume"
-        raise UsageError(f"{out} is an unfinished conversion: resume it with {command}")
-    given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
+    resumed = out if writing["resume"] else None
+    begun = Begun() if resumed is None else _begun(resumed)
     named = "".join(source or begun.source)
-    is_scene([named], cameras)  # which refuses options of cameras
-    if resume and out is not None and not (named or frames or given_seed or split):
-        from recorder.recording import recorded
-
-        if files := recorded(out):
-            say_complete(out)
-            print_recording(out, files, as_json=as_json)
-            return
+    is_scene([named], images)  # which refuses options of cameras
+    given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
+    asked = named or given_seed or writing["frames"] or writing["split"]
+    if resumed is not None and not asked and (files := recorded(resumed)):
+        say_complete(resumed)
+        print_recording(resumed, files, as_json=as_json)
+        return
     if not named:
-        where = f"{out} does not say of what it is: " if resume and out is not None else ""
+        where = "" if resumed is None else f"{resumed} does not say of what it is: "
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
-    if not given_seed:
-        seed = begun.options.get("seed", seed)
+    seed = seed if given_seed else begun.options.get("seed", seed)
     configuration = configure(named, preset, settings, seed)
     if scene_picture is not None:
-        from recorder.recording import save_picture
-
-        save_picture(named, configuration.scene, scene_picture, force=force)
-        click.echo(f"picture {scene_picture}", err=True)
+        save_picture(named, configuration.scene, scene_picture, force=writing["force"])
+        tell(f"picture {scene_picture}")
         if out is None:
             if as_json:
-                options.print_json({"schema": options.SCHEMA, "picture": str(scene_picture)})
+                print_document(picture=str(scene_picture))
             return
-    if out is None:
-        raise click.UsageError("say -o FOLDER, where the recording goes")
-    from recorder.log.split import Split
-    from recorder.recording import DEFAULT_FRAMES, record_scene
-
-    parts = None if split is None else Split.parse(split)
-    nothing_left = resume
-
-    def report(done: float) -> None:
-        nonlocal nothing_left
-        nothing_left = False
-        shown.update(done, max(done, frames or DEFAULT_FRAMES))
-
-    with bar("recording", "frames") as shown, recording_stoppable(ctx, out, notice="") as stop:
-        files = record_scene(
-            named,
-            out,
-            configuration.scene,
-            configuration.record,
-            frames=frames,
-            views=views or None,
-            jobs=jobs,
-            force=force,
-            resume=resume,
-            split=parts,
-            fsync_every=fsync_every,
-            stop=stop,
-            progress=report,
-        )
-    if nothing_left:
-        say_complete(out)
+    out = _folder(out)
+    files = _record_scene(ctx, configuration, out, **writing)
     print_recording(out, files, as_json=as_json)
 
 
-def say_complete(folder: Path) -> None:
-    """Say that there was nothing to resume."""
-    click.echo(f"{folder} is complete: nothing was left to record", err=True)
+def _folder(out: Path | None) -> Path:
+    if out is None:
+        raise click.UsageError("say -o FOLDER, where the recording goes")
+    return out
+
+
+def _begun(folder: Path) -> Begun:
+    """How a recording was begun that is to be resumed."""
+    from recorder.log.begun import read_recording
+
+    begun = read_recording(folder)
+    if begun.source and begun.source[0] in LIVE:
+        raise UsageError(
+            f"{folder} is of live streams, which cannot go back: what is recorded can be read, "
+            "record the rest into another folder"
+        )
+    if begun.source == CONVERTED:
+        command = f"cdmisfa convert SOURCE -o {shlex.quote(str(folder))} --resume"
+        raise UsageError(f"{folder} is an unfinished conversion: resume it with {command}")
+    return begun
 
 
 def _refuse_logs(words: tuple[str, ...]) -> None:
@@ -209,18 +182,49 @@ def _refuse_logs(words: tuple[str, ...]) -> None:
         raise UsageError(f"{' '.join(words)}: record one scene at a time")
 
 
+def _record_scene(
+    ctx: click.Context,
+    configuration: Any,
+    out: Path,
+    *,
+    frames: int | None,
+    views: tuple[str, ...],
+    split: str | None,
+    resume: bool,
+    **how: Any,
+) -> list[ViewRecording]:
+    """Record a scene, or the rest of it."""
+    from recorder.log.split import Split
+    from recorder.recording import DEFAULT_FRAMES, record_scene
+
+    with recording(ctx, out, resume=resume, notice="") as (report, stop):
+        return record_scene(
+            configuration.scene.kind,
+            out,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            views=views or None,
+            split=None if split is None else Split.parse(split),
+            resume=resume,
+            stop=stop,
+            progress=lambda done: report(done, max(done, frames or DEFAULT_FRAMES)),
+            **how,
+        )
+
+
 def record_streams(
     ctx: click.Context,
     words: Sequence[str],
     out: Path,
-    *,
-    frames: int | None,
-    split: str | None,
-    fsync_every: float | None,
-    force: bool,
-    as_json: bool,
     live: LiveOptions,
-    cameras: CameraOptions,
+    images: ImageOptions,
+    *,
+    as_json: bool,
+    force: bool,
+    fsync_every: float | None,
+    frames: int | None = None,
+    split: str | None = None,
     preset: str | None = None,
     settings: Sequence[str] = (),
 ) -> None:
@@ -233,14 +237,9 @@ def record_streams(
 
     refuse_existing(out, force=force, goes_on=False)
     with stoppable(notice="finishing the recording; again to stop at once\n") as stop:
+        how: dict[str, Any] = {"preset": preset, "settings": settings}
         source, configuration = open_cameras_now(
-            words,
-            live,
-            cameras=cameras,
-            preset=preset,
-            settings=settings,
-            say=tell,
-            stop=stop,
+            words, live, cameras=images, say=tell, stop=stop, **how
         )
         with contextlib.closing(source):
             recorded = RecordedWhileWatched(
@@ -267,18 +266,106 @@ def record_streams(
         ctx.exit(stop.exit_code)
 
 
+@grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
+@click.argument("source", nargs=-1, required=True)
+@uploads.out("Folder of the recording, or s3://...; --dry-run needs none.")
+@options.log_options
+@options.dry_run
+@options.live_options
+@options.salvage
+@option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
+@options.server_limits
+@options.fsync_every
+@options.force
+@options.as_json
+@click.pass_context
+def convert_command(
+    ctx: click.Context,
+    /,
+    source: tuple[str, ...],
+    out: Path | None,
+    salvage: bool,
+    resume: bool,
+    fsync_every: float | None,
+    force: bool,
+    as_json: bool,
+    dry_run: bool,
+    live: LiveOptions,
+    cameras: CameraOptions,
+) -> None:
+    """Write camera logs of others as a recording.
+
+    SOURCE is MCAP files or their URLs, ROS bags, LeRobot datasets, tables of numbers (CSV,
+    Parquet), or a video or a folder of pictures for each stream; several, or a pattern such as
+    'logs/*.mcap'. What was interrupted is resumed with --resume. Live streams are recorded, as by
+    cdmisfa record.
+    """
+    from cdmisfa.experiments.convert import convert
+    from recorder.cameras.words import is_live
+    from recorder.log.folder import refuse_existing
+    from replay.inputs import open_cameras, places, refuse_what_is_no_log
+
+    out = Path("REC") if out is None and dry_run else _folder(out)
+    writing: dict[str, Any] = {"fsync_every": fsync_every, "force": force}
+    if any(map(is_live, source)):
+        if resume or salvage or dry_run:
+            raise UsageError(
+                "live streams cannot go back: leave out --resume, --salvage and --dry-run"
+            )
+        record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
+        return
+    named = places(source)
+    for place in named:
+        refuse_what_is_no_log(place)
+    if not resume and not dry_run:
+        refuse_existing(out, force=force)
+    opened = open_cameras(named, cameras, salvage=salvage, goal=("convert", str(out)))
+    with contextlib.closing(opened) as frames:
+        if dry_run:
+            print_plan(frames, as_json=as_json)
+            return
+        say_about(frames)
+        with recording(ctx, out, resume=resume) as (report, stop):
+            files = convert(
+                frames,
+                out,
+                resume=resume,
+                stop=stop,
+                progress=lambda done: report(done, frames.spec.length or 0),
+                **writing,
+            )
+        say_changes(frames)
+    print_recording(out, files, as_json=as_json)
+
+
+def say_complete(folder: Path) -> None:
+    """Say that there was nothing to resume."""
+    tell(f"{folder} is complete: nothing was left to record")
+
+
 @contextlib.contextmanager
-def recording_stoppable(ctx: click.Context, out: Path, **notice: str) -> Iterator[Stop]:
-    """Let the body end its block at a signal, say how to resume, and exit with its code."""
+def recording(
+    ctx: click.Context, out: Path, *, resume: bool, **notice: str
+) -> Iterator[tuple[Callable[[float, float], None], Stop]]:
+    """Show how far a recording is; a signal ends its block, says how to resume, and exits."""
     from recorder.recording import RecordingStoppedError
 
-    with stoppable(**notice) as stop:
+    nothing_left = resume
+
+    def report(done: float, total: float) -> None:
+        nonlocal nothing_left
+        nothing_left = False
+        shown.update(done, total)
+
+    title = "recording" if ctx.command.name == "record" else "converting"
+    with bar(title, "frames") as shown, stoppable(**notice) as stop:
         try:
-            yield stop
+            yield report, stop
         except (RecordingStoppedError, KeyboardInterrupt):
-            line = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
-            click.echo(line, err=True)
+            tell(f"cdmisfa: interrupted: {out} is not finished: go on with --resume")
             ctx.exit(stop.exit_code)
+    if nothing_left:
+        say_complete(out)
 
 
 def print_recording(folder: Path, files: Sequence[ViewRecording], *, as_json: bool) -> None:
@@ -286,11 +373,9 @@ def print_recording(folder: Path, files: Sequence[ViewRecording], *, as_json: bo
     if as_json:
         frames = sum(file.frames for file in files if file.name == files[0].name)
         rows = [file.as_json() for file in files]
-        options.print_json(
-            {"schema": options.SCHEMA, "recording": str(folder), "frames": frames, "views": rows}
-        )
+        print_document(recording=str(folder), frames=frames, views=rows)
         return
-    options.print_table(
+    print_table(
         ("view", "file", "frames", "bytes", "sha256"),
         [(f.name, f.file, f.frames, f.bytes, f.sha256) for f in files],
     )

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import look_options, say_about
+from cdmisfa.cli.making import option
+from cdmisfa.cli.printing import SCHEMA, print_json, print_table, quoted, say_about
 from cdmisfa.core.errors import NotReproducedError
-from cdmisfa.experiments.documents import markdown
+
+if TYPE_CHECKING:
+    from replay.camera_logs.options import CameraOptions
 
 
 @click.command("compare")
 @options.fetched_argument("runs", nargs=-1)
-@click.option(
+@option(
     "--save",
     type=options.OUT,
     metavar="F.rrd",
@@ -49,9 +52,9 @@ def compare_command(
     at = different[0].iteration if different and len(runs) == 2 else -1
     first, second = ({}, {}) if at < 0 else (signals_of(runs[0], at), signals_of(runs[1], at))
     if as_json:
-        options.print_json(
+        print_json(
             {
-                "schema": options.SCHEMA,
+                "schema": SCHEMA,
                 "identical": not different,
                 "first_difference": different[0].as_json() if different else None,
                 "signals": {name: [first[name], second[name]] for name in first if name in second},
@@ -62,15 +65,15 @@ def compare_command(
     elif len(runs) == 2:
         click.echo(str(different[0]) if different else "identical, bit for bit")
     else:
-        options.print_table(HEAD, [row.cells() for row in rows])
+        print_table(HEAD, [row.cells() for row in rows])
     for explanation in filter(None, (row.explanation() for row in rows)):
         if not as_json:
             click.echo(explanation)
     if first and second and not as_json:
         click.echo(f"signals of iteration {at}:")
-        options.print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
+        print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
     if save is not None and not as_json:
-        click.echo(f"view {save}    look at it: cdmisfa view {options.quoted(save)}", err=True)
+        click.echo(f"view {save}    look at it: cdmisfa view {quoted(save)}", err=True)
     if different and len(runs) == 2:
         ctx.exit(NotReproducedError.exit_code)
 
@@ -92,9 +95,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 
     files = draw_figures(run, out, force=force)
     if as_json:
-        options.print_json(
-            {"schema": options.SCHEMA, "run": str(run), "figures": [str(f) for f in files]}
-        )
+        print_json({"schema": SCHEMA, "run": str(run), "figures": [str(f) for f in files]})
         return
     for file in files:
         click.echo(file)
@@ -104,7 +105,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
 
 @click.command("export")
 @options.fetched_argument("path", nargs=-1)
-@click.option(
+@option(
     "--to",
     "form",
     metavar="FORM",
@@ -112,8 +113,8 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
     "file's name ends in.",
 )
 @uploads.out("The file to write, for a recording the folder, or s3://...", required=True)
-@click.option("--lossless", is_flag=True, help="Keep every value of images in a video.")
-@look_options
+@option("--lossless", is_flag=True, help="Keep every value of images in a video.")
+@options.look_options
 @options.server_limits
 @options.force
 @options.as_json
@@ -124,7 +125,7 @@ def export_command(
     lossless: bool,
     force: bool,
     as_json: bool,
-    **cameras: Any,
+    cameras: CameraOptions,
 ) -> None:
     """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
 
@@ -133,24 +134,22 @@ def export_command(
     PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
     camera logs of others, several at once, too, and numbers in them with --field.
     """
-    from replay.camera_logs.options import CameraOptions
     from replay.export.forms import FORMS, export
     from replay.export.tables import CSV_LEAVES_OUT
 
     if str(out) == "-":
         raise click.UsageError("-o - would be a file of this name: name another")
     form = form or out.suffix.removeprefix(".")
-    chosen = CameraOptions(**cameras)
-    rows = export(path, out, form, force=force, lossless=lossless, cameras=chosen, about=say_about)
+    rows = export(path, out, form, force=force, lossless=lossless, cameras=cameras, about=say_about)
     if form == "csv":
         left_out = " and ".join(CSV_LEAVES_OUT)
         click.echo(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them", err=True)
     if form in ("mp4", "lerobot") and not lossless and _is_film(out):
         click.echo("H.264 changes pixels a little: --lossless keeps them all", err=True)
     if as_json:
-        options.print_json(
+        print_json(
             {
-                "schema": options.SCHEMA,
+                "schema": SCHEMA,
                 "path": " ".join(map(str, path)),
                 "file": str(out),
                 "rows": rows,
@@ -166,7 +165,7 @@ def _is_film(out: Path) -> bool:
 
 
 @click.command("signals")
-@click.option("--markdown", "as_page", is_flag=True, help="Print the page docs/signals.md.")
+@option("--markdown", "as_page", is_flag=True, help="Print the page docs/signals.md.")
 @options.as_json
 def signals_command(as_page: bool, as_json: bool) -> None:
     """List every signal that a run records."""
@@ -174,19 +173,19 @@ def signals_command(as_page: bool, as_json: bool) -> None:
 
     signals = [dataclasses.asdict(signal) for signal in SIGNALS.values()]
     if as_json:
-        options.print_json(
-            {"schema": options.SCHEMA, "signals_version": SCHEMA_VERSION, "signals": signals}
-        )
+        print_json({"schema": SCHEMA, "signals_version": SCHEMA_VERSION, "signals": signals})
         return
     columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
     rows = [[signal[column] for column in columns] for signal in signals]
     if as_page:
         click.echo(_page(SCHEMA_VERSION, columns, rows))
     else:
-        options.print_table(columns, rows)
+        print_table(columns, rows)
 
 
 def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
+    from cdmisfa.experiments.documents import markdown
+
     return "\n".join(
         [
             "# Signals",

@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import log_options
+from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.printing import SCHEMA, print_json, print_table, quoted
 from cdmisfa.cli.progress import bar
+
+if TYPE_CHECKING:
+    from replay.camera_logs.options import CameraOptions
 
 MOST_SEEDS = 1_000_000
 
 
-@click.command("sweep")
+@grouped("sweep", common=("out", "grid", "seeds", "settings", "max_iterations", "jobs"))
 @click.argument("source", nargs=-1, required=True)
 @uploads.out(
     "Folder of the sweep, or s3://...; what is finished in it is not computed again.",
     required=True,
     goes_on=True,
 )
-@click.option(
+@option(
     "--grid",
     multiple=True,
     metavar="KEY=V1,V2,...",
     help="Values to try for a configuration key; several grids multiply.",
 )
-@click.option(
+@option(
     "--seeds",
     default="0:20",
     show_default=True,
@@ -36,16 +40,14 @@ MOST_SEEDS = 1_000_000
 )
 @options.preset
 @options.settings
-@click.option(
-    "--max-iterations", type=click.IntRange(1), help="End each trial after so many iterations."
-)
-@click.option("--max-modules", type=click.IntRange(1), help="End each trial after so many modules.")
-@click.option("--loop", is_flag=True, help="Start a recording or log again at its end.")
-@log_options
+@options.end_after("iterations", "End each trial after so many iterations.")
+@options.end_after("modules", "End each trial after so many modules.")
+@options.loop
+@options.log_options
 @options.jobs
 @options.engine
-@click.option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
-@click.option("--retry-failed", is_flag=True, help="Compute trials again that failed before.")
+@option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
+@options.retry_failed
 @options.server_limits
 @options.as_json
 @click.pass_context
@@ -67,7 +69,7 @@ def sweep_command(
     keep_logs: bool,
     retry_failed: bool,
     as_json: bool,
-    **cameras: Any,
+    cameras: CameraOptions,
 ) -> None:
     """Learn from a source many times, over a grid of settings and seeds.
 
@@ -75,7 +77,6 @@ def sweep_command(
     stopped is resumed when it is asked for again. Look at what it found with: cdmisfa results DIR
     """
     from cdmisfa.experiments.sweep import sweep
-    from replay.camera_logs.options import CameraOptions
 
     with bar("sweep", "trials") as shown:
 
@@ -91,7 +92,7 @@ def sweep_command(
                 preset=preset,
                 settings=settings,
                 loop=loop,
-                cameras=CameraOptions(**cameras),
+                cameras=cameras,
                 max_iterations=max_iterations,
                 max_modules=max_modules,
                 jobs=jobs,
@@ -113,9 +114,9 @@ def sweep_command(
             err=True,
         )
     if as_json:
-        options.print_json(
+        print_json(
             {
-                "schema": options.SCHEMA,
+                "schema": SCHEMA,
                 "sweep": report.folder,
                 "trials": report.trials,
                 "skipped": report.skipped,
@@ -132,7 +133,7 @@ def sweep_command(
         for row in failed:
             at = " ".join(f"{key}={value}" for key, value in row["point"].items())
             click.echo(f"failed: {at} seed {row['seed']}: {row['error']}")
-        click.echo(f"look at it: cdmisfa results {options.quoted(out)}")
+        click.echo(f"look at it: cdmisfa results {quoted(out)}")
     if failed:
         ctx.exit(1)
 
@@ -168,8 +169,8 @@ def parse_seeds(text: str) -> list[int]:
 
 @click.command("results")
 @options.path_argument("folder")
-@click.option("--csv", "as_csv", is_flag=True, help="Print comma-separated values.")
-@click.option("--latex", "as_latex", is_flag=True, help="Print a LaTeX table (booktabs).")
+@option("--csv", "as_csv", is_flag=True, help="Print comma-separated values.")
+@option("--latex", "as_latex", is_flag=True, help="Print a LaTeX table (booktabs).")
 @options.as_json
 def results_command(folder: Path, as_csv: bool, as_latex: bool, as_json: bool) -> None:
     """Print mean and standard deviation over seeds at each point of a sweep.
@@ -182,10 +183,10 @@ def results_command(folder: Path, as_csv: bool, as_latex: bool, as_json: bool) -
         raise click.UsageError("choose one of --csv, --latex and --json")
     points = results.results(folder)
     if as_json:
-        options.print_json(results.as_json(points))
+        print_json(results.as_json(points))
     elif as_csv:
         click.echo(results.as_csv(points), nl=False)
     elif as_latex:
         click.echo(results.as_latex(points), nl=False)
     else:
-        options.print_table(*results.as_table(points))
+        print_table(*results.as_table(points))

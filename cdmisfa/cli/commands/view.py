@@ -10,39 +10,34 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.cameras import (
-    look_options,
-    number_options,
-    range_option,
-    say_about,
-    tell,
-    topic_option,
-)
 from cdmisfa.cli.commands.learn import announce
 from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.making import grouped, option, options_of
+from cdmisfa.cli.printing import print_document, say_about, tell
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
+from replay.camera_logs.options import CameraOptions
 
 
-@click.command("view")
+@grouped("view", common=("save", "web", "screenshot", "at", "tab", "every"))
 @options.fetched_argument("run", nargs=-1)
-@click.option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file.")
-@click.option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
-@click.option(
+@option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file.")
+@option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
+@option(
     "--screenshot",
     type=options.OUT,
     metavar="F.png",
     help="Draw the view into a file, without a screen.",
 )
-@click.option(
+@option(
     "--at",
     metavar="WHEN",
     help='Moment of the screenshot: a frame, "iteration 500", or words of an event, as "module 2".',
 )
-@click.option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
-@click.option("--size", metavar="WxH", help="Size of the window or screenshot, as 1600x1000.")
-@click.option("--port", type=click.IntRange(1, 65535), help="Where --web, or a sweep, is served.")
-@click.option(
+@option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
+@option("--size", metavar="WxH", help="Size of the window or screenshot, as 1600x1000.")
+@option("--port", type=click.IntRange(1, 65535), help="Where --web, or a sweep, is served.")
+@option(
     "--every",
     type=click.IntRange(1),
     default=10,
@@ -50,20 +45,20 @@ from cdmisfa.core.errors import UsageError
     metavar="N",
     help="Show the images of every Nth frame; numbers are all shown.",
 )
-@click.option(
+@option(
     "--all-views",
     type=options.OUT,
     metavar="RECORDING",
     help="Also show what was not watched, from the recording that the run learned from.",
 )
-@click.option(
+@option(
     "--memory-limit",
     default="2GB",
     show_default=True,
     metavar="SIZE",
     help="Most memory that the viewer takes for what it keeps.",
 )
-@look_options
+@options.look_options
 @options.server_limits
 @options.force
 def view_command(
@@ -72,15 +67,11 @@ def view_command(
     web: bool,
     screenshot: Path | None,
     at: str | None,
-    topics: tuple[str, ...],
-    fields: tuple[str, ...],
-    time: str | None,
-    rate: float | None,
-    depth: tuple[float, float] | None,
     size: str | None,
     port: int | None,
     memory_limit: str,
     force: bool,
+    cameras: CameraOptions,
     **shown: Any,
 ) -> None:
     """Open a run or a recording in the Rerun viewer, or save, serve or draw it.
@@ -95,12 +86,10 @@ def view_command(
         raise click.UsageError("--at goes with --screenshot")
     if size is not None and (web or save is not None):
         raise click.UsageError("--size goes with a window or --screenshot")
-    from replay.camera_logs.options import CameraOptions
     from replay.runs.folders import is_sweep, runs_in
     from replay.viewer.program import check_limit
 
     check_limit(memory_limit)
-    cameras = CameraOptions(topics, rate=rate, fields=fields, time=time, depth=depth)
     path, *beside = run
     if not beside and runs_in(path):
         if save is not None:
@@ -113,16 +102,16 @@ def view_command(
         raise UsageError(f"{path}: this sweep kept no logs: sweep again with --keep-logs")
     if port is not None and not web:
         raise click.UsageError("--port goes with --web, or with a sweep")
-    # Only here: they take half a second.
-    from replay.view.build import build_view
+    from replay.view.build import build_view  # half a second, as are those below
+
+    if save is not None:
+        build_view(path, save, force=force, beside=beside, cameras=cameras, **shown)
+        tell(f"view {save}")
+        return
     from replay.viewer.headless import WINDOW
     from replay.viewer.headless import screenshot as draw
     from replay.viewer.window import open_window, serve
 
-    if save is not None:
-        build_view(path, save, force=force, beside=beside, cameras=cameras, **shown)
-        click.echo(f"view {save}", err=True)
-        return
     with contextlib.ExitStack() as until_seen:
         if beside or cameras != CameraOptions():
             folder = until_seen.enter_context(tempfile.TemporaryDirectory(prefix="cdmisfa-view-"))
@@ -131,7 +120,7 @@ def view_command(
             path, shown = built, {}
         if screenshot is not None:
             draw(path, screenshot, at=at, force=force, window=size or WINDOW, **shown)
-            click.echo(f"picture {screenshot}", err=True)
+            tell(f"picture {screenshot}")
         elif web:
             serve(path, memory_limit=memory_limit, port=port, **shown)
         else:
@@ -155,7 +144,7 @@ def _view_sweep(
         from replay.viewer.headless import WINDOW, draw_table
 
         draw_table(folder, screenshot, window=size or WINDOW, force=force)
-        click.echo(f"picture {screenshot}", err=True)
+        tell(f"picture {screenshot}")
         return
     from replay.viewer.catalogue import serve_catalogue
 
@@ -165,13 +154,15 @@ def _view_sweep(
 
 @click.command("play")
 @options.fetched_argument("recording", nargs=-1)
-@options.one_of(
+@option(
     "--to",
-    ("rerun", "foxglove"),
-    "To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
-    argument="target",
+    "target",
+    type=click.Choice(["rerun", "foxglove"]),
+    default="rerun",
+    show_default=True,
+    help="To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
 )
-@click.option(
+@option(
     "--rate",
     type=click.FloatRange(1e-3, 1e3),
     default=1.0,
@@ -179,23 +170,21 @@ def _view_sweep(
     metavar="TIMES",
     help="How many times as fast as it was seen.",
 )
-@click.option(
+@option(
     "--fps",
     type=click.FloatRange(1e-3, 1e6),
     metavar="HZ",
     help="Frames a second of what tells none, as folders of pictures.",
 )
-@topic_option
-@number_options
-@range_option
-@click.option("--loop", is_flag=True, help="Start again at its end, until Ctrl-C.")
-@click.option(
+@options_of(CameraOptions, "cameras", "topics", "fields", "time", "depth")
+@option("--loop", is_flag=True, help="Start again at its end, until Ctrl-C.")
+@option(
     "--wait",
     type=click.IntRange(0),
     metavar="TOPICS",
     help="As a robot, begin once so many topics are watched; by default 1, with 0 at once.",
 )
-@click.option(
+@option(
     "--port",
     type=click.IntRange(0, 65535),
     help="Where to serve, on this machine; by default 8765 as a robot, else a free one.",
@@ -214,7 +203,7 @@ def play_command(
     wait: int | None,
     port: int | None,
     as_json: bool,
-    **chosen: Any,
+    cameras: CameraOptions,
 ) -> None:
     """Show a recording as it was seen, in real time.
 
@@ -224,35 +213,24 @@ def play_command(
     """
     if wait is not None and target != "foxglove":
         raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
-    from replay.camera_logs.options import CameraOptions
-
-    cameras = CameraOptions(**chosen)
     with bar("playing", "s") as shown, stoppable(notice="") as stop:
-        how: dict[str, Any] = {
-            "rate": rate,
-            "fps": fps,
-            "cameras": cameras,
-            "about": say_about,
-            "loop": loop,
-            "stop": stop,
-            "progress": shown.update,
-        }
+        from replay.playing.feed import Playback
+
+        how = Playback(rate, loop, fps, cameras, say_about, stop, shown.update)
         if target == "foxglove":
             from replay.playing.as_robot import PORT, play_as_robot
 
             at, begin = PORT if port is None else port, 1 if wait is None else wait
-            played = play_as_robot(recording, port=at, wait=begin, say=tell, **how)
+            played = play_as_robot(recording, how, port=at, wait=begin, say=tell)
         else:
             from replay.playing.in_rerun import play_in_rerun
 
-            played = play_in_rerun(recording, port=port, announce=announce, **how)
+            played = play_in_rerun(recording, how, port=port, announce=announce)
     if played.behind > 1:
         tell(f"it came to lag {played.behind:.1f} s behind: play it with a smaller --rate")
     what = "messages" if target == "foxglove" else "frames"
     if as_json:
-        options.print_json(
-            {"schema": options.SCHEMA, what: played.count, "seconds": played.seconds}
-        )
+        print_document(**{what: played.count, "seconds": played.seconds})
     else:
         click.echo(f"played {played.count} {what}, {played.seconds:.2f} s of the recording")
     if played.stopped and not loop:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from replay.runs.outline import Outline
+from replay.runs.run import Outline
 from replay.view.layouts.first import first_tab
 from replay.view.layouts.panels import Panels
 from replay.view.layouts.paper import paper_layout

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS
 from replay.runs.log import PHI_EVERY
-from replay.runs.outline import Outline
+from replay.runs.run import Outline
 from replay.view.columns import FRAME, ITERATION, TIMELINE_SIGNALS
 from replay.view.heads import gaze
 from replay.view.labels import label, part

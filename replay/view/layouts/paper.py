@@ -6,7 +6,7 @@ import math
 
 import rerun.blueprint as rrb
 
-from replay.runs.outline import Outline
+from replay.runs.run import Outline
 from replay.view.columns import power_of_ten
 from replay.view.lanes import ATTENDS, DOES, EXPLORES, LEARNS, MOSTLY, NOVELTY
 from replay.view.layouts.panels import MOST_MODULES, Panels

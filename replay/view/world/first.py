@@ -9,8 +9,7 @@ from pathlib import Path
 import rerun as rr
 
 from recorder.log.scenery import Scenery
-from replay.runs.log import RunHeader
-from replay.runs.stretches import Stretch
+from replay.runs.log import Batch, RunHeader
 from replay.view.world.known import world_of_run
 from replay.view.world.learned import Lesson
 from replay.view.world.scene import SceneView
@@ -94,14 +93,14 @@ class WorldView:
         elif header.spec.images:
             self._wall = WallView(recording, header, streams)
 
-    def take(self, stretch: Stretch) -> None:
+    def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
         if self._wall is not None:
-            self._wall.take(stretch)
+            self._wall.take(batch)
         if self._scene is not None:
-            for columns in stretch.signals:
+            for columns in batch.signals:
                 self._scene.turn(columns)
-            for frames, truth in stretch.truth:
+            for frames, truth in batch.truth:
                 kept = frames % self._every == 0
                 self._scene.move(frames[kept], truth[kept])
 

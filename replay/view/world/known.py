@@ -15,8 +15,7 @@ from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
 from replay.recordings.poses import first_pose
 from replay.runs.log import RunHeader
-from replay.storage.listing import log_files
-from replay.storage.opening import open_store
+from replay.storage.opening import log_files, open_store
 
 PRESET = (
     "the recording that it learned from is not where it was: the table, the eyes and the sizes of "

@@ -11,10 +11,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from replay.following import Following, Heard, read_outputs
+from replay.following import Fit, read_outputs
 from replay.palette import GREY, colour
-from replay.runs.outline import Outline
-from replay.runs.stretches import Frames
+from replay.runs.log import Frames
+from replay.runs.run import Outline
 from replay.view.columns import line_column
 from replay.view.labels import label
 
@@ -50,7 +50,6 @@ def write_learned(
     log: Path,
     outline: Outline,
     truth: Sequence[Frames],
-    heard: Heard,
 ) -> list[Lesson]:
     """Write each module's output where its stream was watched, and what it follows, everywhere.
 
@@ -59,17 +58,14 @@ def write_learned(
         log: of the run.
         outline: the run in short.
         truth: what the world knew at each frame, piece after piece.
-        heard: the run's records.
     """
     names, spec = outline.names(), outline.header.spec
     if not truth or not outline.saved:
         return []
     frames, values = (np.concatenate(part)[-MOST_FRAMES:] for part in zip(*truth, strict=True))
     iterations, lessons = outline.blocks.iteration(frames), []
-    for output in read_outputs(
-        log, outline, MOST, MOST_FRAMES, truth=(frames, values), records=heard.pieces
-    ):
-        found = output.follows(spec.truth)
+    for output in read_outputs(log, outline, MOST, MOST_FRAMES, truth=(frames, values)):
+        found = output.best_fit(spec.truth)
         if found is None:
             continue
         followed = found(values[:, found.column])
@@ -100,7 +96,7 @@ def write_learned(
     return lessons
 
 
-def _title(module: int, stream: str, found: Following) -> str:
+def _title(module: int, stream: str, found: Fit) -> str:
     return (
         f"What module {module} has learned: where {label(stream)} is watched, "
         f"its output over {label(found.function)}, |r| = {found.r:.2f}"

@@ -11,8 +11,7 @@ import rerun as rr
 from cdmisfa.core.signals import STATES
 from replay.palette import colour, packed_all
 from replay.runs.columns import SignalColumns
-from replay.runs.log import RunHeader
-from replay.runs.stretches import Stretch
+from replay.runs.log import Batch, RunHeader
 from replay.view.columns import ImageColumn, time_columns
 from replay.view.labels import label, part
 
@@ -54,13 +53,13 @@ class WallView:
             recording.log(path, rr.Transform3D(translation=[x, y, 0.0]), static=True)
             self._pictures[s] = ImageColumn(recording, self._spec, path)
 
-    def take(self, stretch: Stretch) -> None:
+    def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
-        for columns in stretch.signals:
+        for columns in batch.signals:
             self._frame(columns)
             self._say(columns)
-        blocks = stretch.blocks
-        for frames, images in stretch.watched if len(blocks.starts) else ():
+        blocks = batch.blocks
+        for frames, images in batch.watched if len(blocks.starts) else ():
             places = blocks.places(frames)
             last = np.flatnonzero(np.diff(places, append=len(blocks.starts)))
             for s in np.unique(blocks.streams[places[last]]).tolist():

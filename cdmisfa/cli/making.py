@@ -1,0 +1,190 @@
+"""Options made of the fields of dataclasses, and --help with options in groups."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import re
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, TypeVar, cast
+
+import click
+
+from cdmisfa.core.options import RANGE, SIZE, TIME, option_name
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+GROUPS = ("Source", "Images", "Live streams", "Learner", "Output")
+"""The headings of --help below the options that are used most."""
+
+
+class Option(click.Option):
+    """An option with the heading of --help that it stands below."""
+
+    def __init__(self, *names: Any, group: str = "Output", **how: Any) -> None:
+        super().__init__(*names, **how)
+        self.group = group
+
+
+class GroupedCommand(click.Command):
+    """A command whose --help lists the options used most, and then the others by `GROUPS`.
+
+    Args:
+        common: names of the arguments whose options are used most.
+        how: see `click.Command`.
+    """
+
+    def __init__(self, *args: Any, common: Sequence[str], **how: Any) -> None:
+        super().__init__(*args, **how)
+        self._common = common
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """See `click.Command`."""
+        params = [param for param in self.get_params(ctx) if isinstance(param, click.Option)]
+        common = [param for name in self._common for param in params if param.name == name]
+        listed = {"Most used": common, **{group: [] for group in GROUPS}}
+        for param in params:
+            if param not in common:
+                listed[getattr(param, "group", GROUPS[-1])].append(param)
+        for heading, each in listed.items():
+            if rows := [row for param in each if (row := param.get_help_record(ctx))]:
+                with formatter.section(heading):
+                    formatter.write_dl(rows)
+
+
+def grouped(name: str, common: Sequence[str]) -> Callable[[Callable[..., Any]], click.Command]:
+    """`click.command` with its options in groups.
+
+    Args:
+        name: of the command.
+        common: names of the arguments whose options are used most.
+    """
+    return click.command(name, cls=GroupedCommand, common=common)
+
+
+def option(*names: str, **how: Any) -> Callable[[Command], Command]:
+    """`click.option`, with a `group`: the heading of --help that it stands below."""
+    return click.option(*names, cls=Option, **how)
+
+
+def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Several options as one, in the order in which --help lists them."""
+    return lambda command: functools.reduce(lambda c, option: option(c), reversed(each), command)
+
+
+class Written(click.ParamType[Any]):
+    """A value that is written in a way of its own.
+
+    Args:
+        name: what it is, for messages.
+        remedy: how it is written.
+        pattern: of its text.
+        read: what its parts come to; None where they are no such value.
+    """
+
+    def __init__(
+        self, name: str, remedy: str, pattern: str, read: Callable[[Sequence[str | None]], Any]
+    ) -> None:
+        self.name, self._remedy, self._pattern, self._read = name, remedy, pattern, read
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """See `click.ParamType`."""
+        if not isinstance(value, str):
+            return value
+        found = re.fullmatch(self._pattern, value, re.ASCII)
+        result = None if found is None else self._read(found.groups())
+        if result is None:
+            self.fail(f"{value!r} is no {self.name}: write {self._remedy}", param, ctx)
+        return result
+
+
+def _size(parts: Sequence[str | None]) -> tuple[int, ...]:
+    return tuple(int(part or 0) for part in reversed(parts))
+
+
+def _seconds(parts: Sequence[str | None]) -> float:
+    hours, minutes, seconds = (float(part or 0) for part in parts)
+    return hours * 3600 + minutes * 60 + seconds
+
+
+def _range(parts: Sequence[str | None]) -> tuple[float, float] | None:
+    low, high = (float(part or 0) for part in parts)
+    return (low, high) if low < high else None
+
+
+_NUMBER = r"(-?\d{1,9}(?:\.\d{1,9})?)"
+
+_WRITTEN = {
+    SIZE: Written("size", "WIDTHxHEIGHT, as 128x48", r"([1-9]\d{0,3})x([1-9]\d{0,3})", _size),
+    TIME: Written(
+        "time",
+        "seconds, or MINUTES:SECONDS, as 1:30",
+        r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d{1,9})?)",
+        _seconds,
+    ),
+    RANGE: Written(
+        "range",
+        "NEAR:FAR in metres, as 0.3:5, or LOW:HIGH of numbers, as -3.2:3.2",
+        f"{_NUMBER}:{_NUMBER}",
+        _range,
+    ),
+}
+"""How values of these units are read."""
+
+
+def options_of(settings: type, argument: str, *names: str) -> Callable[[Command], Command]:
+    """Options made of the fields of a dataclass; see `cdmisfa.core.options.setting`.
+
+    Args:
+        settings: the dataclass.
+        argument: name of the command's argument that gets an object of it.
+        names: of the fields; by default all.
+    """
+    fields = [
+        field
+        for field in dataclasses.fields(settings)
+        if field.metadata and (not names or field.name in names)
+    ]
+
+    def wrapped(command: Command) -> Command:
+        @functools.wraps(command)
+        def with_settings(*args: Any, **values: Any) -> Any:
+            chosen = {field.name: values.pop(field.name) for field in fields}
+            return command(*args, **{argument: settings(**chosen)}, **values)
+
+        made = together(*(option_of(settings, field) for field in fields))
+        return made(cast(Command, with_settings))
+
+    return wrapped
+
+
+def option_of(
+    settings: type, field: dataclasses.Field[Any], **how: Any
+) -> Callable[[Command], Command]:
+    """The option of one field of a dataclass.
+
+    Args:
+        settings: the dataclass.
+        field: of it, with the metadata of `setting`.
+        how: more for `option`.
+    """
+    told: Mapping[str, Any] = field.metadata
+    kind = typing.get_type_hints(settings)[field.name]
+    if types.NoneType in typing.get_args(kind):
+        kind = next(each for each in typing.get_args(kind) if each is not types.NoneType)
+    of: dict[str, Any] = {"type": kind, "show_default": field.default is not None}
+    if told["unit"] in _WRITTEN:
+        of = {"type": _WRITTEN[told["unit"]]}
+    elif typing.get_origin(kind) is Literal:
+        of["type"] = click.Choice(typing.get_args(kind))
+    elif kind is bool:
+        of = {"is_flag": True}
+    elif typing.get_origin(kind) is tuple:
+        of = {"multiple": True}
+    elif kind in (int, float):
+        ranges = {int: click.IntRange, float: click.FloatRange}
+        of["type"] = ranges[kind](told["least"], told["most"])
+    of |= {"default": field.default, "help": told["about"], "metavar": told["unit"] or None}
+    return option(option_name(field), field.name, group=told["group"], **(of | how))

@@ -1,0 +1,68 @@
+"""Settings that are options of commands, too: fields of dataclasses, each stated once.
+
+The command line makes its options of them; see `cdmisfa.cli.options.options_of`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+SIZE, TIME, RANGE = "WxH", "TIME", "LOW:HIGH"
+"""Units that are written in a way of their own: (height, width), seconds, two numbers."""
+
+_WRITTEN: Final[Mapping[str, Callable[[Any], str]]] = {
+    SIZE: lambda size: f"{size[1]}x{size[0]}",
+    RANGE: lambda ends: f"{ends[0]:g}:{ends[1]:g}",
+}
+
+
+def setting(
+    default: Any,
+    about: str,
+    *,
+    unit: str = "",
+    name: str = "",
+    least: float | None = None,
+    most: float | None = None,
+    group: str = "Source",
+) -> Any:
+    """A field of a dataclass that is also an option; its type says what the option takes.
+
+    Args:
+        default: of both.
+        about: one sentence, for --help.
+        unit: what the option's value is written in, as "HZ".
+        name: of the option, where it is not the field's.
+        least: of a number.
+        most: of a number.
+        group: the heading of --help that it stands below.
+    """
+    told = {"about": about, "unit": unit, "name": name, "least": least, "most": most}
+    return dataclasses.field(default=default, metadata={**told, "group": group})
+
+
+def option_name(field: dataclasses.Field[Any]) -> str:
+    """How a setting is called on the command line."""
+    return f"--{(field.metadata['name'] or field.name).replace('_', '-')}"
+
+
+def given(settings: Any) -> list[dataclasses.Field[Any]]:
+    """The settings of a dataclass that are not the defaults."""
+    each = (field for field in dataclasses.fields(settings) if field.metadata)
+    return [field for field in each if getattr(settings, field.name) != field.default]
+
+
+def option_words(settings: Any) -> list[str]:
+    """The words of a command line that give these settings; of defaults, none."""
+    words = []
+    for field in given(settings):
+        value = getattr(settings, field.name)
+        for each in value if field.metadata["unit"] and field.default == () else [value]:
+            words.append(option_name(field))
+            if isinstance(each, float):
+                words.append(f"{each:g}")
+            elif not isinstance(each, bool):
+                words.append(_WRITTEN.get(field.metadata["unit"], str)(each))
+    return words

@@ -1,0 +1,95 @@
+"""How images of cameras, live or stored, become frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from cdmisfa.core.options import RANGE, SIZE, given, option_name, setting
+
+Size = tuple[int, int]
+"""(height, width) in pixels."""
+
+Depth = tuple[float, float]
+"""Distances in metres that are shown black and white, or the range that numbers are kept in."""
+
+Fit = Literal["crop", "pad", "stretch"]
+"""How an image of another ratio of the sides becomes a frame: see `fitted`."""
+
+Clock = Literal["log", "header"]
+"""Which time of a message counts: when it was logged, or that in its header."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageOptions:
+    """How images of cameras, live or stored, become frames, or their messages numbers."""
+
+    size: Size | None = setting(
+        None,
+        "Shrink camera images to this size; by default to what has their ratio of the sides "
+        "and no more pixels than 128x48.",
+        unit=SIZE,
+        group="Images",
+    )
+    fit: Fit = setting(
+        "crop",
+        "Where images have another ratio of the sides than --size: cut two sides, put black "
+        "at them, or change the ratio.",
+        group="Images",
+    )
+    rate: float | None = setting(
+        None,
+        "Frames a second of cameras and logs; by default the first stream's.",
+        unit="HZ",
+        least=1e-3,
+        most=1e6,
+        group="Images",
+    )
+    fields: tuple[str, ...] = setting(
+        (),
+        "Take numbers instead of images: a field of a topic's messages, such as "
+        "pose.position.x or ranges[0:100], or a column of a table; several are one vector.",
+        unit="FIELD",
+        name="field",
+        group="Images",
+    )
+    color: bool = setting(
+        False,
+        "Show red, green and blue beside one another, as a frame of three times the width.",
+        group="Images",
+    )
+    depth: Depth | None = setting(
+        None,
+        "Show distances of depth cameras, in metres, from black to white, as 0.3:5; keep numbers "
+        "within, as -3.2:3.2.",
+        unit=RANGE,
+        name="range",
+        group="Images",
+    )
+
+    def given(self) -> tuple[str, ...]:
+        """The options of the command line that say other than the defaults."""
+        return tuple(option_name(field) for field in given(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What is taken of messages and files.
+
+    Attributes:
+        depth: what is shown of distances, see `raw_image`, and the range that numbers are kept in.
+        fields: the numbers that are taken instead of images; see `Field`.
+        time: the column of a table's times, with its unit; see `TableNumbers`.
+        stamp: the times of messages: those of the log, or those in their headers.
+        color: whether images are taken in their colours; see `raw_image`.
+    """
+
+    depth: Depth | None = None
+    fields: tuple[str, ...] = ()
+    time: str | None = None
+    stamp: Clock = "log"
+    color: bool = False
+
+
+IMAGES = Reading()
+"""Images, and no numbers."""

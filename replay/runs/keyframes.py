@@ -1,0 +1,158 @@
+"""Keyframes of a run: the learner's whole state after some iterations, stored in its log.
+
+`cdmisfa.Keyframe` holds the state's arrays one after the other in `values`, and in the JSON text
+`facts` what each one is, and all else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf import descriptor_pb2
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import LogDamagedError, one_line
+from cdmisfa.core.learning import Keyframe, LearnerState
+from cdmisfa.core.modules import Module
+from cdmisfa.core.untrusted.memory import parse_json
+from recorder.mcap.reader import LogReader
+from replay.runs.codec import define_message, parsed
+from replay.runs.folders import run_log
+from replay.storage.arrays import contents, stored_arrays
+
+KEYFRAME_TOPIC = "/keyframe"
+KEYFRAME_SCHEMA = "cdmisfa.Keyframe"
+
+KEYFRAME_VERSION = 1
+"""Rises when the state of a learner changes its meaning."""
+
+_ABOUT_FACTS = "JSON: name, type and shape of each array, and more"
+_MODULES = "modules."
+_FIELD = descriptor_pb2.FieldDescriptorProto
+_KEYFRAME, KEYFRAME_DEFINITION = define_message(
+    KEYFRAME_SCHEMA,
+    "keyframe",
+    [
+        ("iteration", 1, _FIELD.TYPE_SFIXED64, False, "Iterations done"),
+        ("t", 2, _FIELD.TYPE_SFIXED64, False, "Next frame"),
+        (
+            "facts",
+            3,
+            _FIELD.TYPE_STRING,
+            False,
+            _ABOUT_FACTS,
+        ),
+        ("values", 4, _FIELD.TYPE_BYTES, False, "The arrays, one after the other"),
+    ],
+)
+
+
+def read_keyframe(path: Path, last: int | None = None) -> Keyframe | None:
+    """The newest keyframe of a run's log at or before so many iterations, None where there is none.
+
+    Only the chunks that hold keyframes are read. What is no keyframe of this version is passed
+    over.
+    """
+    newest = _keyframes(run_log(path), lambda k: last is None or k <= last, backwards=True)
+    return next(newest, None)
+
+
+def read_keyframes(path: Path, after: int) -> Iterator[Keyframe]:
+    """The keyframes of a run's log after more than so many iterations, in order.
+
+    Of two after the same iteration, as where a fork begins, the last one is the run's.
+    """
+    before: Keyframe | None = None
+    for keyframe in _keyframes(run_log(path), lambda k: k > after):
+        if before is not None and before.iteration != keyframe.iteration:
+            yield before
+        before = keyframe
+    if before is not None:
+        yield before
+
+
+def _keyframes(
+    log: Path, wanted: Callable[[int], bool], *, backwards: bool = False
+) -> Iterator[Keyframe]:
+    """Keyframes in the order of the file, or from its end on."""
+    step = -1 if backwards else 1
+    with LogReader(log) as reader:
+        own = {n for n, channel in reader.channels.items() if channel.topic == KEYFRAME_TOPIC}
+        for segment in reader.segments[::step]:
+            counts = segment.channel_counts()
+            if counts is not None and not own & counts.keys():
+                continue
+            table = reader.table(segment)
+            if table is None:
+                continue
+            for row in np.flatnonzero(np.isin(table.channel, list(own)))[::step].tolist():
+                if not wanted(int(table.records["sequence"][row])):
+                    continue
+                with contextlib.suppress(LogDamagedError):
+                    keyframe = decode_keyframe(table.payload(row), f"{log} {KEYFRAME_TOPIC}")
+                    if wanted(keyframe.iteration):
+                        yield keyframe
+
+
+def encode_keyframe(keyframe: Keyframe) -> bytes:
+    """A keyframe as the bytes of a message."""
+    state, arrays = keyframe.state, arrays_of(keyframe.state)
+    facts = {
+        "version": KEYFRAME_VERSION,
+        "versions": keyframe.versions,
+        "taken": keyframe.taken,
+        "policy_rng": state.policy_rng,
+        "arrays": contents(arrays),
+    }
+    encoded: bytes = _KEYFRAME(
+        iteration=keyframe.iteration,
+        t=keyframe.t,
+        facts=json.dumps(facts),
+        values=b"".join(array.tobytes() for array in arrays.values()),
+    ).SerializeToString()
+    return encoded
+
+
+def arrays_of(state: LearnerState) -> dict[str, NDArray[Any]]:
+    """All arrays of a state by name: its own, and one for each field of its modules."""
+    fields = dataclasses.fields(Module)
+    return dict(state.arrays) | {
+        _MODULES + field.name: np.array([getattr(m, field.name) for m in state.modules])
+        for field in fields
+    }
+
+
+def decode_keyframe(data: bytes, where: str = "record") -> Keyframe:
+    """The keyframe in the bytes of a message, whose arrays are no larger than these.
+
+    Raises:
+        LogDamagedError: the bytes are not such a message, or one of another version.
+    """
+    decoded = parsed(_KEYFRAME, data, where)
+    try:
+        facts = parse_json(decoded.facts)
+        if facts["version"] != KEYFRAME_VERSION:
+            raise LogDamagedError(f"{where}: a keyframe of version {facts['version']!r}")
+        arrays = stored_arrays(facts["arrays"], decoded.values)
+        of_modules = [name for name in arrays if name.startswith(_MODULES)]
+        columns = {name.removeprefix(_MODULES): arrays.pop(name) for name in of_modules}
+        state = LearnerState(arrays, _modules(columns), dict(facts["policy_rng"]))
+        taken = facts["taken"] if isinstance(facts["taken"], str) else None
+        return Keyframe(decoded.iteration, decoded.t, state, dict(facts["versions"]), taken)
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise LogDamagedError(f"{where}: not a keyframe ({one_line(error)})") from error
+
+
+def _modules(columns: Mapping[str, NDArray[Any]]) -> tuple[Module, ...]:
+    values: Any = {
+        name: column.tolist() if column.ndim == 1 else list(column)
+        for name, column in columns.items()
+    }
+    rows = zip(*values.values(), strict=True)
+    return tuple(Module(**dict(zip(values, row, strict=True))) for row in rows)
