@@ -190,16 +190,16 @@ def _segment(content: memoryview) -> Segment | None:
     parts = sorted(zip(places[1::2], places[::2], strict=True))
     if parts[0][0] != offset + length:
         raise MalformedRecord("a chunk index lies about its message indexes")
-    indexes = []
+    indexes, counts = [], dict.fromkeys(places[::2], 0)
     edges = [*parts, (offset + length + index_size, 0)]
     for (place, channel), (after, _) in itertools.pairwise(edges):
         count, rest = divmod(after - place - INDEX_HEADER.size, 16)
         if rest or count < 0:
             return None
         indexes.append(IndexPart(channel, place + INDEX_HEADER.size, count))
-    return Segment(
-        offset, data, stored, size, compression, 0, start, end, True, indexes, stated=True
-    )
+        counts[channel] += count
+    whole = offset, data, stored, size, compression, 0, start, end, True, indexes, counts
+    return Segment(*whole, stated=True)
 
 
 @functools.lru_cache(8)
