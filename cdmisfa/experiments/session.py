@@ -49,8 +49,7 @@ from cdmisfa.experiments.run_folder import (
     write_results,
 )
 from cdmisfa.experiments.sources import versions_used
-from recorder.log.folder import folder_here
-from recorder.log.whole import partial_path
+from recorder.log.files import folder_here, partial_path
 from replay.runs.folders import RUN_FILE, run_log
 from replay.runs.run import states_whole
 

@@ -22,8 +22,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.untrusted.memory import BUDGET, MAX_LIST, budget, parse_json
 from cdmisfa.core.untrusted.regular import opened_regular
-from recorder.log.folder import held
-from recorder.log.whole import make_folder, refuse_special, to_disk
+from recorder.log.files import held, make_folder, refuse_special, to_disk
 
 ROWS = "rows.jsonl"
 """The rows, in a folder."""

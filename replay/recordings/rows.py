@@ -14,7 +14,7 @@ from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.kernels.frames import gather
 from cdmisfa.kernels.frames import layout as kernel_layout
-from recorder.log.viewfacts import ViewFacts
+from recorder.log.manifest import ViewMetadata
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable
@@ -75,7 +75,7 @@ class ChannelRows:
         layout: where the messages hold their values, once a message is known.
     """
 
-    def __init__(self, reader: LogReader, channel: Channel, facts: ViewFacts) -> None:
+    def __init__(self, reader: LogReader, channel: Channel, facts: ViewMetadata) -> None:
         self.channel = channel
         self.runs: list[Run] = []
         self.layout: RowLayout | None = None

@@ -31,7 +31,7 @@ from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Sett
 from cdmisfa.studies.paper.icub import Icub
 from cdmisfa.studies.paper.nonstationary import NonStationary
 from cdmisfa.studies.paper.oscillatory import FiveStreams, Oscillatory
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 
 EXPERIMENTS: Mapping[str, Experiment] = {
     "oscillatory": Oscillatory(),
@@ -117,7 +117,7 @@ def reproduce(
     found = Findings()
     experiment.evaluate(trials, found)
     table = [{**{f"{SETTING}{k}": v for k, v in t.settings.items()}, **t.row} for t in trials]
-    with whole(request.folder / "rows.parquet") as partial:
+    with atomic_write(request.folder / "rows.parquet") as partial:
         parquet.write_table(pyarrow.Table.from_pylist(table), partial)
     figures = experiment.draw(trials, request.folder)
     return _write_results(name, request, found, len(trials), figures)
@@ -167,7 +167,7 @@ def _write_results(
         }
     )
     write_json(request.folder / "results.json", document)
-    with whole(request.folder / "table.md") as partial:
+    with atomic_write(request.folder / "table.md") as partial:
         partial.write_text(markdown_table(document["table"]), encoding="utf-8")
     return document
 
