@@ -48,7 +48,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         log = ViewLog(folder, "left", RecordingSpec("icub", 3, PICTURES, {}), settings)
         log.write(block)
         log.finish()
-        paths[compression] = log.file.path
+        paths[compression] = folder / "left.mcap"
     return paths
 
 
