@@ -12,7 +12,7 @@ from PIL import Image
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.export import frames
 from replay.export.forms import export
@@ -30,9 +30,9 @@ def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0):
     pixels = rng.integers(0, 256, (len(views), FRAMES, *shape), dtype=np.uint8)
     truth = rng.standard_normal((FRAMES, 2))
     for stream, view in enumerate(views):
-        log = ViewLog(folder, view, Identity("test", 3, spec, {}), RecordConfig())
+        log = ViewLog(folder, view, RecordingSpec("test", 3, spec, {}), RecordConfig())
         log.write(Block(stream, 0, freeze(pixels[stream].copy()), freeze(truth.copy())))
-        log.file.finish()
+        log.finish()
     return pixels, truth
 
 

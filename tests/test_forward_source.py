@@ -17,7 +17,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.session import run
 from cdmisfa.testing.sources import ForwardContract, same
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record
 from replay.recordings.source import RecordedSource
 

@@ -13,7 +13,8 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.experiments.loop import Digest, learn
-from cdmisfa.paper import icub
+from cdmisfa.studies.paper import icub
+from cdmisfa.studies.paper.oscillatory import paper_config
 from replay.recordings.source import RecordedSource
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
@@ -22,7 +23,7 @@ COMPONENTS = (8, 10, 12)
 
 
 def config(components: int) -> LearnerConfig:
-    return dataclasses.replace(icub.learner_config(), components=components)
+    return dataclasses.replace(paper_config("icub"), components=components)
 
 
 @pytest.mark.parametrize("components", COMPONENTS)

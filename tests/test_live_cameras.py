@@ -26,8 +26,8 @@ from cdmisfa.testing.sources import same
 from recorder.cameras.live import LiveSource
 from recorder.cameras.readers import CameraFrames, Readers
 from recorder.cameras.video import Steady
+from recorder.config import Split
 from recorder.live import COUNTS, RecordedWhileWatched, record_watched
-from recorder.log.split import Split
 from replay.export.forms import export
 from replay.integrity.info import describe
 from replay.integrity.verify import check_log

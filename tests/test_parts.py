@@ -15,7 +15,7 @@ from waiting import wait_for
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import UsageError
 from cdmisfa.testing.sources import SourceContract, same
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import check_log
@@ -86,7 +86,7 @@ def test_kill_9_at_any_moment_leaves_parts_that_play_and_go_on(
 ) -> None:
     words = "3s" if split == BY_TIME else "12kB"
     program = (
-        "import sys, time; from pathlib import Path; from recorder.log.split import Split;"
+        "import sys, time; from pathlib import Path; from recorder.config import Split;"
         "from recorder.recording import record_scene;"
         "record_scene('oscillatory', Path(sys.argv[1]), frames=700, split=Split.parse(sys.argv[2]),"
         " progress=lambda _: time.sleep(0.03))"

@@ -18,14 +18,12 @@ from mcap.reader import make_reader
 from waiting import wait_for
 
 from cdmisfa.core.errors import UsageError
-from recorder.config import RecordConfig
+from recorder.config import RecordConfig, Split
 from recorder.log import resume
-from recorder.log.begun import RECORDING
-from recorder.log.folder import held
+from recorder.log.files import held, partial_path
+from recorder.log.manifest import RECORDING
 from recorder.log.messages import RECORDING_METADATA
 from recorder.log.resume import frames_held
-from recorder.log.split import Split
-from recorder.log.whole import partial_path
 from recorder.recording import RecordingStoppedError, record, record_scene
 from recorder.world.icub.config import IcubConfig
 from recorder.world.oscillatory import OscillatorySource
@@ -40,7 +38,7 @@ def sha256(path: Path) -> str:
 
 
 def whole_frames(path: Path, view: str) -> int:
-    return frames_held(path, view).whole(0)
+    return frames_held(path, view).stop_from(0)
 
 
 @pytest.fixture(scope="module")

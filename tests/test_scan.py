@@ -17,7 +17,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.kernels import frames as kernels
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import INDEX_HEADER, Segment
@@ -44,9 +44,9 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for compression in ("zstd", "lz4", "none"):
         folder = tmp_path_factory.mktemp(compression)
         settings = RecordConfig(compression=compression)
-        log = ViewLog(folder, "left", Identity("icub", 3, PICTURES, {}), settings)
+        log = ViewLog(folder, "left", RecordingSpec("icub", 3, PICTURES, {}), settings)
         log.write(block)
-        log.file.finish()
+        log.finish()
         paths[compression] = log.file.path
     return paths
 

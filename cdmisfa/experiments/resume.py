@@ -18,7 +18,7 @@ from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import SCHEMA_VERSION
 from cdmisfa.experiments.command import COMMAND, log_to_resume
 from cdmisfa.experiments.sources import CLOCK
-from recorder.log.whole import partial_path
+from recorder.log.files import partial_path
 from recorder.world.scenes import SCENES
 from replay.runs.folders import RUN_FILE
 from replay.runs.keyframes import read_keyframe

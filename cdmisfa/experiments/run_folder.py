@@ -17,8 +17,14 @@ from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.command import COMMAND, SET_ASIDE
 from cdmisfa.experiments.documents import machine, write_json
 from cdmisfa.experiments.resume import FORK
-from recorder.log.folder import held, logs_in, refuse_existing
-from recorder.log.whole import make_folder, partial_path, refuse_special
+from recorder.log.files import (
+    held,
+    logs_in,
+    make_folder,
+    partial_path,
+    refuse_existing,
+    refuse_special,
+)
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
 from replay.runs.run import final_record

@@ -37,7 +37,7 @@ from cdmisfa.experiments.run_folder import (
     write_results,
 )
 from cdmisfa.experiments.sources import versions_used
-from recorder.log.folder import folder_here
+from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.run import stated_source, states_whole
 from replay.runs.writer import RunWriter

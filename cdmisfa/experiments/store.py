@@ -22,8 +22,7 @@ from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.untrusted.memory import BUDGET, MAX_LIST, budget, parse_json
 from cdmisfa.core.untrusted.regular import opened_regular
-from recorder.log.folder import held
-from recorder.log.whole import make_folder, refuse_special, to_disk
+from recorder.log.files import held, make_folder, refuse_special, to_disk
 
 ROWS = "rows.jsonl"
 """The rows, in a folder."""
@@ -36,7 +35,7 @@ def code(*more: str) -> str:
     """Version of what a trial computes: the package's, and a hash of learner and recorder.
 
     Args:
-        more: further modules that decide it: "cdmisfa/arena/trial".
+        more: further modules that decide it: "cdmisfa/studies/arena/trial".
     """
     root = Path(__file__).parents[2]
     rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")

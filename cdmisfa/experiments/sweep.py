@@ -31,7 +31,7 @@ from cdmisfa.experiments.sources import (
 )
 from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
@@ -270,7 +270,7 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:
-            log = opened.enter_context(whole(trial.log))
+            log = opened.enter_context(atomic_write(trial.log))
         result = run(
             source,
             configuration.learner,

@@ -56,6 +56,7 @@ class LogReader:
         profile: the writer's profile, as "ros2".
         library: what wrote the file.
         complete: the file has its end.
+        first_damage: place of the first damaged record that stands outside chunks, or None.
         data_complete: every message is there, if not the summary behind them.
         metadata: the metadata records.
         statistics: what the summary says the file holds, or None.
@@ -161,10 +162,7 @@ class LogReader:
         return self._structure.definitions.schemas
 
     def attachment_data(self, attachment: Attachment) -> bytes:
-        """Read an attachment's bytes.
-
-        Raises LogDamagedError where it is larger than is read at once.
-        """
+        """Read an attachment's bytes; a LogDamagedError where that is too much at once."""
         if attachment.size > MAX_CHUNK:
             raise LogDamagedError(
                 f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
@@ -348,6 +346,7 @@ class LogReader:
         """Take over what the walk found, with the times of a chunk whose header states none yet."""
         structure = self._structure
         self.by_index, self.complete = structure.by_index, structure.complete
+        self.first_damage = structure.first_damage
         self.profile, self.library = structure.profile, structure.library
         self.data_complete, self.metadata = structure.data_crc is not None, structure.metadata
         self.statistics = structure.summary.statistics if structure.summary else None

@@ -69,32 +69,30 @@ class LogStructure:
         missing: what a file that was cut lacks, in words; "" for a whole one.
         data_crc: CRC of the data section, 0 for none, None where the file ends before it.
         data_end: place where the data section ends.
+        first_damage: place of the first record that is damaged, None where none is.
     """
 
     def __init__(
         self, file: Store, refuse: Refuse, *, by_index: bool = False, resync: bool = False
     ) -> None:
-        self._file = file
-        self._resync = resync
+        self._file, self._resync = file, resync
         self._sure = len(MAGIC)
         self.by_index = False
-        self._refuse = refuse
+        self._tell = refuse
+        self.first_damage: int | None = None
         self.definitions = Definitions(refuse)
         self.segments: list[Segment] = []
         self.tail: Segment | None = None
         self.metadata: list[Metadata] = []
         self.attachments: list[Attachment] = []
-        self.profile = ""
-        self.library = ""
+        self.profile = self.library = ""
         self.summary: Summary | None = None
-        self.complete = False
-        self.missing = ""
+        self.complete, self.missing = False, ""
         self.data_crc: int | None = None
         self.data_end = 0
         self._limit: int | None = None
         self._attachment_spans: list[tuple[int, int]] = []
-        self._metadata_bytes = 0
-        self._inside = 0
+        self._metadata_bytes = self._inside = 0
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
         self._at = len(MAGIC)
@@ -119,6 +117,11 @@ class LogStructure:
         self._read_end()
         self._walk_data()
         return kept
+
+    def _refuse(self, where: str, what: str) -> None:
+        if self.first_damage is None:
+            self.first_damage = self._at
+        self._tell(where, what)
 
     def load_attachments(self) -> None:
         """Read the attachments that the summary names, and check them."""
@@ -370,7 +373,7 @@ class LogStructure:
         return True
 
     def _read_end(self) -> None:
-        self.summary = read_summary(self._file, self.definitions, self._refuse)
+        self.summary = read_summary(self._file, self.definitions, self._tell)
         # What is wrong in a footer may be the place that it says the data to end at.
         lies = self._resync and self.summary is not None and self.summary.broken
         self._limit = self.summary.begin if self.summary and not lies else None

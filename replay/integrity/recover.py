@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.log.files import make_folder
 from recorder.log.logfile import LogFile
-from recorder.log.whole import make_folder
 from recorder.mcap.chunks import UNUSED
 from recorder.mcap.mending import mended
 from recorder.mcap.reader import LogReader

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.log.viewfacts import ViewFacts
+from recorder.log.manifest import ViewMetadata
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable
@@ -70,7 +70,7 @@ class ChannelRows:
     """
 
     def __init__(
-        self, reader: LogReader, channel: Channel, facts: ViewFacts, *, passing: bool = False
+        self, reader: LogReader, channel: Channel, facts: ViewMetadata, *, passing: bool = False
     ) -> None:
         self.channel = channel
         self._reader = reader

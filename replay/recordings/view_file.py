@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.log.manifest import ViewMetadata
 from recorder.log.messages import (
     IMAGE_ENCODING,
     IMAGE_SCHEMA,
@@ -26,7 +27,6 @@ from recorder.log.messages import (
     vector_payload,
     view_topic,
 )
-from recorder.log.viewfacts import ViewFacts
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Segment
 from replay.recordings.channel_rows import ChannelRows
@@ -85,7 +85,7 @@ class ViewFile:
                 f"({len(records)} {RECORDING_METADATA} records); "
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
-        self.facts = facts = ViewFacts.from_metadata(self.path, records[0].values)
+        self.facts = facts = ViewMetadata.parse(self.path, records[0].values)
         self.reader.expect(self.reader.segments)
         schema = IMAGE_SCHEMA if facts.spec.images else VECTOR_SCHEMA
         self._channels = [self._channel(view_topic(facts.view), schema)]

@@ -14,7 +14,7 @@ import rerun as rr
 from rerun.chunk import Chunk
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import refuse_taken, whole
+from recorder.log.files import atomic_write, refuse_taken
 from replay.camera_logs.options import CameraOptions
 from replay.inputs import holds_run
 from replay.runs.folders import MODULES_FILE, run_log
@@ -125,7 +125,7 @@ def recording_to(
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
     recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))
     recording.set_log_time_enabled(False)
-    with whole(out) as partial:
+    with atomic_write(out) as partial:
         try:
             recording.save(partial)
             if not partial.exists():

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import refuse_taken, refuse_unless_png, whole
+from recorder.log.files import atomic_write, refuse_taken, refuse_unless_png
 from replay.camera_logs.source import ForeignSource
 from replay.inputs import holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
@@ -177,7 +177,7 @@ class HeadlessViewer:
     def draw(self, out: Path) -> None:
         """Write the window as a PNG, whole or not at all."""
         png = bytes(self.ask(lambda client: client.take_screenshot()))
-        with whole(out) as partial:
+        with atomic_write(out) as partial:
             partial.write_bytes(png)
 
 
