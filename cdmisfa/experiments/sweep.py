@@ -17,7 +17,7 @@ from typing import Any, cast
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.untrusted.memory import MAX_LIST
+from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, write_json
 from cdmisfa.experiments.run_folder import module_table
 from cdmisfa.experiments.session import run
