@@ -13,7 +13,7 @@ from google.protobuf.json_format import MessageToDict
 from mcap.reader import make_reader
 from rerun.chunk import McapReader
 
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from recorder.log.scenery import scenery_of, times, turned
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
@@ -49,7 +49,10 @@ def test_objects_are_where_the_truth_says(recorded):
     source = RecordedSource(recorded)
     truth = source.take(0, FRAMES).truth
     source.close()
-    things = [scenery_of(as_table(IcubConfig())).table, *scenery_of(as_table(IcubConfig())).objects]
+    things = [
+        scenery_of(section_table(IcubConfig())).table,
+        *scenery_of(section_table(IcubConfig())).objects,
+    ]
     told = [*messages(recorded / "right.mcap", "/scene")]
     assert len(told) == FRAMES
     for t, (_, data) in enumerate(told):
@@ -69,7 +72,7 @@ def test_objects_are_where_the_truth_says(recorded):
 
 @pytest.mark.parametrize("view", ["left", "right"])
 def test_transforms_lead_from_the_root_to_each_eye(recorded, view):
-    gaze = scenery_of(as_table(IcubConfig())).gaze(view)
+    gaze = scenery_of(section_table(IcubConfig())).gaze(view)
     ((_, data), *_) = messages(recorded / f"{view}.mcap", "/tf")
     chain = {
         t.child_frame_id: t for t in FrameTransforms_pb2.FrameTransforms.FromString(data).transforms

@@ -92,7 +92,7 @@ def _keyframes(
             if table is None:
                 continue
             for row in np.flatnonzero(np.isin(table.channel, list(own)))[::step].tolist():
-                if not wanted(int(table.headers["sequence"][row])):
+                if not wanted(int(table.records["sequence"][row])):
                     continue
                 with contextlib.suppress(LogDamagedError):
                     keyframe = decode_keyframe(table.payload(row), f"{log} {KEYFRAME_TOPIC}")
