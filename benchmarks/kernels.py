@@ -16,7 +16,7 @@ from cdmisfa import kernels
 from cdmisfa.core.blocks import freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.incsfa import State, new_state
+from cdmisfa.features.incsfa import IncSFAState, new_state
 from recorder.world.oscillatory import one_period
 from replay.recordings.source import RecordedSource
 from tests.reference.incsfa import PlainIncSFA
@@ -201,8 +201,8 @@ def measure_errors(n: int) -> list[list[Any]]:
     noted = {4_000, n // 10, n}
     first = new_state(np.random.default_rng(1), size, config)
     reference = PlainIncSFA(first, config, np.longdouble)
-    runs: dict[str, tuple[str, int, State]] = {
-        name: (by, way, State(*(array.copy() for array in first)))
+    runs: dict[str, tuple[str, int, IncSFAState]] = {
+        name: (by, way, IncSFAState(*(array.copy() for array in first)))
         for name, by, way in (
             ("by frame, first to last", FRAME, 1),
             ("by frame, last to first", FRAME, -1),

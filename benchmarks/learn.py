@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks.report import SAMPLE, middle, ratio, save
 from cdmisfa.core.config import LearnerConfig, load_preset
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from replay.recordings.source import RecordedSource
 
 CONFIGS = {

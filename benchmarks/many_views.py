@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.report import save
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure
 from recorder.recording import record
 from replay.recordings.source import RecordedSource

@@ -14,7 +14,7 @@ from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals, canonical_bytes
-from cdmisfa.features.projection import project
+from cdmisfa.features.outputs import project
 from replay.recordings.source import RecordedSource
 
 MODULES = (0, 1, 10, 100)

@@ -16,9 +16,9 @@ from benchmarks.report import SAMPLE, save
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments import runs
-from cdmisfa.experiments.recompute.check import learner_after
-from cdmisfa.experiments.resume import Keyframes, command_of
+from cdmisfa.experiments import session
+from cdmisfa.experiments.command import command_of
+from cdmisfa.experiments.loop import Keyframes
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
 from replay.runs.folders import run_log
@@ -71,7 +71,7 @@ def learning(word: str, out: Path, keyframes: int | None, frames: int) -> Callab
         how = SOURCES[word]
         source, told = open_source([word], **how)
         iterations = frames // told.learner.tau
-        runs.run(
+        session.run(
             source,
             told.learner,
             out,
@@ -92,7 +92,7 @@ def learning(word: str, out: Path, keyframes: int | None, frames: int) -> Callab
 def timed(call: Callable[[], int]) -> tuple[float, float]:
     """Microseconds of CPU that an iteration takes, and the part of it that keyframes take."""
     Timed.spent, begin = 0, time.process_time_ns()
-    with mock.patch.object(runs, "Keyframes", Timed):
+    with mock.patch.object(session, "Keyframes", Timed):
         iterations = call()
     took = time.process_time_ns() - begin
     return took / 1000 / iterations, Timed.spent / took
@@ -111,13 +111,13 @@ def share(out: Path) -> tuple[int, float]:
 def moments(out: Path, iterations: int) -> list[float]:
     """Seconds of CPU to go to each of some moments, the least of three times."""
     chosen = np.random.default_rng(0).integers(0, iterations, MOMENTS).tolist()
-    learner_after(out, iterations - 1)  # imports what it needs
+    session.Session.at(out, iterations - 1)  # imports what it needs
     return [min(_seconds(out, at) for _ in range(3)) for at in chosen]
 
 
 def _seconds(out: Path, at: int) -> float:
     begin = time.process_time()
-    learner_after(out, at)
+    session.Session.at(out, at)
     return time.process_time() - begin
 
 

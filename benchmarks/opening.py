@@ -18,7 +18,7 @@ from benchmarks.report import middle, save
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import open_source
 from replay.camera_logs.source import ForeignSource
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from benchmarks.report import interleaved, middle, ratio, save
 from cdmisfa import kernels
-from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
-from cdmisfa.agents.gate import NOVEL
+from cdmisfa.agents.agent import NOVEL, OUTCOME, as_struct, new_agent, rules
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.processes import Workers

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from cdmisfa.core.signals import SIGNALS as SIGNALS
     from cdmisfa.core.signals import BlockSignals as BlockSignals
     from cdmisfa.experiments.loop import learn as learn
-    from cdmisfa.experiments.recompute.run import Run as Run
+    from cdmisfa.experiments.recompute import Run as Run
     from recorder.cameras.stepped import ArraySource as ArraySource
     from recorder.cameras.stepped import GymSource as GymSource
     from recorder.world.oscillatory import OscillatorySource as OscillatorySource
@@ -48,7 +48,7 @@ _load, __dir__, __all__ = exports(
         "cdmisfa.experiments.loop": "learn",
         "recorder.cameras.stepped": "ArraySource GymSource",
         "recorder.world.oscillatory": "OscillatorySource",
-        "cdmisfa.experiments.recompute.run": "Run",
+        "cdmisfa.experiments.recompute": "Run",
     },
 )
 

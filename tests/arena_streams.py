@@ -7,32 +7,31 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from cdmisfa.arena.pictures import Rng, Shown, pixels, stateless
-from cdmisfa.arena.sets import SETS, ArenaSet
-from cdmisfa.arena.streams import STREAMS, Kind
+from cdmisfa.studies.arena.pictures import Footage, Rng, pixels, stateless
+from cdmisfa.studies.arena.streams import SETS, STREAMS, ArenaSet, Kind
 
 SHAPE = (6, 8)
 
 
-def fading(patterns: int) -> Callable[[Rng, int], Shown]:
+def fading(patterns: int) -> Callable[[Rng, int], Footage]:
     """A pattern that comes and goes slowly, and one that flickers."""
     slow_one, fast_one = np.random.default_rng(patterns).uniform(-1, 1, (2, *SHAPE))
 
-    def make(rng: Rng, n: int) -> Shown:
+    def make(rng: Rng, n: int) -> Footage:
         slow = np.sin(2 * np.pi * np.arange(n) / 400 + rng.uniform(0, 6))
         fast = rng.standard_normal(n)
         frames = 127 + 60 * slow[:, None, None] * slow_one + 20 * fast[:, None, None] * fast_one
-        return Shown(pixels(frames), slow[:, None], ("slow",))
+        return Footage(pixels(frames), slow[:, None], ("slow",))
 
     return make
 
 
-def hiss(rng: Rng, n: int) -> Shown:
+def hiss(rng: Rng, n: int) -> Footage:
     """Noise."""
     return stateless(rng.integers(0, 256, (n, *SHAPE), dtype=np.uint8))
 
 
-def blank(rng: Rng, n: int) -> Shown:
+def blank(rng: Rng, n: int) -> Footage:
     """One grey."""
     return stateless(np.full((n, *SHAPE), 90, np.uint8))
 

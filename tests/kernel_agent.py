@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from cdmisfa import kernels
-from cdmisfa.agents.agent import OUTCOME, as_struct, new_agent, rules
-from cdmisfa.agents.gate import NOVEL, Frozen
+from cdmisfa.agents.agent import NOVEL, OUTCOME, Frozen, as_struct, new_agent, rules
 from cdmisfa.core.config import LearnerConfig
 
 STAY = (0.999999, 0.0, 0.0)

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from kernel_agent import STAY, KernelAgent
 from reference.agent import IDLE_EPSILON, has_gap, ready_to_save
 
-from cdmisfa.agents.agent import Agent, begin_abstraction, new_agent
-from cdmisfa.agents.gate import CONSTANT, NOVEL
+from cdmisfa.agents.agent import CONSTANT, NOVEL, Agent, begin_abstraction, new_agent
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.signals import DENSE_STREAMS
-from cdmisfa.features.slowness import instantaneous_slowness
+from cdmisfa.kernels import instantaneous_slowness
 
 TAU = 50
 SLOW = np.sin(2 * np.pi * np.arange(5000) / 250)

@@ -16,7 +16,6 @@ from replay.camera_logs.alignment import (
     by_index,
     by_time,
     counts,
-    even_times,
     of_other_rate,
     overlap,
     step_of,
@@ -66,10 +65,6 @@ def test_a_rate_is_another_from_a_hundredth_on() -> None:
     assert of_other_rate(images, 51)
     assert not of_other_rate(images[:1], 51)
     assert not of_other_rate(times(0, 0, 0), 51)  # they tell no rate
-
-
-def test_images_at_even_times_have_the_clock_of_a_source() -> None:
-    assert even_times(4, 29.97).tolist() == [time_of(t, 29.97, 0) for t in range(4)]
 
 
 def test_streams_differ_by_more_than_half_a_step() -> None:

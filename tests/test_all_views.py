@@ -12,7 +12,7 @@ from run_data import read_signals
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.recordings.poses import head_poses, yaw_of

@@ -13,42 +13,43 @@ import pytest
 from arena_streams import tiny as tiny
 from conftest import Cdmisfa
 
-from cdmisfa.arena import measures
-from cdmisfa.arena.arena import plan
-from cdmisfa.arena.contestants import configured
-from cdmisfa.arena.library import Library, Wanted, linear
-from cdmisfa.arena.measures import Saved, probe
-from cdmisfa.arena.results import results
-from cdmisfa.arena.source import ArenaSource
-from cdmisfa.arena.streams import LEARNED_FROM
-from cdmisfa.arena.trial import History, follow, judge
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
+from cdmisfa.studies.arena import arena
+from cdmisfa.studies.arena.arena import plan_arena
+from cdmisfa.studies.arena.library import ArenaSource, Library, linear
+from cdmisfa.studies.arena.pictures import LEARNED_FROM
+from cdmisfa.studies.arena.results import arena_results
+from cdmisfa.studies.arena.trial import (
+    Course,
+    Judge,
+    SavedModule,
+    allowed_slowness,
+    probe,
+    run_learner,
+    slowest_output,
+)
 
 pytestmark = pytest.mark.usefixtures("tiny")
 
 WORDS = ("sway", "hiss", "swing>hiss", "sway#1", "blank")
+REFERENCE = 0, 8, "none"
+"""Seed, components and expansion."""
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory, tiny: None) -> Library:
     found = Library(tmp_path_factory.mktemp("streams"))
     for name in ("sway", "echo", "swing", "hiss", "short", "blank"):
-        found.prepare(Wanted(name, 0, ((8, "none"),)))
+        found.prepare(name, *REFERENCE)
     return found
 
 
 def batch(library: Library, name: str) -> Module:
     """Batch SFA of a signal, as a module."""
-    return library.reference(name, 0, 8, "none").slowest
-
-
-def pixel(place: int) -> Module:
-    """A module whose output is one of the pixels."""
-    phi = np.zeros((1, 48))
-    phi[0, place] = 1.0
-    return linear(phi, np.zeros(48), "none", PIXEL)
+    return library.reference(name, *REFERENCE).slowest
 
 
 def judged(library: Library, *saved: tuple[Module, int, int], words: Any = WORDS) -> dict[str, Any]:
@@ -57,11 +58,11 @@ def judged(library: Library, *saved: tuple[Module, int, int], words: Any = WORDS
     watched = [(40 * k, k % len(words)) for k in range(100)]
     told = []
     for one, stream, frame in saved:
-        signal = source.shown(stream, frame - 1)
-        told.append(Saved(one, stream, signal.name, signal.learnable, frame, frame // 40))
+        shown = source.shown(stream, frame - 1)
+        told.append(SavedModule(one, stream, shown.name, shown.learnable, frame, frame // 40))
     names = {s.name for phases in source.phases for s in phases if s.learnable}
-    references = {name: library.reference(name, 0, 8, "none") for name in names}
-    return judge(History(told, watched, 4000, ""), source, references)
+    references = {name: library.reference(name, *REFERENCE) for name in names}
+    return Judge(Course(told, watched, 4000, ""), source, references).row()
 
 
 def learned(row: dict[str, Any]) -> dict[str, int | None]:
@@ -81,76 +82,79 @@ def test_batch_sfa_itself_has_learned_and_knows_the_stream_shown_twice(library: 
 
 def test_a_sound_module_of_another_stream_counts_where_it_knows_this_one(library: Library) -> None:
     words = ("sway", "echo", "hiss")  # echo fades as sway does, at other times
-    good = batch(library, "sway")
-    assert learned(judged(library, (good, 0, 400), words=words)) == {"sway": 400, "echo": 400}
-    assert learned(judged(library, (good, 2, 400), words=words)) == {"sway": None, "echo": None}
-    both = judged(library, (good, 0, 400), (batch(library, "echo"), 1, 800), words=words)
-    assert learned(both) == {"sway": 400, "echo": 800}
+    good, other = batch(library, "sway"), batch(library, "echo")
+    for saved, frames in (
+        ([(good, 0, 400)], (400, 400)),
+        ([(good, 2, 400)], (None, None)),
+        ([(good, 0, 400), (other, 1, 800)], (400, 800)),
+    ):
+        row = judged(library, *saved, words=words)
+        assert learned(row) == dict(zip(("sway", "echo"), frames, strict=True))
 
 
-def test_a_module_that_is_not_slow_has_learned_nothing(library: Library) -> None:
-    row = judged(library, (pixel(3), 0, 400))
+def test_what_was_learned_in_vain_is_told(library: Library) -> None:
+    phi = np.zeros((1, 48))
+    phi[0, 3] = 1.0
+    fast, good = linear(phi, np.zeros(48), "none", PIXEL), batch(library, "sway")
+    row = judged(library, (fast, 0, 400))
     assert set(learned(row).values()) == {None}
-    ((only,), tells) = row["modules"], row["probes"]
-    assert only["slowness"] > only["allowed"]
-    assert 0 < tells[0]["modules"] < 0.999
-
-
-def test_a_module_of_noise_is_wrong_however_it_was_learned(library: Library) -> None:
-    noise = batch(library, "sway")
-    row = judged(library, (noise, 1, 400), (noise, 2, 2400))
+    assert row["modules"][0]["slowness"] > row["modules"][0]["allowed"]
+    assert 0 < row["probes"][0]["modules"] < 0.999
+    row = judged(library, (good, 1, 400), (good, 2, 2400))
     assert row["wrong"] == 2
     assert row["modules"][0]["allowed"] is None
     assert set(learned(row).values()) == {None}  # although it would do for sway
+    assert slowest_output(good, library.stream("blank", 0).held_out)[1] == math.inf
+    assert judged(library, (good, 4, 400))["wrong"] == 1
 
 
 def test_a_stream_needs_one_module_however_often_it_is_shown(library: Library) -> None:
     sway, swing = batch(library, "sway"), batch(library, "swing")
     again = dataclasses.replace(sway, phi=-sway.phi)
-    row = judged(library, (sway, 0, 400), (again, 3, 800), (swing, 2, 1200))
-    assert row["doubles"] == 1
     other = dataclasses.replace(sway, phi=noise_direction(library))
-    assert judged(library, (sway, 0, 400), (other, 3, 800))["doubles"] == 0
-    assert judged(library, (sway, 0, 400), (other, 0, 800))["doubles"] == 1
-    assert judged(library, (swing, 2, 400), (swing, 2, 2400))["doubles"] == 0  # hiss since 2000
+    for saved, doubles in (
+        ([(sway, 0, 400), (again, 3, 800), (swing, 2, 1200)], 1),
+        ([(sway, 0, 400), (other, 3, 800)], 0),
+        ([(sway, 0, 400), (other, 0, 800)], 1),
+        ([(swing, 2, 400), (swing, 2, 2400)], 0),  # hiss since 2000
+    ):
+        assert judged(library, *saved)["doubles"] == doubles
 
 
-def noise_direction(library: Library) -> np.ndarray:
+def noise_direction(library: Library) -> FloatArray:
     """Weights of a sway's flickering pattern, (1, I), blind to what fades."""
     x = library.stream("sway", 0).learned_from.reshape(LEARNED_FROM, -1) * PIXEL
     x = x - x.mean(axis=0)
-    slow = (x * (x @ library.reference("sway", 0, 8, "none").slowest.phi.T)).mean(axis=0)
+    slow = (x * (x @ batch(library, "sway").phi.T)).mean(axis=0)
     directions = np.linalg.svd(x, full_matrices=False)[2][:2]
     a, b = directions @ slow
     return np.asarray([b * directions[0] - a * directions[1]])
 
 
-def test_what_changes_counts_from_its_change(library: Library) -> None:
-    words = ("sway>swing", "hiss")
-    both = (batch(library, "sway"), 0, 400), (batch(library, "swing"), 0, 3000)
-    row = judged(library, *both, words=words)
-    assert [(t["signal"], t["frame"]) for t in row["targets"]] == [("sway", 400), ("swing", 3000)]
-    assert [t["watched"] for t in row["targets"]] == [5, 13]  # 3000 - 2000 frames, every other
-    words = ("sway>echo", "hiss")
-    early = judged(library, (batch(library, "sway"), 0, 400), words=words)
-    assert [t["frame"] for t in early["targets"]] == [400, 2000]
-    again = (batch(library, "sway"), 0, 400), (batch(library, "echo"), 0, 3000)
-    assert [t["frame"] for t in judged(library, *again, words=words)["targets"]] == [400, 3000]
+@pytest.mark.parametrize(
+    ("words", "saved", "frames"),
+    [
+        (("sway>swing", "hiss"), (("sway", 400), ("swing", 3000)), [400, 3000]),
+        (("sway>echo", "hiss"), (("sway", 400),), [400, 2000]),
+        (("sway>echo", "hiss"), (("sway", 400), ("echo", 3000)), [400, 3000]),
+    ],
+)
+def test_what_changes_counts_from_its_change(
+    library: Library, words: tuple[str, ...], saved: Any, frames: list[int]
+) -> None:
+    modules = [(batch(library, name), 0, frame) for name, frame in saved]
+    targets = judged(library, *modules, words=words)["targets"]
+    assert [t["frame"] for t in targets] == frames
+    watched = (frames[1] - 2000) // 80 + (frames[1] > 2000)  # every other block
+    assert [t["watched"] for t in targets] == [5, watched]
 
 
 def test_clips_that_loop_are_judged_on_themselves_and_more_mildly(library: Library) -> None:
-    reference = library.reference("short", 0, 8, "none")
-    stream = library.stream("short", 0)
+    reference = library.reference("short", *REFERENCE)
+    stream, sway = library.stream("short", 0), library.stream("sway", 0)
     assert len(stream.held_out) == len(stream.learned_from) + 1 == 401
-    assert measures.allowed(stream, reference) == 1.5 * reference.slowness
-    sway = library.stream("sway", 0)
-    assert measures.allowed(sway, reference) == 1.25 * reference.slowness
-
-
-def test_an_output_that_never_moves_is_not_slow(library: Library) -> None:
-    dead = batch(library, "sway")
-    assert measures.slowest(dead, library.stream("blank", 0).held_out).slowness == math.inf
-    assert judged(library, (dead, 4, 400))["wrong"] == 1
+    assert allowed_slowness(stream, reference) == 1.5 * reference.slowness
+    assert allowed_slowness(sway, reference) == 1.25 * reference.slowness
 
 
 def test_a_probe_tells_what_is_in_the_features_and_no_more() -> None:
@@ -199,80 +203,74 @@ def test_a_run_ends_by_itself_or_with_its_frames(
     library: Library, ends: int, goes_on: bool, blocks: int, ended: str | None
 ) -> None:
     learner: Any = Chooser({5: batch(library, "sway")}, ends)
-    source = ArenaSource(("sway", "hiss"), library, 0)
-    history = follow(learner, source, 800, goes_on=goes_on)
-    assert (len(history.watched), history.frames, history.ended) == (blocks, 40 * blocks, ended)
-    assert [(s.stream, s.signal, s.frame, s.block) for s in history.saved] == [(0, "sway", 200, 5)]
+    course = run_learner(learner, ArenaSource(("sway", "hiss"), library, 0), 800, goes_on=goes_on)
+    assert (len(course.watched), course.frames, course.ended) == (blocks, 40 * blocks, ended)
+    assert [(s.stream, s.signal, s.frame, s.block) for s in course.saved] == [(0, "sway", 200, 5)]
 
 
 def test_trials_are_named_by_what_they_depend_on(tmp_path: Path) -> None:
     def names(*settings: str, frames: int | None = None, learner: str = "2.0") -> set[str]:
-        return {t.id for t in plan(["tiny"], [learner], [0, 1], settings, frames, tmp_path)}
+        return {t.id for t in plan_arena(["tiny"], [learner], [0, 1], settings, frames, tmp_path)}
 
     others = [
         names(),
         names("learner.nu=0.02"),
         names(frames=100),
         names(learner="1.0"),
-        {t.id for t in plan(["oscillatory"], ["2.0"], [0, 1], (), None, tmp_path)},
+        {t.id for t in plan_arena(["oscillatory"], ["2.0"], [0, 1], (), None, tmp_path)},
     ]
     assert len(set.union(*others)) == 10
     assert names() == names("learner.nu=0.01")
-    (first, _) = plan(["tiny"], ["2.0"], [0, 1], ["learner.components=6"], None, tmp_path)
-    assert {w.name for w in first.wanted()} == {"sway", "swing", "hiss"}
+    (first,) = plan_arena(["tiny"], ["2.0"], [0], ["learner.components=6"], None, tmp_path)
     assert first.reference == (6, "none")
-    vectors = plan(["oscillatory"], ["2.0", "progress"], [0], (), None, tmp_path)
+    vectors = plan_arena(["oscillatory"], ["2.0", "progress"], [0], (), None, tmp_path)
     assert [t.reference[1] for t in vectors] == ["quadratic", "quadratic"]
-    assert configured("1.0", ["learner.tau=20"], images=True).tau == 20
 
 
-def test_what_does_not_exist_is_refused_before_anything_runs(
-    cdmisfa: Cdmisfa, tmp_path: Path
-) -> None:
-    out = ("-o", tmp_path / "out")
-    for words, said in (
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
         (("tini",), "no set 'tini': did you mean tiny?"),
         (("tiny", "--learners", "3.0"), "no learner of the arena '3.0'"),
         (("tiny", "--learners", "2.0", "--set", "learner.no=1"), "unknown key learner.no"),
-        (("--page", tmp_path / "page.md"), "holds no trials: run cdmisfa arena"),
-    ):
-        done = cdmisfa("arena", *words, *out)
-        assert (done.code, done.out) == (2, "")
-        assert said in done.err
+        (("--page", "page.md"), "holds no trials: run cdmisfa arena"),
+    ],
+)
+def test_what_does_not_exist_is_refused_before_anything_runs(
+    cdmisfa: Cdmisfa, tmp_path: Path, words: tuple[str, ...], said: str
+) -> None:
+    done = cdmisfa("arena", *words, "-o", tmp_path / "out")
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
     assert not (tmp_path / "out").exists()
 
 
 def test_a_small_arena_from_trials_to_page(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
     words = ("arena", "tiny", "oscillatory", "--learners", "progress,2.0", "--seeds", "0:2")
-    out = ("-o", tmp_path / "out", "--streams", tmp_path / "streams")
-    page = tmp_path / "docs" / "arena.md"
+    out = ("-o", tmp_path / "arena", "--streams", tmp_path / "streams")
+    page = tmp_path / "arena.md"  # its pictures go to the folder of the results
     first = cdmisfa(*words, *out, "--page", page)
     assert first.code == 0, first.err
     assert "8 trials: 8 computed, 0 finished before, 0 failed" in first.err
     again = cdmisfa(*words, *out, "--json")
     assert "8 trials: 0 computed, 8 finished before, 0 failed" in again.err
     entries = again.json["entries"]
-    assert [e["point"] for e in entries] == [
-        {"set": name, "learner": learner}
-        for name in ("oscillatory", "tiny")
-        for learner in ("progress", "2.0")
-    ]
+    points = [(e["point"]["set"], e["point"]["learner"]) for e in entries]
+    assert points == [(s, by) for s in ("oscillatory", "tiny") for by in ("progress", "2.0")]
     for entry in entries[::2]:
         measured = entry["measures"]
-        assert [measured[k]["mean"] for k in ("learned", "wrong", "doubles")] == [1, 0, 0]
-        assert measured["ended"]["mean"] == 1
+        found = [measured[k]["mean"] for k in ("learned", "wrong", "doubles", "ended")]
+        assert found == [1, 0, 0, 1]
         assert measured["blocks"]["mean"] < 300
     waves, tiny = entries[1::2]
     measured = waves["measures"]
     assert measured["learned"] == {"mean": 1.0, "sd": 0.0, "n": 2, "low": 1.0, "high": 1.0}
-    assert (measured["wrong"]["mean"], measured["doubles"]["mean"]) == (0, 0)
-    assert measured["ended"]["mean"] == 1
+    assert [measured[k]["mean"] for k in ("wrong", "doubles", "ended")] == [0, 0, 1]
     assert measured["probe"]["mean"] > 0.99 > measured["probe_components"]["mean"]
     assert 1000 < measured["blocks_learned"]["mean"] == measured["blocks"]["mean"] < 2000
-    assert waves["curve"]["mean"][0] == 0.0
-    assert waves["curve"]["mean"][-1] == 1.0
+    assert (waves["curve"]["mean"][0], waves["curve"]["mean"][-1]) == (0.0, 1.0)
     assert tiny["measures"]["learned"]["mean"] == 0.0
-    assert json.loads((tmp_path / "out" / "results.json").read_text()) == {
+    assert json.loads((tmp_path / "arena" / "results.json").read_text()) == {
         k: v for k, v in again.json.items() if k != "folder"
     }
     text = page.read_text("utf-8")
@@ -282,57 +280,48 @@ def test_a_small_arena_from_trials_to_page(cdmisfa: Cdmisfa, tmp_path: Path) -> 
     assert "oscillatory: " not in failures
     assert "**progress**" not in failures
     assert "| progress | 2 of 2 | 1.00 | 0.00 | 0.00 | 1.00" in text
-    assert (page.with_suffix("") / "arena.png").stat().st_size > 0
+    assert (tmp_path / "arena" / "arena.png").stat().st_size > 0
     head, _, *rows = first.out.splitlines()
     assert head.split()[:3] == ["set", "learner", "seeds"]
-    assert [row.split()[:3] for row in rows] == [
-        [name, learner, "2"] for name in ("oscillatory", "tiny") for learner in ("progress", "2.0")
-    ]
+    assert [tuple(row.split()[:3]) for row in rows] == [(*point, "2") for point in points]
 
 
 def test_of_a_trial_that_several_versions_computed_that_of_now_counts(tmp_path: Path) -> None:
-    def row(number: str, wrong: int) -> str:
-        target = dict.fromkeys(("frame", "block", "watched")) | {"stream": "sway", "signal": "sway"}
+    target = dict.fromkeys(("frame", "block", "watched")) | {"stream": "sway", "signal": "sway"}
+    point = {"set": "tiny", "learner": "2.0", "learner.nu": "0.02"}
+    (now,) = plan_arena(["tiny"], ["2.0"], [0], ["learner.nu=0.02"], None, tmp_path)
+
+    def row(code: str, wrong: int) -> str:
         result = {"frames": 400, "blocks": 10, "ended": "", "modules": [], "targets": [target]}
         result |= {"wrong": wrong, "doubles": 0, "probes": []}
-        point = {"set": "tiny", "learner": "2.0", "learner.nu": "0.02"}
-        found = {"id": number, "status": "done", "point": point, "seed": 0, "code": ""}
+        found = {"id": code, "status": "done", "point": point, "seed": 0, "code": code}
         return json.dumps(found | {"result": result}) + "\n"
 
-    def wrong() -> tuple[float, int]:
-        document = results(tmp_path)
-        (entry,) = document["entries"]
-        return entry["measures"]["wrong"]["mean"], document["outdated"]
-
-    (now,) = plan(["tiny"], ["2.0"], [0], ["learner.nu=0.02"], None, tmp_path)
-    rows = tmp_path / "rows.jsonl"
-    rows.write_text(row("old", 1) + row("newer", 2))
-    assert wrong() == (2, 1)
-    rows.write_text(row("old", 1) + row(now.id, 3) + row("newer", 2))
-    assert wrong() == (3, 0)
+    for rows, wrong, outdated in (
+        ([row("old", 1), row("newer", 2)], 2, 1),
+        ([row("old", 1), row(now.code, 3), row("newer", 2)], 3, 0),
+    ):
+        (tmp_path / "rows.jsonl").write_text("".join(rows))
+        document = arena_results(tmp_path)
+        assert document["entries"][0]["measures"]["wrong"]["mean"] == wrong
+        assert document["outdated"] == outdated
 
 
 def test_a_trial_that_breaks_is_a_failure_and_the_others_go_on(
     cdmisfa: Cdmisfa, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from cdmisfa.arena import arena
-
     def broken(trial: Any) -> dict[str, Any]:
         if trial.seed == 1:
             raise UsageError("it broke")
-        return {**judged_nothing, "frames": 400}
+        target = dict.fromkeys(("frame", "block", "watched")) | {"stream": "sway", "signal": "sway"}
+        row = {"frames": 400, "blocks": 10, "ended": "", "modules": [], "targets": [target]}
+        return row | {"wrong": 0, "doubles": 0, "probes": []}
 
-    judged_nothing = {
-        "blocks": 10, "ended": "", "modules": [], "wrong": 0, "doubles": 0, "probes": [],
-        "targets": [{"stream": "sway", "signal": "sway", "frame": None, "block": None,
-                     "watched": None}],
-    }  # fmt: skip
-    monkeypatch.setattr(arena, "run_trial", broken)
-    words = ("arena", "tiny", "--learners", "2.0", "--seeds", "0:3", "-o", tmp_path)
-    done = cdmisfa(*words)
+    monkeypatch.setattr(arena, "run_arena_trial", broken)
+    done = cdmisfa("arena", "tiny", "--learners", "2.0", "--seeds", "0:3", "-o", tmp_path)
     assert done.code == 1
     assert "failed: set=tiny learner=2.0 seed 1: it broke" in done.err
-    (entry,) = results(tmp_path)["entries"]
+    (entry,) = arena_results(tmp_path)["entries"]
     assert (entry["seeds"], entry["failed"]) == ([0, 1, 2], ["it broke"])
     assert entry["measures"]["learned"]["n"] == 2
     assert "1 failed" in done.out

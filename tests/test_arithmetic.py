@@ -10,7 +10,7 @@ import pytest
 from conftest import Cdmisfa
 
 from cdmisfa.core.errors import NotReproducedError
-from cdmisfa.experiments.recompute.check import check_run, learner_after
+from cdmisfa.experiments.session import Session
 from cdmisfa.kernels import ARITHMETIC
 from replay.runs.compare import computed_otherwise
 from replay.runs.log import read_header
@@ -60,20 +60,20 @@ def test_check_compares_up_to_rounding_and_says_why(cdmisfa: Cdmisfa, former: Pa
     log.write_bytes(
         log.read_bytes().replace(b'"nu": 0.05', b'"nu": 0.04').replace(b'"nu": 0.01', b'"nu": 0.02')
     )
-    differs = check_run(former, _source(former))
+    differs = Session.check(former, _source(former))
     assert differs.difference is not None
     assert str(differs).endswith(why)
 
 
 def test_a_state_is_exact_at_keyframes_alone(former: Path) -> None:
-    assert learner_after(former, 0, _source(former))[0].iteration == 0
+    assert Session.at(former, 0, _source(former)).learner.iteration == 0
     if _number(former) == 1:
-        assert learner_after(former, 6)[0].iteration == 6
+        assert Session.at(former, 6).learner.iteration == 6
     with pytest.raises(
         NotReproducedError,
         match=r"was learned with arithmetic .* only states at its keyframes are exact",
     ):
-        learner_after(former, 5, _source(former))
+        Session.at(former, 5, _source(former))
 
 
 def test_a_run_of_a_former_arithmetic_is_not_gone_on_with(

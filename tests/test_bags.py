@@ -222,6 +222,6 @@ def test_a_packed_bag_is_the_same_and_unpacks_to_no_more_than_the_limit(
         np.testing.assert_array_equal(images.image(row), whole.image(row))
     images.close()
     whole.close()
-    monkeypatch.setattr("replay.camera_logs.formats.bag.MAX_CHUNK", 28_000)
+    monkeypatch.setattr("replay.camera_logs.bag.MAX_CHUNK", 28_000)
     with pytest.raises(LogDamagedError, match="unpacks to more than 28000 bytes"):
         open_images(packed, TOPICS[0])

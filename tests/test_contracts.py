@@ -19,8 +19,7 @@ from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import SIGNALS, values
-from cdmisfa.features.feature import Feature
-from cdmisfa.features.incsfa import IncSFA
+from cdmisfa.features.incsfa import Feature, IncSFA
 from cdmisfa.testing import CameraContract, FeatureContract, FormContract, LearnerContract
 from recorder.cameras.readers import Camera
 from recorder.cameras.words import CAMERAS

@@ -19,7 +19,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
-from cdmisfa.features.feature import Feature
+from cdmisfa.features.incsfa import Feature
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
 

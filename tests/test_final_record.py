@@ -12,7 +12,7 @@ import pytest
 from conftest import Cdmisfa
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.log.logfile import LogFile
 from recorder.mcap.reader import LogReader
 from recorder.world.oscillatory import OscillatorySource

@@ -15,7 +15,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import EXPANSIONS, Expansion, expand, quadratic
 from cdmisfa.features.incsfa import IncSFA
-from cdmisfa.features.projection import project
+from cdmisfa.features.outputs import project
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import lib
 

@@ -23,10 +23,10 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.experiments.convert import convert
 from cdmisfa.testing.sources import SourceContract
+from recorder.config import Split
 from recorder.images.decoding import MessageKind
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted
 from recorder.images.options import Fit
-from recorder.log.split import Split
 from recorder.recording import RecordingStoppedError, recorded
 from replay.camera_logs.options import Align
 from replay.camera_logs.source import ForeignSource

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from kernel_agent import is_constant, recognised
 from reference.agent import BAND, CONSTANT_VARIANCE
 
-from cdmisfa.agents.gate import NOVEL
-from cdmisfa.features.slowness import instantaneous_slowness
+from cdmisfa.agents.agent import NOVEL
+from cdmisfa.kernels import instantaneous_slowness
 
 RNG = np.random.default_rng(3)
 Y = np.ascontiguousarray(RNG.standard_normal((3, 40, 2)))

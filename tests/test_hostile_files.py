@@ -23,7 +23,7 @@ from recorder.config import RecordConfig
 from recorder.log.logfile import LogFile
 from recorder.log.resume import frames_held
 from recorder.recording import record_scene
-from replay.camera_logs.formats import picture_folder
+from replay.camera_logs import pictures
 from replay.camera_logs.opening import open_images
 from replay.integrity.info import describe
 from replay.runs.folders import REQUEST, RUN_METADATA, read_run_json, runs_in
@@ -69,7 +69,7 @@ def test_a_picture_that_became_something_else_is_not_waited_for(tmp_path: Path) 
 def test_a_huge_picture_is_refused_unread(tmp_path: Path) -> None:
     write_pictures(tmp_path / "pictures", 3)
     with (tmp_path / "pictures" / "2.png").open("r+b") as file:
-        file.truncate(picture_folder.MAX_BYTES + 1)
+        file.truncate(pictures.MAX_PICTURE + 1)
     with pytest.raises(CdmisfaError, match=r"2\.png: \d+ bytes.*limit"):
         open_images(tmp_path / "pictures", None)
 

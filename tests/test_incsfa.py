@@ -12,8 +12,8 @@ from cdmisfa.core.blocks import PIXEL, freeze
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.expansion import quadratic
-from cdmisfa.features.incsfa import IncSFA, State, new_state
-from cdmisfa.features.projection import project
+from cdmisfa.features.incsfa import IncSFA, IncSFAState, new_state
+from cdmisfa.features.outputs import project
 from cdmisfa.features.sfa import batch_sfa, slowness
 from recorder.world.oscillatory import OscillatorySource, one_period
 
@@ -61,7 +61,7 @@ def learn(kernel, config, state, frames, gap=False):
     return kernels.incsfa_update(abstraction, frames, gap, kernel)
 
 
-def assert_states_close(a: State, b: State, rtol: float) -> None:
+def assert_states_close(a: IncSFAState, b: IncSFAState, rtol: float) -> None:
     for name in ("mean", "v", "d", "w", "z_prev", "phi"):
         x, y = getattr(a, name), getattr(b, name)
         np.testing.assert_allclose(x, y, rtol=0, atol=rtol * np.abs(x).max(), err_msg=name)

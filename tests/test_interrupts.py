@@ -16,7 +16,7 @@ from conftest import Cdmisfa, Outcome
 
 from cdmisfa.cli.app import run
 from cdmisfa.cli.interrupts import SIGNALS, interruptible, stoppable
-from replay.playing.pace import Played, paced
+from replay.playing.feed import Feed, Playback, Played, paced
 
 
 def wait() -> None:
@@ -117,8 +117,8 @@ LIVE = ("record", "gym:Pendulum-v1", "--frames", 3)
     ("words", "last"),
     [
         (LEARN, "replay.view.build.build_view"),
-        (RECORD, "recorder.log.viewlog.ViewParts.write"),
-        (LIVE, "recorder.log.viewlog.ViewParts.finish"),
+        (RECORD, "recorder.log.viewlog.ViewLog.write"),
+        (LIVE, "recorder.log.viewlog.ViewLog.finish"),
     ],
     ids=["learn", "record", "live"],
 )
@@ -143,7 +143,7 @@ def test_an_interrupt_says_what_is_missing_of_a_run(
     assert cdmisfa("verify", out).code == 0
 
     words = (*LEARN, "-o", out, "--force", "--no-rerun")
-    done = _signalled(cdmisfa, words, "replay.runs.modules.save_modules", 2, monkeypatch)
+    done = _signalled(cdmisfa, words, "cdmisfa.experiments.run_folder.save_modules", 2, monkeypatch)
     assert done.code == 130
     said = f"cdmisfa: interrupted: {out} is not finished: go on with --resume"
     assert done.err.splitlines()[-1] == said
@@ -170,7 +170,8 @@ def _signalled(
 def test_what_was_played_to_its_end_was_not_stopped() -> None:
     for last, stopped in ((2, False), (1, True)):
         played, signals = Played(), list[int]()
-        items = ((i, Message(i)) for i in range(3))
-        for i, _ in paced(items, 1.0, played, stop=lambda signals=signals: bool(signals)):
+        feed = Feed(0, 2, lambda: map(Message, range(3)))
+        how = Playback(stop=lambda signals=signals: bool(signals))
+        for i, _ in paced(feed, how, played):
             signals += [i] if i == last else []
         assert played.stopped is stopped

@@ -14,8 +14,7 @@ from kernel_agent import KernelAgent
 from reference import agent as reference
 
 from cdmisfa import kernels
-from cdmisfa.agents.agent import MEMORY, OUTCOME, Agent
-from cdmisfa.agents.gate import CONSTANT, NOVEL, Frozen
+from cdmisfa.agents.agent import CONSTANT, MEMORY, NOVEL, Agent, Frozen
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig
@@ -45,17 +44,6 @@ def assert_like(found: Agent, expected: Agent) -> None:
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12, err_msg=name)
     for name in MEMORY.names or ():
         np.testing.assert_allclose(found.memory[name], expected.memory[name], 1e-9, 1e-12, name)
-
-
-@pytest.mark.parametrize(("kind", "dtype"), [("memory", MEMORY), ("outcome", OUTCOME)])
-def test_records_are_those_of_the_kernels(kind: str, dtype: np.dtype[Any]) -> None:
-    fields = dict(kernels.ffi.typeof(kind).fields)
-    assert kernels.ffi.sizeof(kind) == dtype.itemsize
-    assert tuple(fields) == dtype.names
-    for name, field in fields.items():
-        places = dtype.fields or {}
-        assert field.offset == places[name][1], name
-        assert kernels.ffi.sizeof(field.type) == places[name][0].itemsize, name
 
 
 @st.composite

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cdmisfa import kernels
 from cdmisfa.core.errors import UsageError
-from cdmisfa.features.recursive import RecursiveSFA, State
+from cdmisfa.features.recursive import RecursiveSFA, RecursiveState
 from cdmisfa.kernels import _plain
 from tests.reference import recursive as reference
 
@@ -41,8 +41,8 @@ def streams(draw: st.DrawFn) -> tuple[RecursiveSFA, list[NDArray[Any]], list[boo
     return RecursiveSFA(inputs, components, outputs, draw(st.integers(1, 400))), blocks, gaps
 
 
-def copied(state: State) -> State:
-    return State(*(array.copy() for array in state))
+def copied(state: RecursiveState) -> RecursiveState:
+    return RecursiveState(*(array.copy() for array in state))
 
 
 def apart(values: NDArray[np.float64]) -> bool:
@@ -108,13 +108,13 @@ def test_the_last_bit_of_large_values_is_no_direction() -> None:
     assert sfa.state.counts.tolist() == [0, 50, 49]
 
 
-def guarded(state: State) -> tuple[State, list[NDArray[Any]]]:
+def guarded(state: RecursiveState) -> tuple[RecursiveState, list[NDArray[Any]]]:
     """A state that lies between guards, and all of the memory it lies in."""
     memory = [np.full(array.size + 2 * GUARD, 7, array.dtype) for array in state]
     inside = [m[GUARD:-GUARD].reshape(a.shape) for m, a in zip(memory, state, strict=True)]
     for own, array in zip(inside, state, strict=True):
         own[...] = array
-    return State(*inside), memory
+    return RecursiveState(*inside), memory
 
 
 @given(
@@ -152,7 +152,7 @@ def test_whatever_frames_hold_nothing_else_is_written(
 
 def learned(module: Any, sfa: RecursiveSFA, blocks: list[NDArray[Any]], gaps: list[bool]) -> Any:
     """All that a kernel module makes of a stream."""
-    sfa.state, _ = guarded(State(*(np.zeros_like(array) for array in sfa.state)))
+    sfa.state, _ = guarded(RecursiveState(*(np.zeros_like(array) for array in sfa.state)))
     vars(sfa).pop("_record", None)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "lib", module.lib)

@@ -15,7 +15,7 @@ import pytest
 from reference.agent import BAND
 
 from cdmisfa import kernels
-from cdmisfa.agents.gate import CONSTANT
+from cdmisfa.agents.agent import CONSTANT
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.config import LearnerConfig, build, load_preset

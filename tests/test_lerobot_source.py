@@ -14,7 +14,7 @@ from conftest import Cdmisfa
 from test_matrix import png
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from replay.camera_logs.formats.lerobot import PAUSE
+from replay.camera_logs.lerobot import PAUSE
 from replay.camera_logs.source import ForeignSource
 
 pytest.importorskip("av")

@@ -27,7 +27,7 @@ from test_view_world import SCENE, without_models
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 from replay.view.bindings import viewer_client, viewer_program

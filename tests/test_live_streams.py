@@ -515,13 +515,14 @@ def test_a_client_that_leaves_a_played_recording_is_no_line_of_its_own(
         "from pathlib import Path\n"
         "from websockets.sync.client import connect\n"
         "from replay.playing.as_robot import play_as_robot\n"
+        "from replay.playing.feed import Playback\n"
         "left = []\n"
         "def leave(line):\n"
         "    client = connect(line.split()[2].strip(','), subprotocols=['foxglove.sdk.v1'])\n"
         "    client.recv(), client.recv(), client.socket.close(), left.append(1)\n"
         "def watch(line): threading.Thread(target=leave, args=[line]).start()\n"
-        "stop = lambda: bool(left)\n"
-        "play_as_robot([Path(sys.argv[1])], port=0, say=watch, stop=stop)\n"
+        "how = Playback(stop=lambda: bool(left))\n"
+        "play_as_robot([Path(sys.argv[1])], how, port=0, say=watch)\n"
     )
     assert cdmisfa("record", "oscillatory", "-o", tmp_path / "rec", "--frames", "20").code == 0
     done = subprocess.run(

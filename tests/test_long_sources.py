@@ -20,7 +20,8 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.runs import RunResult, run
+from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.session import run
 from recorder.mcap.reader import LogReader
 from replay.camera_logs.opening import identity_of
 from replay.camera_logs.source import ForeignSource

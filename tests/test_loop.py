@@ -14,10 +14,9 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.loop import ENDINGS, Digest, learn
-from cdmisfa.experiments.resume import Keyframes
-from cdmisfa.paper.demo import Shown
-from cdmisfa.testing.sinks import CONFIG, SinkContract
+from cdmisfa.experiments.loop import ENDINGS, Digest, Keyframes, learn
+from cdmisfa.studies.demo import ProgressSink
+from cdmisfa.testing.learners import CONFIG, SinkContract
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.writer import RunWriter
 
@@ -90,9 +89,9 @@ class TestReporter(SinkContract):
         return Reporter(Bar(), None)
 
 
-class TestShown(SinkContract):
+class TestProgressSink(SinkContract):
     def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
-        return Shown(Bar(), 20)
+        return ProgressSink(Bar(), 20)
 
 
 def learner_for(source: OscillatorySource) -> CuriousLearner:

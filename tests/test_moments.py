@@ -20,8 +20,7 @@ from cdmisfa.cli import run
 from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import ACTIONS
-from cdmisfa.experiments.recompute.check import check_run, learner_after
-from cdmisfa.experiments.recompute.forks import fork_run
+from cdmisfa.experiments.session import Session
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
 from replay.runs.compare import first_difference
@@ -124,11 +123,11 @@ def test_any_moment_is_that_of_the_straight_run(
 @pytest.mark.parametrize("algorithm", OF)
 def test_a_run_is_what_it_says(place: Path, algorithm: str) -> None:
     for name in ("live", "loop-resumed"):
-        checked = check_run(place / f"{algorithm}-{name}")
+        checked = Session.check(place / f"{algorithm}-{name}")
         assert (checked.start, checked.stop, checked.difference) == (0, ENDS, None)
-    part = check_run(place / f"{algorithm}-live", start=47, stop=71)
+    part = Session.check(place / f"{algorithm}-live", start=47, stop=71)
     assert (part.start, part.stop, part.difference) == (40, 71, None)
-    recorded = check_run(place / f"{algorithm}-live", [str(place / "log")], stop=30)
+    recorded = Session.check(place / f"{algorithm}-live", [str(place / "log")], stop=30)
     assert recorded.difference is None
 
 
@@ -170,11 +169,11 @@ def test_a_run_that_lies_is_found_out(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
     cdmisfa("learn", "oscillatory", *words("2.0"), *LEARN, "-o", run, "--max-iterations", 30)
     lying(run, b'"seed": 3', b'"seed": 4')
     assert read_header(run).manifest["seed"] == 4
-    checked = check_run(run)
+    checked = Session.check(run)
     assert checked.difference is not None
     assert checked.difference.iteration <= 1
     with pytest.raises(NotReproducedError, match="learned again, iteration"):
-        learner_after(run, 20)
+        Session.at(run, 20)
 
 
 def a_bit(state: LearnerState) -> LearnerState:
@@ -226,14 +225,14 @@ def test_there_is_no_moment_after_the_end(place: Path, k: int) -> None:
     with pytest.raises(UsageError, match="holds 130 iterations"):
         Run(place / "2.0-live").at(k)
     with pytest.raises(UsageError, match="holds 130 iterations"):
-        check_run(place / "2.0-live", start=k)
+        Session.check(place / "2.0-live", start=k)
     with pytest.raises(UsageError, match="holds 130 iterations"):
-        check_run(place / "2.0-live", stop=k)
+        Session.check(place / "2.0-live", stop=k)
 
 
 def test_no_part_ends_before_it_begins(place: Path) -> None:
     with pytest.raises(UsageError, match="from 20 to 10 there is nothing to check"):
-        check_run(place / "2.0-live", start=20, stop=10)
+        Session.check(place / "2.0-live", start=20, stop=10)
 
 
 def test_without_its_source_a_run_has_its_keyframes(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
@@ -299,7 +298,8 @@ def test_a_fork_goes_on_as_told(place: Path, tmp_path: Path, cdmisfa: Cdmisfa) -
 def test_a_fork_that_changes_nothing_is_its_parent(place: Path, tmp_path: Path) -> None:
     for algorithm in OF:
         parent, fork = place / f"{algorithm}-live", tmp_path / algorithm
-        fork_run(parent, 33, fork, seed=3, rerun=False)
+        with Session.fork(parent, 33, fork, seed=3) as session:
+            session.learn(rerun=False)
         assert first_difference(parent, fork) is None
 
 
@@ -312,7 +312,7 @@ def test_a_fork_at_the_beginning_is_one_too(place: Path, tmp_path: Path, cdmisfa
     resumed = cdmisfa("learn", "--resume", "-o", fork, "--max-iterations", 60, "--no-rerun")
     assert resumed.code == 0, resumed.err
     assert first_difference(fork, straight) is None
-    assert check_run(fork).difference is None
+    assert Session.check(fork).difference is None
     compared = cdmisfa("compare", parent, fork, "--save", tmp_path / "both.rrd")
     assert (compared.code, "learner.nu 0.05 against 0.02; seed 3 against 9" in compared.out) == (
         4,
@@ -327,7 +327,7 @@ def test_a_fork_of_a_recording_is_resumed_with_another_seed(
     begun = ("fork", place / "2.0-loop", "--at", 31, "--seed", 9, *told, "-o", fork)
     assert cdmisfa(*begun, "--max-iterations", 60).code == 0
     resumed = cdmisfa("learn", "--resume", "-o", fork, "--max-iterations", 70, "--no-rerun")
-    assert (resumed.code, check_run(fork).difference) == (0, None)
+    assert (resumed.code, Session.check(fork).difference) == (0, None)
 
 
 def test_forks_of_forks_are_resumed_and_checked(
@@ -344,8 +344,8 @@ def test_forks_of_forks_are_resumed_and_checked(
         resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")
         assert resumed.code == 0, resumed.err
         assert first_difference(two, straight) is None
-        assert check_run(two).difference is None
-        assert check_run(two, start=40, stop=100).difference is None
+        assert Session.check(two).difference is None
+        assert Session.check(two, start=40, stop=100).difference is None
         keyframe = read_keyframe(two, 52)
         assert keyframe is not None
         assert keyframe.iteration == 52
@@ -378,7 +378,8 @@ def test_a_fork_that_was_cut_before_it_began_is_refused(
     place: Path, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
     fork = tmp_path / "fork"
-    fork_run(place / "2.0-live", 40, fork, settings=["learner.nu=0.02"], rerun=False)
+    with Session.fork(place / "2.0-live", 40, fork, settings=["learner.nu=0.02"]) as session:
+        session.learn(rerun=False)
     log = (fork / "run.mcap").read_bytes()
     (fork / "run.mcap").unlink()
     (fork / "run.mcap.partial").write_bytes(log[: len(log) // 5])
@@ -398,14 +399,15 @@ def test_an_option_that_is_short_for_a_key_is_kept(tmp_path: Path, cdmisfa: Cdmi
     run, told = tmp_path / "run", ("--algorithm", "progress", "--set", "learner.explore=0.3")
     done = cdmisfa("learn", "oscillatory", *told, *LEARN, "-o", run, "--max-iterations", 12)
     assert done.code == 0, done.err
-    assert check_run(run).difference is None
+    assert Session.check(run).difference is None
 
 
 def test_compare_says_what_differs_and_shows_both(
     place: Path, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
     parent, fork = place / "2.0-live", tmp_path / "fork"
-    fork_run(parent, 20, fork, settings=["learner.epsilon_decay=0.5"], seed=8, rerun=False)
+    with Session.fork(parent, 20, fork, settings=["learner.epsilon_decay=0.5"], seed=8) as session:
+        session.learn(rerun=False)
     found = cdmisfa("compare", parent, fork)
     assert found.code == 4
     told = "fork was told otherwise: learner.epsilon_decay 0.999 against 0.5; seed 3 against 8"

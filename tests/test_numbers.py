@@ -25,7 +25,7 @@ from cdmisfa.testing.sources import SourceContract
 from recorder.images.decoding import MessageKind, message_decoder
 from recorder.images.fields import Field, numbers_of
 from recorder.log.messages import descriptor_set
-from replay.camera_logs.formats.table import MAX_ROWS
+from replay.camera_logs.csv_table import MAX_ROWS
 from replay.camera_logs.source import ForeignSource
 from replay.recordings.source import RecordedSource
 

@@ -29,26 +29,36 @@ from recorder.cameras.foxglove import FoxgloveCamera
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.playing.as_robot import play_as_robot
-from replay.playing.feed import Told, Topic, opened_feed
-from replay.playing.pace import Played, paced, rounds
+from replay.playing.feed import (
+    DueMessage,
+    Feed,
+    Playback,
+    Played,
+    Topic,
+    opened_messages,
+    paced,
+)
 from replay.recordings.source import RecordedSource
 
 FRAMES, FPS = 21, 8.0  # of so few a second that a busy machine is not late by a tick
 TOPIC = Topic("/x", "json", "", "", b"")
 
 
-def told(*seconds: float) -> list[Told]:
-    return [Told(10**18 + round(s * 1e9), TOPIC, str(s).encode()) for s in seconds]
+def told(*seconds: float) -> list[DueMessage]:
+    return [DueMessage(10**18 + round(s * 1e9), TOPIC, str(s).encode()) for s in seconds]
+
+
+def feed_of(items: list[DueMessage]) -> Feed[DueMessage]:
+    return Feed(items[0].time_ns, items[-1].time_ns, lambda: items)
 
 
 def played_at(
-    items: list[Told], rate: float = 1.0, over: float = 0.0
+    items: list[DueMessage], rate: float = 1.0, over: float = 0.0
 ) -> tuple[list[float], Played]:
     clock, played = Clock(over), Played()
-    since = [(item.time_ns - items[0].time_ns, item) for item in items]
-    pace = paced(since, rate, played, now=clock.monotonic, sleep=clock.sleep)
+    pace = paced(feed_of(items), Playback(rate), played, now=clock.monotonic, sleep=clock.sleep)
     times = [clock.now - 100 for _ in pace]
     return times, played
 
@@ -70,13 +80,13 @@ def test_waits_that_are_too_long_add_up_to_no_drift() -> None:
 
 
 def test_a_loop_begins_again_a_step_after_the_end() -> None:
-    items = told(0, 0.5, 0.5, 1)
-    start, stop = items[0].time_ns, items[-1].time_ns
-    endless = rounds(lambda: items, start, stop, loop=True)
+    feed = feed_of(told(0, 0.5, 0.5, 1))
+    at_once = Playback(1e12, loop=True)
+    endless = paced(feed, at_once, Played())
     since = [next(endless)[0] / 1e9 for _ in range(9)]
     assert since == [0, 0.5, 0.5, 1, 1.5, 2, 2, 2.5, 3]
-    assert [s for s, _ in rounds(lambda: items, start, stop, loop=False)][-1] == 10**9
-    assert list(rounds(list, 0, 0, loop=True)) == []
+    assert [s for s, _ in paced(feed, Playback(1e12), Played())][-1] == 10**9
+    assert list(paced(Feed(0, 0, list), at_once, Played())) == []
 
 
 def views() -> dict[str, np.ndarray[Any, Any]]:
@@ -91,7 +101,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextlib.contextmanager
-def robot(*paths: Path, **options: Any) -> Iterator[tuple[int, list[Played]]]:
+def robot(path: Path, rate: float, wait: int = 1) -> Iterator[tuple[int, list[Played]]]:
     """A recording played as a robot in a thread: its port, and what was played in the end."""
     pytest.importorskip("foxglove")
     with socket.socket() as probe:
@@ -99,13 +109,10 @@ def robot(*paths: Path, **options: Any) -> Iterator[tuple[int, list[Played]]]:
         port = probe.getsockname()[1]
     said, over = threading.Event(), threading.Event()
     done: list[Played] = []
+    how = Playback(rate, stop=over.is_set)
 
     def play() -> None:
-        done.append(
-            play_as_robot(
-                paths, port=port, say=lambda line: said.set(), stop=over.is_set, **options
-            )
-        )
+        done.append(play_as_robot([path], how, port=port, say=lambda line: said.set(), wait=wait))
 
     thread = threading.Thread(target=play)
     thread.start()
@@ -139,8 +146,8 @@ def test_what_is_played_is_recorded_as_it_was(
 
 def test_messages_keep_their_bytes_and_times(recording: Path) -> None:
     websockets = pytest.importorskip("websockets.sync.client")
-    with opened_feed([recording]) as feed:
-        expected = list(feed.messages())
+    with opened_messages([recording], Playback()) as feed:
+        expected = list(feed.items())
     assert [told.topic.name for told in expected[:2]] == ["/view/left", "/view/right"]
     with robot(recording, rate=1) as (port, _):
         camera = FoxgloveCamera(f"foxglove://127.0.0.1:{port}/view/right", "right", timeout=20)
@@ -157,8 +164,8 @@ def test_messages_keep_their_bytes_and_times(recording: Path) -> None:
 
 
 def test_what_every_file_tells_is_played_once(oscillatory_recording: Path) -> None:
-    with opened_feed([oscillatory_recording]) as feed:
-        names = [told.topic.name for told in feed.messages()]
+    with opened_messages([oscillatory_recording], Playback()) as feed:
+        names = [told.topic.name for told in feed.items()]
     assert names.count("/truth") == names.count("/view/x1") == 2000
     assert len(feed.topics) == 4
 
@@ -174,11 +181,11 @@ def test_logs_that_are_no_mcap_files_are_played_frame_by_frame(tmp_path: Path) -
     folders = [tmp_path / "left", tmp_path / "right"]
     with (
         pytest.raises(UsageError, match="left tells no rate: set one with --fps"),
-        opened_feed(folders),
+        opened_messages(folders, Playback()),
     ):
         pass
-    with opened_feed(folders, 25) as feed:
-        first, again = list(feed.messages()), list(feed.messages())
+    with opened_messages(folders, Playback(fps=25)) as feed:
+        first, again = list(feed.items()), list(feed.items())
     assert first == again
     assert [topic.name for topic in feed.topics] == ["/view/left", "/view/right"]
     assert [told.topic.schema_name for told in first] == ["foxglove.RawImage"] * 10
@@ -188,21 +195,21 @@ def test_logs_that_are_no_mcap_files_are_played_frame_by_frame(tmp_path: Path) -
 
 def test_others_logs_are_played_as_they_are(tmp_path: Path) -> None:
     write_cameras(tmp_path / "log.mcap", {"/a": (3, 40), "/b": (2, 60)})
-    with opened_feed([tmp_path / "log.mcap"]) as feed:
-        order = [(told.topic.name, told.time_ns // 10**6 - 1000) for told in feed.messages()]
+    with opened_messages([tmp_path / "log.mcap"], Playback()) as feed:
+        order = [(told.topic.name, told.time_ns // 10**6 - 1000) for told in feed.items()]
     assert order == [("/a", 0), ("/b", 0), ("/a", 40), ("/b", 60), ("/a", 80)]
 
 
 def test_topics_are_played_as_they_are_and_fields_as_numbers(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_cameras(path, {"/a": (3, 40), "/b": (2, 60)})
-    with opened_feed([path]) as feed:
-        every = [told for told in feed.messages() if told.topic.name == "/b"]
-    with opened_feed([path], cameras=CameraOptions(topics=("/b*",))) as feed:
-        assert list(feed.messages()) == every
+    with opened_messages([path], Playback()) as feed:
+        every = [told for told in feed.items() if told.topic.name == "/b"]
+    with opened_messages([path], Playback(cameras=CameraOptions(topics=("/b*",)))) as feed:
+        assert list(feed.items()) == every
     with (
         pytest.raises(UsageError, match="no topic /c; it has: /a, /b"),
-        opened_feed([path], cameras=CameraOptions(topics=("/b", "/c"))),
+        opened_messages([path], Playback(cameras=CameraOptions(topics=("/b", "/c")))),
     ):
         pass
     (tmp_path / "t.csv").write_text("stamp,a\n0,1\n1,2\n2,n/a\n3,4\n")
@@ -212,8 +219,8 @@ def test_topics_are_played_as_they_are_and_fields_as_numbers(tmp_path: Path) -> 
     def about(source: Logged) -> None:
         said.extend(source.warnings)
 
-    with opened_feed([tmp_path / "t.csv"], None, cameras, about) as feed:
-        told = list(feed.messages())
+    with opened_messages([tmp_path / "t.csv"], Playback(cameras=cameras, about=about)) as feed:
+        told = list(feed.items())
     assert [(each.topic.schema_name, each.time_ns // 10**9) for each in told] == [
         ("cdmisfa.Vector", second) for second in (0, 1, 2)
     ]
@@ -238,7 +245,7 @@ def test_the_viewer_is_handed_every_frame(
 
     threads: list[threading.Thread] = []
     begin = time.monotonic()
-    played = play_in_rerun([recording], rate=8, announce=watch)
+    played = play_in_rerun([recording], Playback(rate=8), announce=watch)
     assert time.monotonic() - begin > (FRAMES - 1) / FPS / 8
     threads[0].join()
     assert (played.count, played.seconds) == (FRAMES, (FRAMES - 1) / FPS)

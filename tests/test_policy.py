@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kernel_agent import STAY, KernelAgent
 from reference.agent import value_sum
 
-from cdmisfa.agents.gate import NOVEL
+from cdmisfa.agents.agent import NOVEL
 from cdmisfa.core.config import LearnerConfig
 
 ACTIONS = 2

@@ -15,19 +15,25 @@ from moving_pictures import LENGTH, MovingPictures
 
 from cdmisfa import Run
 from cdmisfa.agents.learners import LEARNERS, open_learner
-from cdmisfa.agents.progress import held
+from cdmisfa.agents.progress import candidate as held
 from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, relative_progress
 from cdmisfa.agents.progress.candidate import WHITE_NOISE, Candidate, learning_error
 from cdmisfa.agents.progress.config import ATTENTIONS, ProgressConfig
-from cdmisfa.agents.progress.judging import flatness, gain, hopeless, promising
+from cdmisfa.agents.progress.judging import (
+    flatness,
+    gain,
+    hopeless,
+    new_streams,
+    outcome,
+    promising,
+)
 from cdmisfa.agents.progress.learner import ProgressLearner
-from cdmisfa.agents.progress.streams import new_streams, outcome
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import STATES, canonical_bytes
 from cdmisfa.experiments.loop import Digest, learn
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure
 from recorder.recording import record
 from replay.recordings.source import RecordedSource

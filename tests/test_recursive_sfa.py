@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
-from cdmisfa.features.feature import Feature
+from cdmisfa.features.incsfa import Feature
 from cdmisfa.features.recursive import PIECE, RecursiveSFA
 from cdmisfa.features.sfa import batch_sfa
 from cdmisfa.kernels import ffi, lib

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -12,44 +13,50 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Cdmisfa
 from waiting import wait_for
 
-from cdmisfa.cli.app import run as cdmisfa
-from cdmisfa.core.errors import NotReproducedError, UsageError
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.paper import (
-    costs,
-    difficulty,
-    icub,
-    nonstationary,
-    oscillatory,
-    reproduce,
-    stability,
-)
-from cdmisfa.paper.reproduce import Request, Trial
+from cdmisfa.studies.paper import comparison, difficulty, icub, nonstationary
+from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Trial
+from cdmisfa.studies.paper.oscillatory import Oscillatory, paper_config
+from cdmisfa.studies.paper.reproduce import markdown_table, reproduce
 from recorder.world.oscillatory import OscillatorySource
+from replay.recordings.source import RecordedSource
 
 SAMPLE = Path(__file__).parent.parent / "sample_logs" / "icub"
 
 
-def request(folder: Path, trials: int | None = None, **keys: Any) -> Request:
-    return Request(trials, True, None, folder, **keys)
+def stability(folder: Path, trials: int = 1, jobs: int = 1) -> tuple[dict[str, Any], list[int]]:
+    """The results of an experiment, and how many trials were finished at each report."""
+    done: list[int] = []
+    request = Request(trials, True, None, folder, jobs)
+    return reproduce("stability", request, progress=lambda n, _: done.append(n)), done
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No figures, which take a second each, where they are not looked at."""
-    for module in (oscillatory, stability):
-        monkeypatch.setattr(module, "draw", lambda trials, folder: [])
+    for experiment in (Oscillatory, comparison.Stability):
+        monkeypatch.setattr(experiment, "draw", lambda self, trials, folder: [])
+
+
+def judged(experiment: Experiment, trials: list[Trial]) -> Findings:
+    found = Findings()
+    experiment.evaluate(trials, found)
+    return found
 
 
 @pytest.mark.parametrize("name", ["oscillatory", "five", "stability", "costs", "difficulty"])
 def test_quick_runs_reproduce_the_claim_and_write_everything(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
-    assert cdmisfa(["reproduce", name, "--quick", "-o", str(tmp_path), "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)["experiments"][0]
+    done = cdmisfa("reproduce", name, "--quick", "-o", tmp_path, "--json")
+    assert done.code == 0, done.err
+    (document,) = done.json["experiments"]
     folder = tmp_path / name
     assert document["reproduced"] is True
     assert json.loads((folder / "results.json").read_text()) == document
@@ -63,147 +70,140 @@ def test_quick_runs_reproduce_the_claim_and_write_everything(
 
 
 def test_a_change_is_followed_early_and_not_late(tmp_path: Path) -> None:
-    document = reproduce.reproduce("nonstationary", request(tmp_path, trials=1))
-    early, late = document["claims"][:2]
-    assert early["holds"], early
-    assert late["holds"], late
+    document = reproduce("nonstationary", Request(1, True, None, tmp_path))
+    assert [claim["holds"] for claim in document["claims"][:2]] == [True, True]
 
 
-def test_finished_trials_are_kept_and_the_figures_are_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_finished_trials_are_kept_and_the_page_shows_table_and_figures(
+    tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
-    first = reproduce.reproduce("stability", request(tmp_path, trials=1))
-    pictures = {f: (tmp_path / f).read_bytes() for f in first["figures"]}
-    monkeypatch.setattr(reproduce, "run_one", pytest.fail)
-    counts: list[tuple[int, int]] = []
-    again = reproduce.reproduce(
-        "stability", request(tmp_path, trials=1), progress=lambda d, n: counts.append((d, n))
-    )
-    assert again == first
-    assert counts == [(2, 2)]
-    assert {f: (tmp_path / f).read_bytes() for f in again["figures"]} == pictures
+    folder = tmp_path / "r" / "stability"
+    first, done = stability(folder)
+    assert done == [0, 1, 2]
+    pictures = {f: (folder / f).read_bytes() for f in first["figures"]}
+    assert stability(folder) == (first, [2])
+    assert {f: (folder / f).read_bytes() for f in first["figures"]} == pictures
+    page = tmp_path / "docs" / "reproduction.md"
+    assert cdmisfa("reproduce", "-o", tmp_path / "r", "--page", page).code == 0
+    text = page.read_text()
+    assert (folder / "table.md").read_text() in text
+    assert "](reproduction/stability.png)" in text
+    assert (page.parent / "reproduction" / "stability.png").exists()
+    assert cdmisfa("reproduce", "-o", tmp_path / "none", "--page", page).code == 2
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_more_trials_run_only_what_is_missing(tmp_path: Path) -> None:
-    reproduce.reproduce("stability", request(tmp_path, trials=1))
-    counts: list[int] = []
-    reproduce.reproduce(
-        "stability", request(tmp_path, trials=2), progress=lambda done, _: counts.append(done)
-    )
-    assert counts == [2, 3, 4]
+def test_more_trials_run_only_what_is_missing_in_as_many_processes(tmp_path: Path) -> None:
+    one, _ = stability(tmp_path / "1")
+    assert stability(tmp_path / "2", jobs=2)[0] == one
+    assert stability(tmp_path / "1", trials=2)[1] == [2, 3, 4]
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_results_of_more_or_other_trials_are_replaced_only_with_force(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
-    command = ["reproduce", "stability", "-o", str(tmp_path)]
+    command = ("reproduce", "stability", "-o", tmp_path)
     folder = tmp_path / "stability"
-    assert cdmisfa([*command, "--trials", "2"]) in (0, 4)
+    assert cdmisfa(*command, "--trials", 2).code in (0, 4)
     before = {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
-    capsys.readouterr()
-    assert cdmisfa([*command, "--trials", "1"]) == 2
-    message = capsys.readouterr().err.splitlines()[-1]
-    assert f"{folder} holds results of 4 trials, 2 of them not among the 2" in message
-    assert "--force" in message
+    refused = cdmisfa(*command, "--trials", 1)
+    assert refused.code == 2
+    assert f"{folder} holds results of 4 trials, 2 of them not among the 2" in refused.err
+    assert "--force" in refused.err
     assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
-    assert cdmisfa([*command, "--trials", "1", "--force"]) in (0, 4)
+    assert cdmisfa(*command, "--trials", 1, "--force").code in (0, 4)
     assert json.loads((folder / "results.json").read_text())["trials"] == 2
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_killed_reproduction_goes_on_where_it_stopped(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "cdmisfa", "reproduce", "oscillatory"]
-    command += ["-o", str(tmp_path), "--trials", "400"]
-    trials = tmp_path / "oscillatory" / "trials"
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    folder = tmp_path / "oscillatory"
+    rows = folder / "rows.jsonl"
+
+    def kept() -> int:
+        return rows.read_bytes().count(b"\n") if rows.exists() else 0
+
+    process = subprocess.Popen(
+        [*command, "-o", str(tmp_path), "--trials", "400"], stderr=subprocess.DEVNULL
+    )
     try:
-        wait_for(lambda: len(list(trials.glob("*.npz"))) >= 3, 120, process)
+        wait_for(lambda: kept() >= 3, 120, process)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
-    kept = {p.name: p.stat().st_mtime_ns for p in trials.glob("*.npz")}
-    assert len(kept) >= 3
-    folder = tmp_path / "oscillatory"
-    document = reproduce.reproduce("oscillatory", request(folder, trials=len(kept) + 1))
-    assert document["trials"] == len(kept) + 1
-    assert {n: (trials / n).stat().st_mtime_ns for n in kept} == kept
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_two_processes_give_the_rows_of_one(tmp_path: Path) -> None:
-    one = reproduce.reproduce("stability", request(tmp_path / "1", trials=1))
-    two = reproduce.reproduce("stability", request(tmp_path / "2", trials=1, jobs=2))
-    assert two == one
+    finished, done = kept(), list[int]()
+    request = Request(finished + 1, True, None, folder)
+    document = reproduce("oscillatory", request, progress=lambda n, _: done.append(n))
+    assert document["trials"] == finished + 1
+    assert done == [finished, finished + 1]
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_claim_that_fails_exits_4(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cdmisfa: Cdmisfa
 ) -> None:
-    monkeypatch.setattr(stability, "run", _unstable)
-    assert cdmisfa(["reproduce", "stability", "--trials", "1", "-o", str(tmp_path)]) == 4
-    assert "stability did not come out: 2.0 keeps its policy" in capsys.readouterr().err
+    def unstable(self: Experiment, settings: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        row = {"exploration_ends": 1, "changes": 1, "before": "011", "after": "101"}
+        return row, {"R": np.zeros((9, 3)), "policy": np.eye(9, 3, dtype=np.int8)}
+
+    monkeypatch.setattr(comparison.Stability, "run", unstable)
+    done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path)
+    assert done.code == 4
+    said = "stability did not come out: 2.0 keeps its policy after epsilon = 0 (0 of 1 trials)"
+    assert done.err.endswith(f"{said}\n")
 
 
-def _unstable(settings: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    row = {"exploration_ends": 1, "changes": 1, "before": "011", "after": "101"}
-    return row, {"R": np.zeros((9, 3)), "policy": np.eye(9, 3, dtype=np.int8)}
+@pytest.mark.usefixtures("undrawn")
+def test_a_trial_that_breaks_or_is_damaged_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cdmisfa: Cdmisfa
+) -> None:
+    stability(tmp_path)
+    rows = tmp_path / "rows.jsonl"
+    rows.write_text(rows.read_text().replace('"arrays":"UEsDB', '"arrays":"UEsDA'))
+    with pytest.raises(UsageError, match=r"the row of trial \w+ is damaged"):
+        stability(tmp_path)
+
+    def broken(self: Experiment, settings: Any) -> Any:
+        raise UsageError("it broke")
+
+    monkeypatch.setattr(comparison.Stability, "run", broken)
+    done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path / "other")
+    assert done.code == 1
+    assert "'seed': 0}: it broke; the others are kept" in done.err
 
 
 @pytest.mark.parametrize("algorithm", ["1.0", "2.0"])
 def test_a_key_that_is_not_counted_for_an_algorithm_changes_nothing(algorithm: str) -> None:
-    def learned(**keys: Any) -> Any:
-        config = oscillatory.learner_config(algorithm=algorithm, warm_up=2, **keys)
+    def learned(*others: str) -> Any:
+        keys = {key: other[key] for key in others}
+        config = paper_config("oscillatory", algorithm=algorithm, warm_up=2, **keys)
         result = run_trial(config, seed=1, max_iterations=1200, max_modules=2)
         return [(m.iteration, m.phi.tolist()) for m in result.modules], result.iterations
 
-    uncounted = {*costs.OWN["1.0"], *costs.OWN["2.0"]} - set(costs.parameters(algorithm))
     other = {"delta": 1e-5, "gate_window": 5, "alpha": 0.5, "roc_centres": 3, "roc_radius": 1.0}
     other |= {"roc_memory": 10, "roc_error": 0.01}
     unchanged = learned()
     assert unchanged[0]
-    assert learned(**{key: other[key] for key in uncounted}) == unchanged
-    assert learned(**{key: other[key] for key in costs.OWN[algorithm]}) != unchanged
+    assert learned(*set(other) - set(comparison.used_keys(algorithm))) == unchanged
+    assert learned(*set(other) & set(comparison.used_keys(algorithm))) != unchanged
 
 
-def test_check_names_every_failed_claim() -> None:
-    claims = [
-        {"claim": "a", "holds": False, "detail": "1"},
-        {"claim": "b", "holds": True, "detail": ""},
-    ]
-    with pytest.raises(NotReproducedError, match=r"x did not come out: a \(1\)$"):
-        reproduce.check({"experiment": "x", "claims": claims})
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_damaged_trial_is_named(tmp_path: Path) -> None:
-    reproduce.reproduce("stability", request(tmp_path, trials=1))
-    damaged = next((tmp_path / "trials").glob("*.npz"))
-    damaged.write_bytes(damaged.read_bytes()[:100])
-    with pytest.raises(UsageError, match=damaged.name):
-        reproduce.reproduce("stability", request(tmp_path, trials=1))
-
-
-def test_an_unknown_experiment_is_a_usage_error(tmp_path: Path) -> None:
-    assert cdmisfa(["reproduce", "stabillity", "-o", str(tmp_path)]) == 2
-    assert cdmisfa(["reproduce", "-o", str(tmp_path)]) == 2
-
-
-def test_the_page_holds_every_table_and_figure_and_nothing_is_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["stabillity"], "no experiment 'stabillity': did you mean stability?"),
+        ([], "say which experiment"),
+        (["difficulty", "--recording", str(SAMPLE)], "takes more than 4000: record them"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(
+    words: list[str], said: str, tmp_path: Path, cdmisfa: Cdmisfa
 ) -> None:
-    reproduce.reproduce("stability", request(tmp_path / "r" / "stability", trials=1))
-    monkeypatch.setattr(reproduce, "run_one", pytest.fail)
-    page = tmp_path / "docs" / "reproduction.md"
-    page.parent.mkdir()
-    assert cdmisfa(["reproduce", "-o", str(tmp_path / "r"), "--page", str(page)]) == 0
-    text = page.read_text()
-    assert (tmp_path / "r" / "stability" / "table.md").read_text() in text
-    assert "](reproduction/stability.png)" in text
-    assert (page.parent / "reproduction" / "stability.png").exists()
-    assert cdmisfa(["reproduce", "-o", str(tmp_path / "none"), "--page", str(page)]) == 2
+    done = cdmisfa("reproduce", *words, "-o", tmp_path)
+    assert done.code == 2
+    assert said in done.err
 
 
 def trials_with(midpoints: dict[float, float], rewarded: int = 100) -> list[Trial]:
@@ -224,31 +224,36 @@ def trials_with(midpoints: dict[float, float], rewarded: int = 100) -> list[Tria
     ]
 
 
-def test_the_order_of_table_1_is_judged() -> None:
-    falling = nonstationary.evaluate(trials_with({0.008: 2.0, 0.0009: 0.85, 0.0: 0.7}))
-    assert all(claim.holds for claim in falling.claims)
-    rising = nonstationary.evaluate(trials_with({0.008: 0.7, 0.0009: 0.85, 0.0: 0.9}))
-    assert [claim.holds for claim in rising.claims] == [False, True, False]
+@pytest.mark.parametrize(
+    ("midpoints", "holds"),
+    [
+        ({0.008: 2.0, 0.0009: 0.85, 0.0: 0.7}, [True, True, True]),
+        ({0.008: 0.7, 0.0009: 0.85, 0.0: 0.9}, [False, True, False]),
+    ],
+)
+def test_the_order_of_table_1_is_judged(midpoints: dict[float, float], holds: list[bool]) -> None:
+    found = judged(nonstationary.NonStationary(), trials_with(midpoints))
+    assert [claim["holds"] for claim in found.claims] == holds
 
 
 def test_a_change_is_judged_only_after_enough_rewarded_blocks() -> None:
-    followed = nonstationary.evaluate(trials_with({0.008: 0.9, 0.0: 0.7})).claims[0]
-    assert followed.holds
-    assert followed.detail == "10 of 10 trials with epsilon^c = 0.86"  # not 1, where 0 came before
-    unfollowed = nonstationary.evaluate(trials_with({0.008: 0.95, 0.0: 0.88})).claims[0]
-    assert not unfollowed.holds
-    notes = nonstationary.evaluate(trials_with({0.008: 0.95, 0.0: 0.7})).notes
+    experiment = nonstationary.NonStationary()
+    followed = judged(experiment, trials_with({0.008: 0.9, 0.0: 0.7})).claims[0]
+    assert followed["holds"]  # not 1, where 0 came before
+    assert followed["detail"] == "10 of 10 trials with epsilon^c = 0.86"
+    assert not judged(experiment, trials_with({0.008: 0.95, 0.0: 0.88})).claims[0]["holds"]
+    notes = judged(experiment, trials_with({0.008: 0.95, 0.0: 0.7})).notes
     assert "Above 0.86 they are fewer than 30" in notes[1]
     assert notes[1].endswith("Epsilon^d lies there at sigma = 0.008.")
 
 
 def test_the_other_start_of_epsilon_has_a_column_of_its_own() -> None:
-    trials = trials_with({0.008: 0.9, 0.0: 0.7})
-    early = [t for t in trials if t.settings["start"] == nonstationary.STARTS[0]]
-    late = trials_with({0.008: 0.8, 0.0: 0.5})
-    late = [t for t in late if t.settings["start"] == nonstationary.STARTS[1]]
-    lines = [line.as_json() for line in nonstationary.evaluate([*early, *late]).lines]
-    head, _, first, share, *_ = reproduce.markdown_table(lines).splitlines()
+    starts = zip(
+        nonstationary.STARTS, ({0.008: 0.9, 0.0: 0.7}, {0.008: 0.8, 0.0: 0.5}), strict=True
+    )
+    trials = [t for s, midpoints in starts for t in trials_with(midpoints) if _start(t) == s]
+    lines = judged(nonstationary.NonStationary(), trials).lines
+    head, _, first, share, *_ = markdown_table(lines).splitlines()
     assert head.endswith("| n | epsilon from 1.0 |")
     ours, other = (float(first.split(" | ")[k].split()[0]) for k in (2, 6))
     assert ours == pytest.approx(0.915, abs=0.02)
@@ -256,15 +261,17 @@ def test_the_other_start_of_epsilon_has_a_column_of_its_own() -> None:
     assert share.endswith("| - |")
 
 
-def test_the_icub_trial_watches_learns_and_keeps_what_its_figures_show() -> None:
-    source = OscillatorySource()
-    from cdmisfa.core.config import LearnerConfig
+def _start(trial: Trial) -> float:
+    return float(trial.settings["start"])
 
-    row, arrays = icub.watch(source, LearnerConfig(), seed=0, iterations=1600)
+
+def test_the_icub_trial_keeps_what_its_figures_show() -> None:
+    source = OscillatorySource()
+    row, arrays = icub.learn_curves(source, LearnerConfig(), seed=0, iterations=1600)
     assert row["streams"] == [0, 1, 2]
     assert row["policies"] == ["011", "101", "110"]
     assert arrays["eta_dot"].shape == (1600, 1)
-    assert arrays["y1"].shape == (icub.SHOWN,)
+    assert arrays["y1"].shape == (icub.DRAWN,)
 
 
 def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
@@ -287,33 +294,26 @@ def test_icub_figures_and_claims_from_rows(tmp_path: Path) -> None:
     one = good | {"streams": [0], "policies": ["011"]}
     trials = [Trial(new, good, arrays), Trial(new, good, arrays)]
     trials += [Trial(old, one, arrays), Trial(loose, good, arrays)]
-    assert all(claim.holds for claim in icub.evaluate(trials).claims)
-    claims = icub.evaluate([*trials, Trial(new, wrong, arrays)]).claims
-    assert [claim.holds for claim in claims] == [True, False, True]
-    claims = icub.evaluate([*trials, Trial(old, good, arrays)]).claims
-    assert [claim.holds for claim in claims] == [True, True, False]
-    of_the_old = [line for line in icub.evaluate(trials).lines if line.quantity.startswith("1.0")]
-    learned = [line.ours.mean for line in of_the_old if "correlation" not in line.quantity]
+
+    def holds(*more: Trial) -> list[bool]:
+        return [c["holds"] for c in judged(icub.Icub(), [*trials, *more]).claims]
+
+    assert holds() == [True, True, True]
+    assert holds(Trial(new, wrong, arrays)) == [True, False, True]
+    assert holds(Trial(old, good, arrays)) == [True, True, False]
+    lines = [x for x in judged(icub.Icub(), trials).lines if x["quantity"].startswith("1.0")]
+    learned = [line["mean"] for line in lines if "correlation" not in line["quantity"]]
     assert learned == [1.0, 0.0, 2.0, 1.0]  # modules and both in order, of each threshold
-    assert len(icub.draw(trials, tmp_path)) == 4
+    assert len(icub.Icub().draw(trials, tmp_path)) == 4
 
 
 @pytest.mark.skipif(not SAMPLE.exists(), reason="the sample recording is not there")
 def test_the_sample_recording_s_noise_is_not_learnable() -> None:
     eta = []
-    for view in range(3):
-        frames = difficulty._view(str(SAMPLE), view, 2000)
-        weights = difficulty.slowest(frames[:1000], 7)
-        eta.append(difficulty.slowness((frames[1000:] / 255.0 @ weights)[:, None])[0])
-    limit = difficulty.LEARNABLE * difficulty.WHITE_NOISE
-    assert eta[0] < limit
-    assert eta[2] < limit
-    assert eta[1] > limit
-
-
-def test_difficulty_says_how_many_frames_of_a_view_it_takes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["reproduce", "difficulty", "--quick", "--recording", str(SAMPLE)]
-    assert cdmisfa([*words, "-o", str(tmp_path)]) == 2
-    assert "takes more than 4000: record them" in capsys.readouterr().err
+    with contextlib.closing(RecordedSource(SAMPLE)) as source:
+        for view in range(3):
+            source.seek(0)
+            frames = source.take(view, 2000).frames.reshape(2000, -1)
+            weights = difficulty.slowest_weights(frames[:1000], 7)
+            eta.append(difficulty.slowness((frames[1000:] / 255.0 @ weights)[:, None])[0])
+    assert [e < difficulty.LEARNABLE for e in eta] == [True, False, True]

@@ -21,8 +21,8 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import ENDINGS
-from cdmisfa.experiments.runs import RunResult
-from cdmisfa.experiments.runs import run as run_it
+from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.session import run as run_it
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import load_modules
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import configure, open_source
 
 ROOT = Path(__file__).parents[1]

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from reference.agent import converged
 
-from cdmisfa.features import slowness as module
-from cdmisfa.features.slowness import slowness, window_rate
+from cdmisfa import kernels
+from cdmisfa.features.outputs import slowness_by_moments, window_rate
 
 signals = arrays(np.float64, st.integers(3, 60), elements=st.floats(-1e3, 1e3))
 
 
 def instantaneous_slowness(y: np.ndarray) -> float:
-    return float(module.instantaneous_slowness(y[:, None])[0])
+    return float(kernels.instantaneous_slowness(y[:, None])[0])
 
 
 def eta(y: np.ndarray) -> float:
@@ -77,8 +77,8 @@ def test_eta_inst_tends_to_eta_when_tau_is_large() -> None:
 
 
 def test_a_signal_without_variance_has_no_slowness() -> None:
-    assert slowness(1.0, 0.0) == math.inf
-    assert slowness(1.0, -1e-20) == math.inf
+    assert slowness_by_moments(1.0, 0.0) == math.inf
+    assert slowness_by_moments(1.0, -1e-20) == math.inf
     assert instantaneous_slowness(np.full(10, 3.0)) == math.inf
 
 

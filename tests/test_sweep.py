@@ -40,7 +40,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.processes import EngineError, WorkerDied, run_all
 from cdmisfa.experiments import results as reading
 from cdmisfa.experiments import sweep as sweeping
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import open_source
 from cdmisfa.experiments.store import ROWS, read_rows
 from cdmisfa.experiments.sweep import REQUEST, UNKEPT, plan, sweep

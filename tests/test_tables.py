@@ -15,7 +15,7 @@ import pytest
 from conftest import Cdmisfa
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from replay.camera_logs.formats.csv_table import line_of
+from replay.camera_logs.csv_table import line_of
 from replay.camera_logs.source import ForeignSource
 
 ROWS = 12

@@ -12,7 +12,7 @@ from run_data import read_signals, rows_of
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments import runs
+from cdmisfa.experiments import session
 from recorder.world.oscillatory import OscillatorySource
 from replay.runs.modules import SlowFeatures, save_modules
 
@@ -21,7 +21,7 @@ from replay.runs.modules import SlowFeatures, save_modules
 def run(tmp_path_factory):
     """A run that saved a module of expanded frames, and went on."""
     out = tmp_path_factory.mktemp("run")
-    runs.run(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
+    session.run(OscillatorySource(), LearnerConfig(), out, max_iterations=600, rerun=False)
     return out
 
 

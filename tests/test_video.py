@@ -20,7 +20,7 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.testing.sources import SourceContract
 from recorder.images.pixels import shrink
-from replay.camera_logs.formats.video import VideoImages
+from replay.camera_logs.pictures import VideoImages
 from replay.camera_logs.source import ForeignSource
 
 av = pytest.importorskip("av")

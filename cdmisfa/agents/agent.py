@@ -1,8 +1,10 @@
-"""The curiosity-driven agent: what it remembers, and the rules it goes by."""
+"""The curiosity-driven agent: what it remembers, its rules, and its gate of frozen modules."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,52 +14,44 @@ from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
+from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import DENSE_STREAMS
 
-MEMORY = np.dtype(
-    [
-        ("iteration", "i8"),  # iterations so far
-        ("module", "i8"),  # abstraction being learned, from 1
-        ("stream", "i8"),  # stream to watch next
-        ("last_stream", "i8"),  # stream before the last action; -1 before the first
-        ("last_action", "i8"),
-        ("fed_stream", "i8"),  # stream of the last novel block; -1 none
-        ("fed_until", "i8"),  # frame after the last novel block
-        ("novel_blocks", "i8"),  # since the abstraction was created
-        ("rewards", "i8"),  # t of the running reward function
-        ("scale", "f8"),  # what the sums are divided by to give R; 0 before the first reward
-        ("roc_error", "f8"),  # CD-MISFA 1.0: running mean of the clustering error
-        ("xi", "f8"),  # mean weight change of the last novel block
-        ("share", "f8"),  # running share of novel blocks of the stream of the block before
-        ("epsilon", "f8"),
-        ("idle", "i8"),  # iterations with epsilon practically 0
-    ]
-)
 
-OUTCOME = np.dtype(
-    [
-        ("stream", "i8"),
-        ("module", "i8"),
-        ("novel", "?"),
-        ("known_by", "i8"),
-        ("saved", "?"),
-        ("share", "f8"),
-        ("novel_blocks", "i8"),
-        ("roc_error", "f8"),
-        ("roc_error_inst", "f8"),
-        ("xi", "f8"),
-        ("xi_dot", "f8"),
-        ("curiosity", "f8"),
-        ("expert", "f8"),
-        ("reward", "f8"),
-        ("epsilon", "f8"),
-        ("explored", "?"),
-        ("action", "i8"),
-        ("next_stream", "i8"),
-    ],
-    align=True,
-)
-"""Both as `kernels.h` has them."""
+def _record_type(kind: str) -> np.dtype[np.void]:
+    """The type of arrays of records, as C has them."""
+    types = {"int64_t": "i8", "double": "f8", "_Bool": "?"}
+    fields = dict(kernels.ffi.typeof(kind).fields)
+    layout: Any = {
+        "names": list(fields),
+        "formats": [types[field.type.cname] for field in fields.values()],
+        "offsets": [field.offset for field in fields.values()],
+        "itemsize": kernels.ffi.sizeof(kind),
+    }
+    made: np.dtype[np.void] = np.dtype(layout)
+    return made
+
+
+MEMORY = _record_type("memory")
+"""Numbers that the agent remembers.
+
+iteration: iterations so far. module: abstraction being learned, from 1. stream: to watch next.
+last_stream: before the last action, -1 before the first. last_action. fed_stream: of the last novel
+block, -1 for none. fed_until: frame after that. novel_blocks: since the abstraction was created.
+rewards: t of the running reward function. scale: what the sums are divided by to give R, 0 before
+the first reward. roc_error: CD-MISFA 1.0, running mean of the clustering error. xi: mean change of
+the weights in the last novel block. share: running share of novel blocks of the stream of the block
+before. epsilon. idle: iterations with epsilon practically 0.
+"""
+
+OUTCOME = _record_type("outcome")
+"""What an iteration came to: signals of `BlockSignals` by their names."""
+
+NOVEL: int = kernels.lib.NOVEL
+"""Verdict: no frozen module knows the block. Positive verdicts are the module's index."""
+
+CONSTANT: int = kernels.lib.CONSTANT
+"""Verdict: the block carries nothing to learn."""
 
 
 class Agent(NamedTuple):
@@ -90,36 +84,12 @@ class Agent(NamedTuple):
     counts: FloatArray
 
 
-class Rules(NamedTuple):
-    """The numbers of `LearnerConfig` that one iteration needs."""
-
-    sigma: float
-    beta: float
-    delta: float
-    gamma: float
-    epsilon_start: float
-    epsilon_decay: float
-    epsilon_knee: float
-    epsilon_tail_decay: float
-    slowness_window: float
-    eta_dot_window: float
-    gate_window: float
-    warm_up: float
-    min_variance: float
-    novel_share: float
-    tabular: bool
-    alpha: float
-    roc_radius: float
-    roc_memory: float
-    roc_error: float
-    patience: float
-
-
-def rules(config: LearnerConfig, n_streams: int) -> Rules:
-    """The rules of a configuration for n streams."""
-    special: Any = {"beta": config.reward_beta(n_streams), "tabular": config.algorithm == "1.0"}
-    values: Any = {n: float(getattr(config, n)) for n in Rules._fields if n not in special}
-    return Rules(**special, **values)
+def rules(config: LearnerConfig, n_streams: int) -> SimpleNamespace:
+    """The numbers of a configuration that an iteration with n streams needs, by their names."""
+    beta, tabular = config.reward_beta(n_streams), int(config.algorithm == "1.0")
+    names = {name for name, _ in kernels.ffi.typeof("rules").fields} - {"beta", "tabular"}
+    values = {name: float(getattr(config, name)) for name in names}
+    return SimpleNamespace(**values, beta=beta, tabular=tabular)
 
 
 def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent:
@@ -128,36 +98,26 @@ def new_agent(config: LearnerConfig, n_streams: int, first_stream: int) -> Agent
     Raises:
         UsageError: more streams than CD-MISFA 1.0's table of rewards is kept for.
     """
-    outputs = config.outputs
-    dense = n_streams if n_streams <= DENSE_STREAMS else 0
-    clusters = (n_streams, config.roc_centres) if config.algorithm == "1.0" else (0, 0)
-    if config.algorithm == "1.0" and not dense:
-        raise UsageError(
-            f"learner.algorithm 1.0 takes at most {DENSE_STREAMS} streams, not {n_streams}"
-        )
-    memory = np.zeros(1, MEMORY)
-    agent = Agent(
-        memory=memory,
-        eta=np.zeros(outputs),
-        eta_dot=np.zeros(outputs),
-        eta_inst=np.zeros(outputs),
-        gate_mean=np.zeros(outputs),
-        gate_variance=np.zeros(outputs),
-        derivative=np.zeros(outputs),
-        y_sum=np.zeros(outputs),
-        square_sum=np.zeros(outputs),
-        y_frames=np.zeros(1, np.int64),
-        recent_mean=np.zeros(outputs),
-        recent_square=np.zeros(outputs),
-        stay_sum=np.zeros(n_streams),
-        switch_sum=np.zeros(n_streams),
-        dense=np.zeros((dense, 2, dense)),
-        policy=np.zeros(n_streams, np.int64),
-        centres=np.zeros((*clusters, config.tau, outputs)),
-        counts=np.zeros(clusters),
-    )
-    memory["last_stream"] = -1
-    memory["stream"] = first_stream
+    tabular, dense = config.algorithm == "1.0", n_streams
+    if n_streams > DENSE_STREAMS:
+        dense = 0
+        if tabular:
+            raise UsageError(
+                f"learner.algorithm 1.0 takes at most {DENSE_STREAMS} streams, not {n_streams}"
+            )
+    clusters = (n_streams, config.roc_centres) if tabular else (0, 0)
+    others: dict[str, Any] = {
+        "memory": np.zeros(1, MEMORY),
+        "y_frames": np.zeros(1, np.int64),
+        "stay_sum": np.zeros(n_streams),
+        "switch_sum": np.zeros(n_streams),
+        "dense": np.zeros((dense, 2, dense)),
+        "policy": np.zeros(n_streams, np.int64),
+        "centres": np.zeros((*clusters, config.tau, config.outputs)),
+        "counts": np.zeros(clusters),
+    }
+    agent = Agent(**{n: others.get(n, np.zeros(config.outputs)) for n in Agent._fields})
+    agent.memory["last_stream"], agent.memory["stream"] = -1, first_stream
     begin_abstraction(agent, config.epsilon_start)
     return agent
 
@@ -178,7 +138,7 @@ def begin_abstraction(agent: Agent, epsilon_start: float) -> None:
     m["epsilon"] = epsilon_start
 
 
-def as_struct(agent: Agent, told: Rules, out: NDArray[np.void]) -> kernels.Struct:
+def as_struct(agent: Agent, told: SimpleNamespace, out: NDArray[np.void]) -> kernels.Struct:
     """An agent as the kernels take it: its arrays, its rules, and where its outcome goes.
 
     Args:
@@ -193,9 +153,49 @@ def as_struct(agent: Agent, told: Rules, out: NDArray[np.void]) -> kernels.Struc
         "tensor": len(agent.dense),
         "places": agent.counts.shape[1],
     }
-    rules = kernels.Struct("rules", told._asdict(), {})
+    rules = kernels.Struct("rules", vars(told), {})
     arrays = {"rules": rules.pointer, "out": kernels.records("outcome", out)}
     arrays["memory"] = kernels.records("memory", agent.memory)
     for name, array in zip(agent._fields[1:], agent[1:], strict=True):
         arrays[name] = kernels.pointer(name, array, array.shape, array.dtype)
     return kernels.Struct("agent", sizes, arrays)
+
+
+class Frozen(NamedTuple):
+    """All frozen modules in one stack, so that one pass over a block serves them all.
+
+    Attributes:
+        phi: (M J, I) weights.
+        offset: (M J,) phi times the mean.
+        band_mean: (M, J) centres of the bands of known slowness.
+        band_sd: (M, J) their standard deviations.
+        centres: (M, S, C, n, J) clusters; (M, 0, 0, n, J) but for CD-MISFA 1.0.
+        counts: (M, S, C).
+    """
+
+    phi: FloatArray
+    offset: FloatArray
+    band_mean: FloatArray
+    band_sd: FloatArray
+    centres: FloatArray
+    counts: FloatArray
+
+    @property
+    def struct(self) -> kernels.Struct:
+        """The stack as the kernels take it."""
+        arrays = {n: kernels.pointer(n, a, a.shape) for n, a in self._asdict().items()}
+        sizes = {"modules": len(self.band_mean), "inputs": self.phi.shape[1]}
+        return kernels.Struct("frozen", sizes, arrays)
+
+
+def frozen_modules(modules: Sequence[Module], agent: Agent, n_inputs: int) -> Frozen:
+    """The modules of an agent whose abstractions have I = `n_inputs`."""
+    count, outputs = len(modules), len(agent.eta)
+    return Frozen(
+        phi=np.array([m.phi for m in modules]).reshape(count * outputs, n_inputs),
+        offset=np.array([kernels.mean_output(m.phi, m.mean) for m in modules]).reshape(-1),
+        band_mean=np.array([m.band_mean for m in modules]).reshape(count, outputs),
+        band_sd=np.array([m.band_sd for m in modules]).reshape(count, outputs),
+        centres=np.array([m.centres for m in modules]).reshape(count, *agent.centres.shape),
+        counts=np.array([m.counts for m in modules]).reshape(count, *agent.counts.shape),
+    )

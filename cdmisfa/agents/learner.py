@@ -15,8 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-from cdmisfa.agents.agent import OUTCOME, as_struct, begin_abstraction, new_agent, rules
-from cdmisfa.agents.gate import NOVEL, stacked
+from cdmisfa.agents.agent import (
+    NOVEL,
+    OUTCOME,
+    as_struct,
+    begin_abstraction,
+    frozen_modules,
+    new_agent,
+    rules,
+)
 from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec, freeze
@@ -26,8 +33,7 @@ from cdmisfa.core.expansion import expand
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import NO_STATE, BlockSignals
-from cdmisfa.features.feature import Feature, MakeFeature
-from cdmisfa.features.incsfa import IncSFA
+from cdmisfa.features.incsfa import Feature, IncSFA, MakeFeature
 
 POLICY_KEY, WEIGHTS_KEY = 1, 2
 """Spawn keys of the learner's two random generators, beneath the run's seed."""
@@ -341,7 +347,7 @@ class CuriousLearner:
         self.abstraction = self._new_abstraction()
 
     def _freeze(self) -> None:
-        self.frozen = stacked(self.modules, self.agent, self._n_inputs)
+        self.frozen = frozen_modules(self.modules, self.agent, self._n_inputs)
         self._frozen = self.frozen.struct
 
     def _new_abstraction(self) -> Feature:

@@ -44,7 +44,7 @@ def live_source(
     """
     from cdmisfa.experiments.sources import open_cameras_now
     from recorder.live import RecordedWhileWatched
-    from recorder.log.folder import refuse_existing
+    from recorder.log.files import refuse_existing
 
     for folder in (out, record_to):
         if folder is not None:

@@ -1,14 +1,17 @@
-"""The loop that every run is: watch, learn, tell. And why it ends."""
+"""The loop of every run: take a block, learn, tell the sinks; and the sinks of every run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from cdmisfa.core.blocks import Block, FrameSource
 from cdmisfa.core.errors import LogExhaustedError
-from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
+
+if TYPE_CHECKING:
+    from replay.runs.writer import RunWriter
 
 INTERRUPTED: Final = "interrupted"
 """Why a run ended that was stopped before it came to an end of its own."""
@@ -22,6 +25,12 @@ ENDINGS: Mapping[str, str] = {
     INTERRUPTED: "it was interrupted",
 }
 """Why a run ended, in words."""
+
+EVERY = 100
+"""Iterations between two keyframes, where nothing else is said and the log has room for them."""
+
+SHARE = 5
+"""A keyframe waits until the log has grown by so many times the size of the one before."""
 
 
 def learn(
@@ -90,3 +99,61 @@ class Digest(SignalsHash, Sink):
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """See `Sink`."""
         self.add(signals)
+
+
+class Keyframes(Sink):
+    """Writes the learner's state into the log of its run, every so many iterations and at its end.
+
+    It comes after the log, which then holds every iteration before.
+
+    Args:
+        log: of the run.
+        source: what it learns from.
+        learner: what learns.
+        versions: of the packages that compute it.
+        every: iterations between two, 0 writes one at the end only; None for as often as
+            `EVERY` iterations, where they stay below a part in `SHARE` of the log before them.
+    """
+
+    def __init__(
+        self,
+        log: RunWriter,
+        source: FrameSource,
+        learner: Learner,
+        versions: Mapping[str, str],
+        every: int | None = None,
+    ) -> None:
+        self._log, self._source, self._learner = log, source, learner
+        self._versions = versions
+        self._every = EVERY if every is None else every
+        self._share = SHARE if every is None else 0
+        self._due = 0
+        self._t: int | None = None
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        self._t = self._source.t
+        if not self._every or learner.iteration % self._every:
+            return
+        self._log.flush()
+        before = self._log.size
+        if before < self._due:
+            return
+        keyframe = self._keyframe()
+        if not self._due:  # the first, of which nobody knows yet how small it is compressed
+            self._due = self._share * sum(a.nbytes for a in keyframe.state.arrays.values())
+            if before < self._due:
+                return
+        self._log.keyframe(keyframe)
+        self._due = self._log.size + self._share * (self._log.size - before)
+
+    def finish(self) -> None:
+        """See `Sink`."""
+        self._log.keyframe(self._keyframe())
+        self._log.sync()
+
+    def _keyframe(self) -> Keyframe:
+        learner, taken = self._learner, getattr(self._source, "taken", None)
+        # Cameras have moved on, where they ended or were stopped within the next block.
+        t = self._source.t if self._t is None else self._t
+        return Keyframe(learner.iteration, t, learner.state, self._versions, taken)

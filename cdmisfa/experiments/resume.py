@@ -1,199 +1,62 @@
-"""What a run is resumed from: the command that began it, and its log with its keyframes.
-
-A keyframe is a learner's state, which stands in the log after the iterations that led to it. So a
-run that was stopped anywhere is resumed from the newest keyframe that can be read.
-"""
+"""What a run continues from: the keyframes of its own log, or its parent's where it is a fork."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import json
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
-from cdmisfa.core.config import differences
-from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError, one_line
-from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink
-from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals, SignalsHash
-from cdmisfa.experiments.documents import versions
+from cdmisfa.agents.learners import LEARNERS, open_learner
+from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.config import build, differences, parse_settings, section_table
+from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
+from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
+from cdmisfa.core.signals import SCHEMA_VERSION
+from cdmisfa.experiments.command import COMMAND, log_to_resume
 from cdmisfa.experiments.sources import CLOCK
-from recorder.cameras.words import is_live
-from recorder.log.begun import Begun, found_path, is_path, relative_path
-from recorder.log.whole import partial_path
+from recorder.log.files import partial_path
 from recorder.world.scenes import SCENES
-from replay.camera_logs.options import CameraOptions
+from replay.runs.folders import RUN_FILE
+from replay.runs.keyframes import read_keyframe
+from replay.runs.log import RunHeader, read_columns, read_header
+from replay.runs.run import known_to_both, stated_source
 
 if TYPE_CHECKING:
-    from replay.runs.writer import RunWriter
-
-COMMAND = "command"
-"""Key of a manifest: the command that began the run, which may differ when it is resumed."""
+    from cdmisfa.experiments.recompute import Recomputation
 
 FORK = "fork"
-"""Key of a manifest: from which run and iteration a fork went on, and what it was told before."""
+"""Key of a manifest: from which run and iteration a fork continues, and its settings before."""
 
-CAMERAS = tuple(field.name for field in dataclasses.fields(CameraOptions))
-"""Options of a command that say how images of others become frames."""
-
-OPTIONS = (
-    "seed",
-    "preset",
-    "settings",
-    "algorithm",
-    "loop",
-    "salvage",
-    "follow",
-    *CAMERAS,
-    "max_iterations",
-    "max_modules",
-    "keyframes",
-)
-"""What of a command makes a run what it is, and where it ends, besides its source."""
-
-SET_ASIDE = "run.before.mcap.partial"
-"""The log of a run that is being resumed, until the new one has taken over what counts."""
-
-EVERY = 100
-"""Iterations between two keyframes, where nothing else is said and the log has room for them."""
-
-SHARE = 5
-"""A keyframe waits until the log has grown by so many times the size of the one before."""
+KEPT = ("algorithm", "expansion", "tau")
+"""Keys of a learner on which what it learned depends, whatever the shapes of its memory."""
 
 
-def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> dict[str, Any]:
-    """The command that begins a run, as JSON values; paths are kept relative to its folder.
-
-    Of the options of the command those in `OPTIONS` are kept.
-    """
-    kept = {name: options[name] for name in OPTIONS if name in options}
-    preset = kept.get("preset")
-    if preset is not None and preset.endswith(".toml"):
-        kept["preset"] = relative_path(preset, run)
-    names = [word for word in source if word in SCENES or is_live(word)]
-    return Begun(tuple(source), kept).as_json(run, names)
-
-
-def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """The command that began a run: its source and its options.
+def header_to_resume(run: Path) -> tuple[Path, RunHeader | None]:
+    """The log of a run that was stopped, and its header; None where it was killed before that.
 
     Raises:
-        UsageError: there is no run, it does not say, or its source is of a plugin that is gone.
-        LogDamagedError: its log cannot be read.
+        UsageError: there is no run, or it is of a later version of this software.
+        LogDamagedError: the log cannot be read.
     """
-    from replay.runs.log import read_header
-
     log = log_to_resume(run)
-    kept = read_header(log).manifest.get(COMMAND)
-    begun = Begun.from_json(kept, run)
-    if begun is None:
-        raise UsageError(f"{run} does not say what it learns from: name its source")
-    for word in map(str, dict(kept or {})["source"]):
-        if not (is_path(word) or word in SCENES or is_live(word)):
-            raise UsageError(
-                f"{run} learns from {word}, which {_packages_gone(log)} brought: install it again"
-            )
-    options = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in begun.options.items()
-        if name in OPTIONS
-    }
-    preset = options.get("preset")
-    if preset is not None and str(preset).endswith(".toml"):
-        options["preset"] = found_path(str(preset), run)
-    return begun.source, options
-
-
-def _packages_gone(log: Path) -> str:
-    """The packages of plugins that a run used and that are not installed any more."""
-    from replay.runs.keyframes import read_keyframe
-
-    keyframe = read_keyframe(log)
-    used = {} if keyframe is None else keyframe.versions
-    gone = [f"{name} {used[name]}" for name in sorted(used.keys() - versions().keys())]
-    return f"the plugin {' or '.join(gone)}" if gone else "a plugin"
-
-
-@dataclass(frozen=True, slots=True)
-class Fork:
-    """Where a run goes on from another one.
-
-    Attributes:
-        log: of the other run.
-        keyframe: where it goes on.
-        ancestry: what the manifest keeps of it: `parent`, `at`, `changed`, and as `before` what
-            the parent was told.
-    """
-
-    log: Path
-    keyframe: Keyframe
-    ancestry: Mapping[str, Any]
-
-
-class Keyframes(Sink):
-    """Writes where a run stands into its log, every so many iterations and at its end.
-
-    It comes after the log, which then holds every iteration before.
-
-    Args:
-        log: of the run.
-        source: what it learns from.
-        learner: what learns.
-        versions: of the packages that compute it.
-        every: iterations between two, 0 writes one at the end only; None for as often as
-            `EVERY` iterations, where they stay below a part in `SHARE` of the log before them.
-    """
-
-    def __init__(
-        self,
-        log: RunWriter,
-        source: FrameSource,
-        learner: Learner,
-        versions: Mapping[str, str],
-        every: int | None = None,
-    ) -> None:
-        self._log, self._source, self._learner = log, source, learner
-        self._versions = versions
-        self._every = EVERY if every is None else every
-        self._share = SHARE if every is None else 0
-        self._due = 0
-        self._t: int | None = None
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        self._t = self._source.t
-        if not self._every or learner.iteration % self._every:
-            return
-        self._log.flush()
-        before = self._log.size
-        if before < self._due:
-            return
-        keyframe = self._keyframe()
-        if not self._due:  # the first, of which nobody knows yet how small it is compressed
-            self._due = self._share * sum(a.nbytes for a in keyframe.state.arrays.values())
-            if before < self._due:
-                return
-        self._log.keyframe(keyframe)
-        self._due = self._log.size + self._share * (self._log.size - before)
-
-    def finish(self) -> None:
-        """See `Sink`."""
-        self._log.keyframe(self._keyframe())
-        self._log.sync()
-
-    def _keyframe(self) -> Keyframe:
-        learner, taken = self._learner, getattr(self._source, "taken", None)
-        # Cameras have moved on, where they ended or were stopped within the next block.
-        t = self._source.t if self._t is None else self._t
-        return Keyframe(learner.iteration, t, learner.state, self._versions, taken)
+    try:
+        return log, read_header(log)
+    except (LogDamagedError, UsageError):
+        if log != partial_path(run / RUN_FILE):
+            raise
+        return log, None
 
 
 def restore(learner: Learner, keyframe: Keyframe) -> None:
-    """Put a learner where a keyframe of this configuration stands; of another: LogDamagedError."""
+    """Put a learner into the state of a keyframe.
+
+    Raises:
+        LogDamagedError: the keyframe is of another configuration.
+    """
     try:
         learner.restore(keyframe.state)
     except (LookupError, TypeError, ValueError) as error:
@@ -201,37 +64,24 @@ def restore(learner: Learner, keyframe: Keyframe) -> None:
         raise LogDamagedError(f"{what} ({one_line(error)})") from error
 
 
-def take_over(
-    log: RunWriter, learner: Learner, source: Any, digest: SignalsHash, fork: Fork
-) -> None:
-    """Bring log, learner, source and digest to where a fork goes on."""
-    restore(learner, fork.keyframe)
-    for signals in log.take_over(fork.log, fork.keyframe.iteration):
-        digest.add(signals)
-    source.seek(fork.keyframe.t)
-    changed = [f"{key} is {new}, was {old}" for key, (old, new) in fork.ancestry["changed"].items()]
-    text = f"fork of {fork.ancestry['parent']} after {learner.iteration} iterations"
-    log.event(source.t, max(learner.iteration - 1, 0), "; ".join([text, *changed]))
-    log.keyframe(fork.keyframe, again=True)
-    log.sync()
-
-
-def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> Keyframe | None:
-    """Bring learner and source to where the newest keyframe of a log stands; writes nothing.
+def restore_from(
+    log: Path, learner: Learner, source: Any, forked_at: int | None
+) -> Keyframe | None:
+    """Put learner and source to the newest keyframe of a log that can be read.
 
     Args:
         log: of the run that is to be resumed.
         learner: of its configuration.
-        source: what it learns from; a LogDamagedError where it does not show that any more.
-        forked_at: the iteration from which on a fork is itself, None where it is none; a UsageError
-            where it was cut before.
+        source: what it learns from.
+        forked_at: the iteration where a fork leaves its parent's log; None where it is no fork.
 
     Returns:
-        The keyframe; None where the log has none, and all begins anew.
-    """
-    from replay.runs.keyframes import read_keyframe
-    from replay.runs.log import read_columns
+        The keyframe; None where the log has none, and the run begins anew.
 
+    Raises:
+        UsageError: a fork was cut before the iteration where it begins.
+        LogDamagedError: the source does not show any more what was learned from.
+    """
     keyframe = read_keyframe(log)
     if forked_at is not None and (keyframe is None or keyframe.iteration < forked_at):
         raise UsageError(f"{log.parent} was cut before its fork: fork again with --force")
@@ -251,114 +101,14 @@ def go_back(log: Path, learner: Learner, source: Any, forked_at: int | None) -> 
     return keyframe
 
 
-def bring_back(
-    log: RunWriter, keyframe: Keyframe | None, digest: SignalsHash, versions: Mapping[str, str]
+def refuse_difference(
+    log: Path, header: RunHeader, spec: SourceSpec, manifest: Mapping[str, Any]
 ) -> None:
-    """Write what a run that is resumed keeps: all until the keyframe that it went back to.
-
-    Args:
-        log: of the run; a LogWriteError where the disk does not take it.
-        keyframe: see `go_back`.
-        digest: of its signals, at their beginning.
-        versions: of the packages that go on computing it.
-    """
-    before = log.path.parent / SET_ASIDE
-    if not before.exists():
-        return
-    if keyframe is not None:
-        for signals in log.take_over(before, keyframe.iteration):
-            digest.add(signals)
-        last = max(keyframe.iteration - 1, 0)
-        log.event(keyframe.t, last, f"resumed at iteration {keyframe.iteration}")
-        changed = [
-            f"{name} is {now}, was {keyframe.versions.get(name)}"
-            for name, now in versions.items()
-            if keyframe.versions.get(name) != now
-        ]
-        if changed:
-            log.event(keyframe.t, last, "; ".join(changed), "WARNING")
-    log.sync()
-    try:
-        before.unlink()
-    except OSError as error:
-        raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
-
-
-def log_to_resume(run: Path) -> Path:
-    """The log of a run that was stopped, wherever it is; a UsageError where there is none."""
-    from replay.runs.folders import RUN_FILE
-
-    finished = run / RUN_FILE
-    for found in (run / SET_ASIDE, partial_path(finished), finished):
-        if found.is_file():
-            return found
-    raise UsageError(
-        f"{run} holds no {RUN_FILE}: there is no run to resume, begin one there with --force"
-    )
-
-
-def set_aside(
-    run: Path, spec: SourceSpec, manifest: Mapping[str, Any], going_back: Callable[[Path], None]
-) -> None:
-    """Move the log of a run that is to be resumed out of the way, after checking that it may.
-
-    A log that said nothing before the run was stopped stays. Where learner or source cannot go
-    back to where the log stands, all stays as it is.
+    """Refuse to resume with another configuration, seed or source, naming the first difference.
 
     Raises:
-        UsageError: there is no run, or it was made with another configuration or source.
+        UsageError: there is one.
     """
-    from replay.runs.folders import RUN_FILE
-
-    found = log_to_resume(run)
-    if found == partial_path(run / RUN_FILE) and not _has_header(found):
-        return
-    refuse_difference(run, found, spec, manifest)
-    going_back(found)
-    try:
-        os.replace(found, run / SET_ASIDE)
-    except OSError as error:
-        raise LogWriteError(f"{found} cannot be set aside: {error.strerror}") from error
-
-
-def ancestry_of(run: Path | None) -> Mapping[str, Any] | None:
-    """Of which run a run that is to be resumed is a fork; None where it is none."""
-    from replay.runs.log import read_header
-
-    try:
-        ancestry = None if run is None else read_header(log_to_resume(run)).manifest.get(FORK)
-    except (LogDamagedError, UsageError):  # told where the run is resumed
-        return None
-    known = isinstance(ancestry, Mapping) and isinstance(ancestry.get("at"), int)
-    return ancestry if known else None
-
-
-def stated_whole(run: Path | None) -> bool:
-    """Whether a run that is to be resumed states the SHA-256 of all of a file."""
-    from replay.runs.run import stated_source, states_whole
-
-    try:
-        return run is not None and states_whole(stated_source(log_to_resume(run)))
-    except (LogDamagedError, UsageError):  # told where the run is resumed
-        return False
-
-
-def _has_header(log: Path) -> bool:
-    from replay.runs.log import read_header
-
-    try:
-        read_header(log)
-    except (LogDamagedError, UsageError):
-        return False
-    return True
-
-
-def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[str, Any]) -> None:
-    """Refuse to resume with another configuration, seed or source, naming the first difference."""
-    from replay.runs.log import read_header
-    from replay.runs.run import known_to_both, stated_source
-
-    header = read_header(log)
     source_then, source_now = known_to_both(stated_source(log), _json(manifest["source"]))
     before = {
         "signals": header.schema,
@@ -384,8 +134,8 @@ def refuse_difference(run: Path, log: Path, spec: SourceSpec, manifest: Mapping[
         if key.removeprefix("config.record.") in CLOCK and _clock(header.spec) == _clock(spec):
             continue  # begun when a preset's clock was said of every source
         raise UsageError(
-            f"{run} was made with {key.removeprefix('config.')} = {old}, not {new}: resume with "
-            "what it was made with, or choose another folder"
+            f"{log.parent} was made with {key.removeprefix('config.')} = {old}, not {new}: resume "
+            "with what it was made with, or choose another folder"
         )
 
 
@@ -395,3 +145,93 @@ def _clock(spec: SourceSpec) -> list[Any]:
 
 def _json(value: Any) -> Any:
     return json.loads(json.dumps(value))
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigSpan:
+    """The configuration and seed of a run's learner from an iteration on; a fork begins one."""
+
+    start: int
+    config: Any
+    seed: int
+    reseeded: bool
+
+
+def config_history(log: Path, manifest: Mapping[str, Any]) -> tuple[ConfigSpan, ...]:
+    """The configurations of a run, in order.
+
+    Raises:
+        LogDamagedError: its manifest does not state them.
+    """
+    try:
+        table, seed, fork = manifest["config"]["learner"], manifest["seed"], manifest.get(FORK)
+        config = build(LEARNERS[table["algorithm"]].configuration, "learner", table)
+        if fork is None:
+            return (ConfigSpan(0, config, seed, reseeded=False),)
+        before = config_history(log, fork["before"])
+        reseeded = seed != before[-1].seed
+        return (*before, ConfigSpan(int(fork["at"]), config, seed, reseeded))
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
+        raise LogDamagedError(f"{log} does not say how its learner was configured") from error
+
+
+def reconfigured(learner: Learner, span: ConfigSpan, spec: SourceSpec) -> Learner:
+    """A learner in the state of another one, with another configuration.
+
+    Raises:
+        ValueError: what was learned does not fit the configuration.
+    """
+    new, state = open_learner(span.config, spec, span.seed), learner.state
+    policy_rng = new.state.policy_rng if span.reseeded else state.policy_rng
+    new.restore(LearnerState(state.arrays, state.modules, policy_rng))
+    return new
+
+
+def continued(
+    parent: Recomputation, settings: Sequence[str], seed: int | None
+) -> tuple[ConfigSpan, LearnerState]:
+    """The configuration of a fork, and its learner's state, where its parent was computed again.
+
+    Raises:
+        UsageError: a setting cannot change.
+    """
+    manifest = parent.header.manifest
+    before = int(manifest["seed"])
+    config = _config_of_fork(manifest["config"]["learner"], settings)
+    seed = before if seed is None else seed
+    span = ConfigSpan(parent.learner.iteration, config, seed, reseeded=seed != before)
+    try:
+        return span, reconfigured(parent.learner, span, parent.header.spec).state
+    except (ValueError, UsageError) as error:
+        raise UsageError(
+            f"{' '.join(settings)}: what was learned does not fit it ({error}): fork with keys "
+            "that keep its shape"
+        ) from error
+
+
+def changes(manifest: Mapping[str, Any], span: ConfigSpan) -> dict[str, list[Any]]:
+    """What a fork changes of the configuration of its parent: values before and now, by key."""
+    each = differences(manifest["config"]["learner"], section_table(span.config))
+    changed = {f"learner.{key}": [before, now] for key, before, now in each}
+    if span.reseeded:
+        changed["seed"] = [int(manifest["seed"]), span.seed]
+    return changed
+
+
+def _config_of_fork(before: Mapping[str, Any], settings: Sequence[str]) -> Any:
+    """The configuration of a fork's learner."""
+    words = parse_settings(settings)
+    other = next((section for section in words if section != "learner"), None)
+    if other is not None:
+        raise UsageError(f"{other}.* is the parent's and stays: a fork changes learner.* alone")
+    kind = LEARNERS[before["algorithm"]].configuration
+    config = build(kind, "learner", before, words.get("learner", {}))
+    for key, old, new in differences(
+        section_table(build(kind, "learner", before)), section_table(config)
+    ):
+        if key in KEPT:
+            raise UsageError(
+                f"learner.{key} is {old} and stays: what was learned depends on it, so {new} is "
+                "for a run of its own"
+            )
+    return config

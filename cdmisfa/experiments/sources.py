@@ -6,21 +6,20 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
+from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import versions
+from recorder.cameras.options import LiveOptions
+from recorder.cameras.words import PACKAGES, is_live, open_live
 from recorder.config import RecordConfig, SceneConfig
 from recorder.images.options import ImageOptions
-from recorder.world.scenes import SCENES, scene_of
+from recorder.world.scenes import SCENES, open_scene, scene_of
 from replay.camera_logs.options import CameraOptions
-
-if TYPE_CHECKING:
-    from recorder.cameras.options import LiveOptions
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -38,7 +37,7 @@ class Configuration:
 
     Attributes:
         learner: keys `learner.*`, of the class that the learner's entry in `LEARNERS` names.
-        scene: keys `scene.*`; its seed is never None.
+        scene: keys `scene.*`.
         record: keys `record.*`.
         streams: of what kind the streams are where they are no scene's: "cameras", "gym",
             "foreign"; "" of a scene.
@@ -52,57 +51,132 @@ class Configuration:
     streams: str = ""
     clock: tuple[float, int] | None = None
 
+    def seeded(self, seed: int) -> Configuration:
+        """The same with a seed of the scene, where it has none of its own."""
+        if self.scene.seed is not None:
+            return self
+        return replace(self, scene=replace(self.scene, seed=seed))
+
     def open_scene(self) -> SeekableSource:
         """The live scene."""
-        from recorder.world.scenes import open_scene
-
         return open_scene(self.scene.kind, self.scene, self.record)
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
-        scene = {"kind": self.streams} if self.streams else as_table(self.scene)
+        scene = {"kind": self.streams} if self.streams else section_table(self.scene)
         clock = {} if self.clock is None else dict(zip(CLOCK, self.clock, strict=True))
-        return {"scene": scene, "record": as_table(self.record) | clock}
-
-    def shown_by(self, spec: SourceSpec, streams: str) -> Configuration:
-        """The same of a source that is no live scene, whose streams are of a kind."""
-        return replace(self, streams=streams, clock=(spec.fps, spec.start_ns))
+        return {"scene": scene, "record": section_table(self.record) | clock}
 
 
 def configure(
-    kind: str,
-    preset: str | None = None,
-    settings: Sequence[str] = (),
-    seed: int = 0,
-    *,
-    learner: str | None = None,
+    kind: str, preset: str | None = None, settings: Sequence[str] = (), seed: int | None = 0
 ) -> Configuration:
-    """Fill the configuration for a kind of scene.
+    """Fill the configuration for a live scene.
 
     Args:
         kind: the scene, which also names the preset where none is given and the learner that
             `settings` choose has none of its own.
         preset: name of a preset or a .toml file.
         settings: `section.key=value` words; they win over the preset.
-        seed: becomes `scene.seed` where that is not set.
-        learner: the learner where neither `preset` nor `settings` choose one; by default that of
-            the scene's preset.
+        seed: becomes `scene.seed` where that is not set; None leaves it to `seeded`.
 
     Raises:
         UsageError: an unknown scene, preset, learner, section or key, or a value that misfits.
     """
+    chosen = {} if preset is None else load_preset(preset)
+    filled = _configure(kind, preset, chosen, parse_settings(settings))
+    return filled if seed is None else filled.seeded(seed)
+
+
+def log_settings(
+    settings: Sequence[str], name: str | Path | None
+) -> Mapping[str, Mapping[str, str]]:
+    """Settings by section, for a source that is no live scene: its world and clock are its own.
+
+    Args:
+        settings: `section.key=value` words.
+        name: of the source; None lets settings of scenes pass, as the command of a fork keeps the
+            seed that its parent states.
+
+    Raises:
+        UsageError: a setting is for live scenes alone.
+    """
     words = parse_settings(settings)
+    vain = [f"scene.{key}" for key in words.get("scene", {})]
+    vain += [f"record.{key}" for key in words.get("record", {}) if key in CLOCK]
+    if vain and name is not None:
+        raise UsageError(f"{vain[0]} is for live scenes, and {name} is none: leave it out")
+    return words
+
+
+def configure_for(
+    spec: SourceSpec,
+    described: Mapping[str, Any],
+    preset: str | None = None,
+    words: Mapping[str, Mapping[str, str]] | None = None,
+    seed: int | None = 0,
+) -> Configuration:
+    """Fill the configuration for a source that is no live scene.
+
+    Its streams and its clock are its own. The preset is that of the scene it was recorded from,
+    else of the kind of its frames; the learner of other streams is `OF_CAMERAS` where neither
+    preset nor settings choose one.
+
+    Args:
+        spec: of the source.
+        described: what it says of itself.
+        preset: see `configure`.
+        words: see `log_settings`.
+        seed: see `configure`.
+
+    Raises:
+        UsageError: as for `configure`.
+    """
+    chosen = {} if preset is None else load_preset(preset)
+    kind = str(described.get("scene", ""))
+    if kind not in SCENES:
+        kind = str(chosen.get("scene", {}).get("kind"))
+    if kind not in SCENES:
+        kind = "icub" if len(spec.frame_shape) == 2 else "oscillatory"
+    streams = streams_of(described)
+    filled = _configure(kind, preset, chosen, words or {}, OF_CAMERAS if streams else None)
+    filled = replace(filled, streams=streams, clock=(spec.fps, spec.start_ns))
+    return filled if seed is None else filled.seeded(seed)
+
+
+def _configure(
+    kind: str,
+    preset: str | None,
+    chosen: Mapping[str, Mapping[str, Any]],
+    words: Mapping[str, Mapping[str, str]],
+    learner: str | None = None,
+) -> Configuration:
+    """Fill a configuration from the sections of a chosen preset and of settings."""
+    scene = SCENES[kind]
     algorithm = words.get("learner", {}).get("algorithm", learner if preset is None else None)
     own = LEARNERS[algorithm].preset if algorithm is not None else None
-    tables = load_preset(preset or own or SCENES[kind].preset)
+    tables = chosen if preset is not None else load_preset(own or scene.preset)
     for section in (*tables, *words):
         if section not in SECTIONS:
             raise UsageError(f"unknown section {section}: {did_you_mean(section, SECTIONS)}")
+    layers = {name: (tables.get(name, {}), words.get(name, {})) for name in SECTIONS}
+    _refuse_other_scene(kind, preset, *layers["scene"])
+    if algorithm is None:
+        algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
+    _refuse_keys_of_others(algorithm, words.get("learner", {}))
+    _refuse_keys_of_others(algorithm, tables.get("learner", {}), preset)
+    named = {"algorithm": algorithm}
+    return Configuration(
+        learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"], named),
+        scene=build(scene.config, "scene", *layers["scene"], {"kind": kind}),
+        record=build(RecordConfig, "record", *layers["record"]),
+    )
 
-    layers: dict[str, tuple[Mapping[str, Any], ...]] = {
-        name: (tables.get(name, {}), words.get(name, {})) for name in SECTIONS
-    }
-    of_preset, of_words = layers["scene"]
+
+def _refuse_other_scene(
+    kind: str, preset: str | None, of_preset: Mapping[str, Any], of_words: Mapping[str, Any]
+) -> None:
+    """Refuse a preset or settings that are for another scene."""
     if of_preset.get("kind", kind) != kind:
         raise UsageError(
             f"the preset {preset} is for the scene {of_preset['kind']}, this is {kind}: choose "
@@ -118,27 +192,10 @@ def configure(
                 f"scene.{key} means nothing to the scene {kind}, which has "
                 f"{', '.join(f'scene.{own}' for own in known[kind])}"
             )
-    if algorithm is None:
-        algorithm = str(tables.get("learner", {}).get("algorithm", LearnerConfig().algorithm))
-    layers["learner"] = (*layers["learner"], {"algorithm": algorithm})
-    _refuse_keys_of_others(algorithm, words.get("learner", {}))
-    _refuse_keys_of_others(algorithm, tables.get("learner", {}), preset)
-    scene = build(SCENES[kind].config, "scene", *layers["scene"], {"kind": kind})
-    return Configuration(
-        learner=build(LEARNERS[algorithm].configuration, "learner", *layers["learner"]),
-        scene=scene if scene.seed is not None else replace(scene, seed=seed),
-        record=build(RecordConfig, "record", *layers["record"]),
-    )
 
 
 def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | None = None) -> None:
-    """Say so where a key is not this learner's but another's.
-
-    Args:
-        algorithm: name of the learner.
-        keys: of its configuration.
-        preset: that sets them; None where the user does.
-    """
+    """Refuse a key that is another learner's; `preset` sets it, or None where the user does."""
     own = {field.name for field in fields(LEARNERS[algorithm].configuration)}
     for key in sorted(set(keys) - own):
         for name, entry in LEARNERS.items():
@@ -150,25 +207,10 @@ def _refuse_keys_of_others(algorithm: str, keys: Iterable[str], preset: str | No
                 )
 
 
-def refuse_keys_of_scenes(settings: Sequence[str], source: str | Path) -> None:
-    """Refuse what would be set in vain: what is no live scene has a world and a clock of its own.
-
-    A run that is resumed may have been told so: as a fork, to keep the seed that its parent states.
-
-    Args:
-        settings: `section.key=value` words.
-        source: the first word that names it.
-
-    Raises:
-        UsageError: one of them is about either, and the source is no scene.
-    """
-    if source in SCENES:
-        return
-    words = parse_settings(settings)
-    vain = [f"scene.{key}" for key in words.get("scene", {})]
-    vain += [f"record.{key}" for key in words.get("record", {}) if key in CLOCK]
-    if vain:
-        raise UsageError(f"{vain[0]} is for live scenes, and {source} is none: leave it out")
+def streams_of(described: Mapping[str, Any]) -> str:
+    """Of what kind a source's streams are where they are no scene's; "" of a scene."""
+    scene = str(described.get("scene", ""))
+    return "" if scene in SCENES else scene or str(described["kind"])
 
 
 def versions_used(
@@ -181,8 +223,6 @@ def versions_used(
         source: what it learns from.
         described: what the source says of itself, where it may be of cameras.
     """
-    from recorder.cameras.words import PACKAGES
-
     scene = scene_of(source)
     return {
         **versions(),
@@ -190,33 +230,6 @@ def versions_used(
         **(SCENES.versions(scene.name) if scene is not None else {}),
         **(described or {}).get(PACKAGES, {}),
     }
-
-
-def scene_kind_for(
-    spec: SourceSpec, described: Mapping[str, Any], preset: str | None = None
-) -> str:
-    """The kind of scene, and so the preset, for a recording: that of its scene.
-
-    What shows another scene takes the kind of the `preset` chosen, else by what a frame is.
-    """
-    scene = str(described.get("scene", ""))
-    if scene in SCENES:
-        return scene
-    chosen = load_preset(preset).get("scene", {}).get("kind") if preset is not None else None
-    if chosen in SCENES:
-        return str(chosen)
-    return "icub" if len(spec.frame_shape) == 2 else "oscillatory"
-
-
-def streams_of(described: Mapping[str, Any]) -> str:
-    """Of what kind a source's streams are where they are no scene's; "" of a scene."""
-    scene = str(described.get("scene", ""))
-    return "" if scene in SCENES else scene or str(described["kind"])
-
-
-def learner_of(streams: str) -> str | None:
-    """The learner of what `streams_of` says where nobody chooses one; None for the preset's."""
-    return OF_CAMERAS if streams else None
 
 
 def open_source(
@@ -229,6 +242,7 @@ def open_source(
     salvage: bool = False,
     cameras: CameraOptions | None = None,
     follow: float | None = None,
+    resumed: bool = False,
 ) -> tuple[SeekableSource, Configuration]:
     """Open a live scene by its name, a recording, or other people's camera logs.
 
@@ -242,25 +256,24 @@ def open_source(
         salvage: pass over the damaged parts of a recording.
         cameras: how images of others become frames; given, the paths are taken as such logs.
         follow: wait so many seconds for more frames of a recording that is being written.
+        resumed: the settings are those of a run that is resumed; see `log_settings`.
 
     Raises:
         UsageError: neither a scene nor a path that exists, or a wrong configuration.
         CdmisfaError: the scene needs a simulator that is missing, or the log is damaged.
     """
     if follow is None and is_scene(words, cameras):
-        kind = str(words[0])
-        configuration = configure(kind, preset, settings, seed)
+        configuration = configure(str(words[0]), preset, settings, seed)
         return configuration.open_scene(), configuration
+    told = log_settings(settings, None if resumed else words[0])
     source = open_logs(words, loop=loop, salvage=salvage, cameras=cameras, follow=follow)
     try:
         described = description(source, at_once=True)
-        kind = scene_kind_for(source.spec, described, preset)
-        streams = streams_of(described)
-        configuration = configure(kind, preset, settings, seed, learner=learner_of(streams))
-        return source, configuration.shown_by(source.spec, streams)
+        configuration = configure_for(source.spec, described, preset, told, seed)
     except BaseException:
         source.close()
         raise
+    return source, configuration
 
 
 def is_scene(words: Sequence[str | Path], cameras: ImageOptions | None = None) -> bool:
@@ -308,9 +321,7 @@ def open_logs(
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
-    from recorder.cameras.words import is_live
-    from replay.inputs.opening import open_log
-    from replay.inputs.words import places
+    from replay.inputs import open_log, places
     from replay.storage.location import Url
 
     if live := [str(word) for word in words if is_live(str(word))]:
@@ -359,8 +370,6 @@ def open_cameras_now(
         UsageError: a word names no live stream or one that cannot be opened, or a wrong
             configuration.
     """
-    from recorder.cameras.words import is_live, open_live
-
     stored = [str(word) for word in words if not is_live(str(word))]
     if stored:
         raise UsageError(
@@ -372,12 +381,11 @@ def open_cameras_now(
     if of_logs := [option for option in cameras.given() if option not in theirs]:
         raise UsageError(f"{words[0]} is a live stream: {are_for(of_logs, 'logs')}")
     live = replace(live, **framing)
+    told = log_settings(settings, words[0])
     source = open_live([str(word) for word in words], live, say=say, stop=stop)
     try:
-        described = source.describe()
-        kind = scene_kind_for(source.spec, described, preset)
-        configuration = configure(kind, preset, settings, live.seed, learner=OF_CAMERAS)
-        return source, configuration.shown_by(source.spec, streams_of(described))
+        configuration = configure_for(source.spec, source.describe(), preset, told, live.seed)
     except BaseException:
         source.close()
         raise
+    return source, configuration

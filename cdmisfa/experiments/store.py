@@ -20,10 +20,8 @@ from typing import Any, Protocol, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import WorkerDied, run_all
-from cdmisfa.core.untrusted.memory import BUDGET, MAX_LIST, budget, parse_json
-from cdmisfa.core.untrusted.regular import opened_regular
-from recorder.log.folder import held
-from recorder.log.whole import make_folder, refuse_special, to_disk
+from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
+from recorder.log.files import held, make_folder, refuse_special, to_disk
 
 ROWS = "rows.jsonl"
 """The rows, in a folder."""
@@ -36,7 +34,7 @@ def code(*more: str) -> str:
     """Version of what a trial computes: the package's, and a hash of learner and recorder.
 
     Args:
-        more: further modules that decide it: "cdmisfa/arena/trial".
+        more: further modules that decide it: "cdmisfa/studies/arena/trial".
     """
     root = Path(__file__).parents[2]
     rooms = ("cdmisfa/core", "cdmisfa/features", "cdmisfa/agents", "recorder")

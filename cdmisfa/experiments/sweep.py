@@ -10,30 +10,28 @@ import contextlib
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.untrusted.memory import MAX_LIST
+from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, write_json
-from cdmisfa.experiments.runs import module_table, run
+from cdmisfa.experiments.run_folder import module_table
+from cdmisfa.experiments.session import run
 from cdmisfa.experiments.sources import (
     Configuration,
     configure,
+    configure_for,
     is_scene,
-    learner_of,
+    log_settings,
     open_logs,
-    refuse_keys_of_scenes,
-    scene_kind_for,
-    streams_of,
 )
 from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
@@ -172,35 +170,27 @@ def plan(
     """
     words = (source,) if isinstance(source, str | Path) else tuple(source)
     cameras = cameras or CameraOptions()
-    kind, recorded, spec = _identify(words, preset, loop, cameras)
-    streams = "" if recorded is None else streams_of(recorded)
-    refuse_keys_of_scenes([*settings, *(f"{key}=" for key in grid)], words[0])
-    points = [
-        dict(zip(grid, map(str, values), strict=True))
-        for values in itertools.product(*grid.values())
-    ]
+    configured, recorded = _configured(words, preset, loop, cameras)
     # Workers may have another working directory.
-    paths = tuple(str(w) if w == kind or "://" in str(w) else str(Path(w).resolve()) for w in words)
+    scene = recorded is None
+    paths = tuple(str(w) if scene or "://" in str(w) else str(Path(w).resolve()) for w in words)
     each = tuple(dict.fromkeys(seeds))
-    ends = [max_iterations, max_modules]
     trials: dict[str, SweepTrial] = {}
-    for point in points:
-        chosen = (*settings, *(f"{key}={value}" for key, value in point.items()))
-        seeded = _seeded(kind, preset, chosen, learner_of(streams))
+    for values in itertools.product(*grid.values()):
+        point = dict(zip(grid, map(str, values), strict=True))
+        told = configured((*settings, *(f"{key}={value}" for key, value in point.items())))
         for seed in each:
-            configuration = seeded(seed)
-            if spec is not None:
-                configuration = configuration.shown_by(spec, streams)
-            depends: list[Any] = [as_table(configuration.learner)]
+            configuration = told.seeded(seed)
+            depends: list[Any] = [section_table(configuration.learner)]
             used = LEARNERS.versions(configuration.learner.algorithm)
-            if recorded is None:  # the world's part counts only where it is live
+            if scene:  # the world's part counts only where it is live
                 depends.append(configuration.tables())
                 used |= SCENES.versions(configuration.scene.kind)
             if used:
                 depends.append(used)
             if cameras != CameraOptions():
                 depends.append(dataclasses.asdict(cameras))
-            name = identity(depends, seed, recorded, ends, code())
+            name = identity(depends, seed, recorded, [max_iterations, max_modules], code())
             trial = SweepTrial(
                 id=name,
                 source=paths,
@@ -219,31 +209,20 @@ def plan(
     return list(trials.values())
 
 
-def _seeded(
-    kind: str, preset: str | None, settings: Sequence[str], learner: str | None
-) -> Callable[[int], Configuration]:
-    """`configure` for many seeds at once: a seed only ever becomes `scene.seed`."""
-    base, other = (configure(kind, preset, settings, seed, learner=learner) for seed in (0, 1))
-    if base == other:
-        return lambda seed: base
-    return lambda seed: replace(base, scene=replace(base.scene, seed=seed))
-
-
-def _identify(
+def _configured(
     words: tuple[str | Path, ...], preset: str | None, loop: bool, cameras: CameraOptions
-) -> tuple[str, Any, SourceSpec | None]:
-    """The scene's name, and what tells a recording's bytes from another's, and its streams.
-
-    The latter two are None where it is live.
-    """
+) -> tuple[Callable[[Sequence[str]], Configuration], dict[str, Any] | None]:
+    """The configuration for settings, and what a source says of itself; None of a live scene."""
     if is_scene(words, cameras):
-        return str(words[0]), None, None
+        return lambda told: configure(str(words[0]), preset, told, None), None
     source = open_logs(words, loop=loop, cameras=cameras, goal=("sweep", "SWEEP"))
-    try:
-        described = dict(source.describe())
-        return scene_kind_for(source.spec, described, preset), described, source.spec
-    finally:
-        source.close()
+    with contextlib.closing(source):
+        recorded, spec = dict(source.describe()), source.spec
+
+    def configured(settings: Sequence[str]) -> Configuration:
+        return configure_for(spec, recorded, preset, log_settings(settings, words[0]), None)
+
+    return configured, recorded
 
 
 def compute(trial: SweepTrial) -> Mapping[str, Any]:
@@ -291,7 +270,7 @@ def _logged_trial(trial: SweepTrial) -> dict[str, Any]:
     with contextlib.closing(source), contextlib.ExitStack() as opened:
         log = None
         if trial.log is not None:
-            log = opened.enter_context(whole(trial.log))
+            log = opened.enter_context(atomic_write(trial.log))
         result = run(
             source,
             configuration.learner,

@@ -5,9 +5,8 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "cdmisfa.features.feature": "Feature",
-        "cdmisfa.features.incsfa": "IncSFA",
-        "cdmisfa.features.projection": "project",
+        "cdmisfa.features.incsfa": "Feature IncSFA",
+        "cdmisfa.features.outputs": "project",
         "cdmisfa.features.recursive": "RecursiveSFA",
         "cdmisfa.features.sfa": "batch_sfa",
     },

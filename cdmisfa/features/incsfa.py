@@ -1,4 +1,4 @@
-"""`IncSFA`: incremental slow feature analysis, the paper's adaptive abstraction.
+"""Adaptive abstractions: what a learner learns with, and `IncSFA`, the paper's.
 
 Sources: candid covariance-free incremental PCA (CCIPCA): Weng, Zhang and Hwang 2003;
 minor component analysis (MCA) by sequential addition: Peng and Yi 2006; the two joined
@@ -7,8 +7,9 @@ as IncSFA: Kompella, Luciw and Schmidhuber 2012. How it is computed: `kernels/in
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,42 @@ from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.config import LearnerConfig
 
 
-class State(NamedTuple):
+@runtime_checkable
+class Feature(Protocol):
+    """Slow features that are learned frame by frame: y = phi (x - mean).
+
+    One that also has `kernel`, a record of its arrays as `IncSFA` has it, is learned with in C.
+    """
+
+    def update(self, frames: NDArray[Any], gap: bool = False) -> FloatArray:
+        """Learn from consecutive frames.
+
+        Args:
+            frames: (n, I) uint8 pixels, which count 1/255 each, or float64 values, expanded.
+            gap: the first frame does not follow the last one learned from.
+
+        Returns:
+            xi, (n,): change of phi at each frame, NaN where there is none to tell.
+        """
+
+    @property
+    def phi(self) -> FloatArray:
+        """Weights of the centred input, (J, I)."""
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of the input, (I,)."""
+
+    @property
+    def state(self) -> Any:
+        """Every array that changes, as a named tuple; restored by writing into them."""
+
+
+MakeFeature = Callable[[LearnerConfig, int, np.random.Generator], Feature]
+"""How a learner makes a feature: configuration, length of an expanded frame, where to draw."""
+
+
+class IncSFAState(NamedTuple):
     """An adaptive abstraction: arrays only, changed in place by the kernels.
 
     I inputs, K whitening components, J outputs. Saving these arrays saves everything.
@@ -46,7 +82,7 @@ class State(NamedTuple):
     counts: NDArray[np.int64]
 
 
-def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) -> State:
+def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) -> IncSFAState:
     """Draw an abstraction: CCIPCA vectors .1 x standard normal, MCA rows normalised.
 
     Args:
@@ -58,7 +94,7 @@ def new_state(rng: np.random.Generator, n_inputs: int, config: LearnerConfig) ->
     v, w = kernels.normal(rng, (K, n_inputs), (J, K))
     v *= 0.1
     w /= np.sqrt((w * w).sum(axis=1))[:, None]
-    return State(
+    return IncSFAState(
         mean=np.zeros(n_inputs),
         v=v,
         d=np.sqrt((v * v).sum(axis=1)),

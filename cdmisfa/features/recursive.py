@@ -26,7 +26,7 @@ PIECE: int = kernels.lib.PIECE
 _TINY = 1e-300
 
 
-class State(NamedTuple):
+class RecursiveState(NamedTuple):
     """Everything that changes: I inputs, L directions, K whitened components, J outputs.
 
     Attributes:
@@ -85,7 +85,7 @@ class RecursiveSFA:
         size = min(2 * components, n_inputs)
         components = min(components, n_inputs)
         self.window = window
-        self.state = State(
+        self.state = RecursiveState(
             mean=np.zeros(n_inputs),
             basis=np.zeros((size, n_inputs)),
             variance=np.zeros(size),

@@ -5,12 +5,9 @@ import pytest
 from cdmisfa.core.exports import exports
 
 _CONTRACTS = {
-    "cdmisfa.testing.cameras": "CameraContract",
     "cdmisfa.testing.exports": "FormContract",
-    "cdmisfa.testing.features": "FeatureContract",
-    "cdmisfa.testing.learners": "LearnerContract",
-    "cdmisfa.testing.sinks": "SinkContract",
-    "cdmisfa.testing.sources": "ForwardContract SourceContract same",
+    "cdmisfa.testing.learners": "FeatureContract LearnerContract SinkContract",
+    "cdmisfa.testing.sources": "CameraContract ForwardContract SourceContract same",
 }
 
 pytest.register_assert_rewrite(*_CONTRACTS)

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.experiments.runs import run
+from cdmisfa.experiments.session import run
 from recorder.cameras.stepped import ArraySource
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatorySource
 from replay.export.forms import Form
-from replay.inputs.opening import open_to_look
+from replay.inputs import open_to_look
 
 FRAMES, ITERATIONS = 12, 6
 

@@ -1,21 +1,47 @@
-"""What every `Learner` promises, as tests: say what to open.
+"""What every `Learner`, `Feature` and `Sink` promises, as tests: say what to open.
 
 class TestMine(LearnerContract):
     def open(self, spec, seed) -> Learner:
         return Mine(MineConfig(), spec, seed)
+
+class TestMyFeature(FeatureContract):
+    def open(self, config, n_inputs, rng) -> Feature:
+        return MyFeature(config, n_inputs, rng)
+
+class TestDigest(SinkContract):
+    def open(self, folder, source, learner) -> Sink:
+        return Digest()
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec
-from cdmisfa.core.learning import Learner, LearnerState
+from cdmisfa.core.config import LearnerConfig
+from cdmisfa.core.learning import Learner, LearnerState, Sink
 from cdmisfa.core.signals import SignalsHash
+from cdmisfa.experiments.loop import Digest, learn
+from cdmisfa.features.incsfa import Feature
 from recorder.world.oscillatory import OscillatorySource
+
+INPUTS = 3
+
+CONFIG = LearnerConfig(
+    tau=40, eta_dot_window=8, warm_up=3, delta=1.0, min_variance=1e-6, novel_share=0.0
+)
+"""Saves its first module at iteration 8."""
+
+Opened = tuple[OscillatorySource, CuriousLearner, Sink]
 
 
 def signals_sha256(learner: Learner, source: FrameSource, iterations: int) -> str:
@@ -52,6 +78,10 @@ class LearnerContract:
         assert 0 <= learner.stream < len(spec.streams)
         assert learner.tau >= 1
         assert learner.over == ""
+        phi = learner.phi
+        assert phi.ndim == 2
+        phi[...] = np.nan
+        assert not np.isnan(learner.phi).any(), "phi is a copy"
 
     def test_signals_are_of_the_block_that_was_watched(self) -> None:
         source = self.source()
@@ -82,17 +112,14 @@ class LearnerContract:
         source.seek(t)
         assert signals_sha256(other, source, self.iterations) == sha256
         assert (other.stream, other.iteration) == (learner.stream, learner.iteration)
+        summary = dict(learner.summary())
+        assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
-    def test_a_state_that_is_not_its_own_is_refused(self) -> None:
-        learner = self.open(self.source().spec, 0)
-        state = learner.state
-        with pytest.raises(ValueError, match=r".+"):
-            learner.restore(LearnerState({}, (), state.policy_rng))
-        assert learner.iteration == 0
-
-    def test_a_block_that_was_not_asked_for_is_refused(self) -> None:
+    def test_what_is_not_its_own_is_refused(self) -> None:
         source = self.source()
         learner = self.open(source.spec, 0)
+        with pytest.raises(ValueError, match=r".+"):
+            learner.restore(LearnerState({}, (), learner.state.policy_rng))
         for stream, n in ((learner.stream, learner.tau + 1), (-1, learner.tau)):
             block = source.take(stream % len(source.spec.streams), n)
             if (block.stream, len(block)) != (learner.stream, learner.tau):
@@ -100,16 +127,102 @@ class LearnerContract:
                     learner.step(block)
         assert learner.iteration == 0
 
-    def test_its_weights_are_a_copy(self) -> None:
-        learner = self.open(self.source().spec, 0)
-        phi = learner.phi
-        assert phi.ndim == 2
-        phi[...] = np.nan
-        assert not np.isnan(learner.phi).any()
 
-    def test_its_summary_is_json(self) -> None:
-        source = self.source()
-        learner = self.open(source.spec, 0)
-        signals_sha256(learner, source, self.iterations)
-        summary = dict(learner.summary())
-        assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+def seen(n: int, seed: int = 0) -> NDArray[np.float64]:
+    """Values that change slowly, with noise, (n, 3)."""
+    t = np.arange(n)[:, None] / np.array([40.0, 7.0, 3.0])
+    noise = np.random.default_rng(seed).standard_normal((n, INPUTS))
+    return np.asarray(np.sin(t) + 0.1 * noise)
+
+
+class FeatureContract:
+    """The tests; a subclass opens a fresh feature in `open`.
+
+    Attributes:
+        config: of the learner that it is for.
+    """
+
+    config = LearnerConfig(expansion="none")
+
+    def open(self, config: LearnerConfig, n_inputs: int, rng: np.random.Generator) -> Feature:
+        """Open a fresh feature of the kind under test."""
+        raise NotImplementedError
+
+    def _open(self) -> Feature:
+        return self.open(self.config, INPUTS, np.random.default_rng(5))
+
+    def test_it_is_a_feature(self) -> None:
+        feature = self._open()
+        assert isinstance(feature, Feature)
+        assert feature.phi.shape == (self.config.outputs, INPUTS)
+        assert feature.mean.shape == (INPUTS,)
+
+    def test_it_says_how_much_each_frame_changed_it(self) -> None:
+        feature = self._open()
+        assert feature.update(seen(50)).shape == (50,)
+        xi = feature.update(seen(20, 1), gap=True)
+        assert xi.shape == (20,)
+        assert np.isnan(xi).all() or (xi[~np.isnan(xi)] >= 0).all()
+
+    def test_the_same_frames_give_the_same_bits(self) -> None:
+        one, two = self._open(), self._open()
+        for feature in (one, two):
+            feature.update(seen(60))
+        assert one.phi.tobytes() == two.phi.tobytes()
+        assert one.mean.tobytes() == two.mean.tobytes()
+
+    def test_what_is_written_into_its_state_restores_it(self) -> None:
+        one, two = self._open(), self._open()
+        one.update(seen(60))
+        stored: dict[str, NDArray[Any]] = {k: v.copy() for k, v in one.state._asdict().items()}
+        for name, array in two.state._asdict().items():
+            array[...] = stored[name]
+        more = seen(60, 1)
+        np.testing.assert_array_equal(one.update(more), two.update(more))
+        assert one.phi.tobytes() == two.phi.tobytes()
+
+
+class SinkContract:
+    """The tests; a subclass opens a fresh sink for a run in `open`."""
+
+    def open(self, folder: Path, source: OscillatorySource, learner: Learner) -> Sink:
+        """Open a fresh sink of the kind under test."""
+        raise NotImplementedError
+
+    @pytest.fixture
+    def opened(self, tmp_path: Path) -> Iterator[Opened]:
+        """A source, a learner for it, and a sink for their run."""
+        source = OscillatorySource()
+        learner = CuriousLearner(CONFIG, source.spec, seed=3)
+        sink = self.open(tmp_path, source, learner)
+        context: Any = sink if hasattr(sink, "__exit__") else contextlib.nullcontext()
+        with context:
+            yield source, learner, sink
+        if hasattr(sink, "abandon"):  # a log whose run did not finish it
+            sink.abandon()
+
+    def test_it_changes_nothing_of_a_run(self, opened: Opened) -> None:
+        source, learner, sink = opened
+        digest, alone = Digest(), Digest()
+        learn(source, learner, (sink, digest), max_iterations=20, max_modules=9)
+        assert len(learner.modules) == 1
+        other = CuriousLearner(CONFIG, source.spec, seed=3)
+        learn(OscillatorySource(), other, (alone,), max_iterations=20, max_modules=9)
+        assert digest.hexdigest() == alone.hexdigest()
+        state, expected = learner.state, other.state
+        assert state.policy_rng == expected.policy_rng
+        for name, array in expected.arrays.items():
+            assert state.arrays[name].tobytes() == array.tobytes(), name
+
+    def test_it_takes_a_run_without_blocks(self, opened: Opened) -> None:
+        source, learner, sink = opened
+        assert isinstance(sink, Sink)
+        assert learn(source, learner, (sink,), max_iterations=0) == "max_iterations"
+
+    def test_it_takes_events_of_every_level(self, opened: Opened) -> None:
+        source, learner, sink = opened
+        signals = learner.step(block := source.take(learner.stream, learner.tau))
+        sink.block(block, signals, learner)
+        for level in ("INFO", "WARNING"):
+            sink.event(source.t, 0, "it rains", level)
+        sink.finish()

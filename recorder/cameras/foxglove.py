@@ -17,10 +17,11 @@ from urllib.parse import urlsplit
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.video import Steady
-from recorder.images.decoding import IMAGES, MessageKind, Reading, Taken, decoder_of
+from recorder.images.decoding import MessageKind, Taken, decoder_of
 from recorder.images.messages import holds_distances
+from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
 from recorder.images.videos import VideoPackets
 

@@ -15,8 +15,8 @@ from recorder.cameras.live import LiveSource
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.readers import Camera, CameraFrames, Readers
 from recorder.config import view_names
-from recorder.images.decoding import Reading
 from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.options import Reading
 from recorder.images.pixels import RECIPE
 from recorder.images.videos import COLOR_RECIPE, VIDEO_RECIPE
 

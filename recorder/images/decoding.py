@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, one_line
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.images.fields import Field, field_value, members, numbers_of
 from recorder.images.messages import SCHEMAS, foxglove_image, image_decoder, ros_stamp
-from recorder.images.options import Clock, Depth
+from recorder.images.options import Reading
 from recorder.images.pixels import MalformedImage, Shown
 
 Taken = Callable[[bytes | memoryview], Shown]
@@ -32,29 +31,6 @@ Stamp = Callable[[bytes | memoryview], int]
 _SECONDS: Final = ("sec", "secs", "seconds")
 _REST: Final = ("nsec", "nsecs", "nanosec", "nanos")
 _HEADER: Final = re.compile(r"(?:std_msgs/)?(?:msg/)?Header\s+\w+")
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """What is taken of messages and files.
-
-    Attributes:
-        depth: what is shown of distances, see `raw_image`, and the range that numbers are kept in.
-        fields: the numbers that are taken instead of images; see `Field`.
-        time: the column of a table's times, with its unit; see `TableNumbers`.
-        stamp: the times of messages: those of the log, or those in their headers.
-        color: whether images are taken in their colours; see `raw_image`.
-    """
-
-    depth: Depth | None = None
-    fields: tuple[str, ...] = ()
-    time: str | None = None
-    stamp: Clock = "log"
-    color: bool = False
-
-
-IMAGES = Reading()
-"""Images, and no numbers."""
 
 
 class MessageKind(NamedTuple):

@@ -70,3 +70,26 @@ class ImageOptions:
     def given(self) -> tuple[str, ...]:
         """The options of the command line that say other than the defaults."""
         return tuple(option_name(field) for field in given(self))
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What is taken of messages and files.
+
+    Attributes:
+        depth: what is shown of distances, see `raw_image`, and the range that numbers are kept in.
+        fields: the numbers that are taken instead of images; see `Field`.
+        time: the column of a table's times, with its unit; see `TableNumbers`.
+        stamp: the times of messages: those of the log, or those in their headers.
+        color: whether images are taken in their colours; see `raw_image`.
+    """
+
+    depth: Depth | None = None
+    fields: tuple[str, ...] = ()
+    time: str | None = None
+    stamp: Clock = "log"
+    color: bool = False
+
+
+IMAGES = Reading()
+"""Images, and no numbers."""

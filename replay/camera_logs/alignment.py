@@ -8,8 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.clock import NANOSECONDS, times_of
+from cdmisfa.core.clock import NANOSECONDS, RECORDED_FPS, times_of
 from cdmisfa.core.errors import UsageError
+from replay.camera_logs.stream import ImageStream
+from replay.camera_logs.table import TableNumbers
 from replay.stored import Span
 
 MAX_FRAMES: Final = 2**31
@@ -44,9 +46,36 @@ def step_of(times: Times) -> float:
     return float(np.median(np.diff(times)) / NANOSECONDS) if len(times) > 1 else float("nan")
 
 
-def even_times(count: int, fps: float) -> Times:
-    """Times of images of which only the rate is known, from 0, (count,) nanoseconds."""
-    return times_of(np.arange(count), fps, 0).astype(np.uint64)
+def known_times(streams: Sequence[ImageStream], fps: float) -> list[Times]:
+    """When each stream's images were taken; from 0 at an even rate where that is not known."""
+    return [
+        s.times if len(s.times) else times_of(np.arange(s.count), fps, 0).astype(np.uint64)
+        for s in streams
+    ]
+
+
+def rate_of(streams: Sequence[ImageStream]) -> float:
+    """Images a second of the first stream that has times.
+
+    Raises:
+        UsageError: none has, or they tell no rate that is taken.
+    """
+    timed = next((s for s in streams if len(s.times)), streams[0])
+    step, table = step_of(timed.times), isinstance(timed, TableNumbers)
+    count = "say what its times count, as --time COLUMN:s (or ms, us, ns)"
+    if not step > 0:
+        what = f"{timed.path}: {timed.topic}" if len(timed.times) else timed.path
+        remedy = ", or name the column of its times with --time" if table else ""
+        if table and len(timed.times):
+            what = f"{timed.path}: most of its rows are of the time of the row before, which"
+            remedy = f", or {count}"
+        raise UsageError(f"{what} tells no rate: set one with --rate{remedy}")
+    if table and 1 / step > RECORDED_FPS[1]:
+        raise UsageError(
+            f"{timed.path}: {1 / step:.6g} rows a second are more than the {RECORDED_FPS[1]:.0f} "
+            f"that are taken: {count}, or set a rate with --rate"
+        )
+    return float(f"{1 / step:.6g}")
 
 
 def overlap(streams: Sequence[Times]) -> tuple[int, int]:

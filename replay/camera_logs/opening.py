@@ -1,24 +1,73 @@
-"""Opening camera logs of any kind: which logs paths mean, of what kind they are, what they are."""
+"""Camera logs of any kind opened: which logs paths mean, of what kind they are, what is there."""
 
 from __future__ import annotations
 
+import contextlib
+import fnmatch
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final, Literal
 
 from cdmisfa.core.errors import UsageError
-from recorder.images.decoding import IMAGES, Reading
-from replay.camera_logs.formats.bag import BAGS, BagImages
-from replay.camera_logs.formats.lerobot import LeRobotImages, is_dataset
-from replay.camera_logs.formats.mcap_log import McapImages
-from replay.camera_logs.formats.picture_folder import PICTURES, FolderImages, by_number
-from replay.camera_logs.formats.table import TableNumbers, is_table
-from replay.camera_logs.formats.video import VIDEOS, VideoImages
-from replay.camera_logs.joined import JoinedImages, Stamped
-from replay.camera_logs.stream import ImageStream, NothingLoggedError
-from replay.camera_logs.video_messages import in_order
+from recorder.images.options import IMAGES, Reading
+from recorder.images.videos import VideoPackets
+from replay.camera_logs.bag import BAGS, BagImages, bag_channels, bag_topics
+from replay.camera_logs.lerobot import (
+    LeRobotImages,
+    dataset_cameras,
+    dataset_channels,
+    is_dataset,
+)
+from replay.camera_logs.mcap_log import McapImages, mcap_topics
+from replay.camera_logs.pictures import PICTURES, VIDEOS, FolderImages, VideoImages, by_number
+from replay.camera_logs.selected import VideoMessages, by_stamps, joined
+from replay.camera_logs.stream import ChannelFacts, ImageStream, NothingLoggedError, holds_none
+from replay.camera_logs.table import TABLES, TableNumbers, table_channels
 from replay.storage.identity import FilesIdentity, Identity, log_identity
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import log_files
+
+Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table"]
+
+WHOLE_FILES: Final = frozenset((*VIDEOS, *BAGS, *TABLES, *PICTURES))
+"""Endings of files that are read whole, and so by their paths alone."""
+
+ALL: Final = ("*",)
+"""Topics that mean every one with images."""
+
+
+def log_format(path: Location) -> Format:
+    """The format of a log; a folder of MCAP files that are parts of one log is "split"."""
+    if isinstance(path, Url):
+        return "mcap"
+    if path.is_dir():
+        if is_dataset(path):
+            return "dataset"
+        parts, metadata = any(path.glob("*.mcap")), path / "metadata.yaml"
+        if metadata.exists() and not parts:
+            return "bag"
+        if metadata.is_file():
+            return "split"
+        pictures = any(file.suffix.lower() in PICTURES for file in path.iterdir())
+        return "pictures" if pictures and not any(path.glob("*.mcap*")) else "mcap"
+    if path.suffix in BAGS:
+        return "bag"
+    if path.suffix.lower() in VIDEOS and path.is_file():
+        return "video"
+    return "table" if path.suffix.lower() in TABLES and path.is_file() else "mcap"
+
+
+def only_foreign(path: Location) -> bool:
+    """Whether a path can be no recording of ours, by its kind."""
+    return log_format(path) not in ("mcap", "split")
+
+
+def image_logs(paths: Sequence[str | Location]) -> list[Location]:
+    """The logs that paths mean, one at least: a folder of MCAP files is each, a rosbag2 one log."""
+    found: list[Location] = []
+    for path in map(location, paths):
+        found += log_files(path) if log_format(path) == "mcap" else [path]
+    return found
 
 
 def open_images(
@@ -38,14 +87,9 @@ def open_images(
     """
     images = _open(path, topic, salvage=salvage, reading=reading)
     try:
-        images = in_order(images)
-    except BaseException:
-        images.close()
-        raise
-    if reading.stamp == "log":
-        return images
-    try:
-        return Stamped(images)
+        if isinstance(images.decode, VideoPackets):
+            images = VideoMessages(images, images.decode)
+        return images if reading.stamp == "log" else by_stamps(images)
     except BaseException:
         images.close()
         raise
@@ -53,42 +97,49 @@ def open_images(
 
 def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
     """Open a log with the reader of its format, which raises as `open_images` does."""
-    if isinstance(path, Path):
-        if is_table(path):
-            return TableNumbers(path, topic, reading)
-        if is_bag(path):
-            return BagImages(path, topic, reading=reading)
-        if is_split(path):
-            return _open_parts(path, topic, salvage=salvage, reading=reading)
-        if reading.fields and (path.is_dir() or is_video(path)):
-            raise UsageError(f"{path} holds images: --field is for messages and tables")
-        if is_dataset(path):
-            return LeRobotImages(path, topic, color=reading.color)
-        if path.is_dir():
-            return FolderImages(path, topic, color=reading.color)
-        if is_video(path):
-            return VideoImages(path, topic, color=reading.color)
-    return McapImages(path, topic, salvage=salvage, reading=reading)
+    kind = log_format(path)
+    if isinstance(path, Url) or kind == "mcap":
+        return McapImages(path, topic, salvage=salvage, reading=reading)
+    if kind == "split":
+        return _open_parts(path, topic, salvage=salvage, reading=reading)
+    if kind == "bag":
+        return BagImages(path, topic, reading=reading)
+    if kind == "table":
+        return TableNumbers(path, topic, reading)
+    if reading.fields:
+        raise UsageError(f"{path} holds images: --field is for messages and tables")
+    if kind == "dataset":
+        return LeRobotImages(path, topic, color=reading.color)
+    if kind == "pictures":
+        return FolderImages(path, topic, color=reading.color)
+    return VideoImages(path, topic, color=reading.color)
 
 
-def image_logs(paths: Sequence[str | Location]) -> list[Location]:
-    """The logs that paths mean, one at least: a folder of MCAP files is each, a rosbag2 one log."""
-    found: list[Location] = []
-    for path in map(location, paths):
-        if only_foreign(path) or (isinstance(path, Path) and is_split(path)):
-            found.append(path)
-        else:
-            found += log_files(path)
-    return found
+def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
+    """Open the images on a topic of a log in parts.
 
-
-def only_foreign(path: Location) -> bool:
-    """Whether a path can be no recording of ours, by its kind."""
-    if isinstance(path, Url):
-        return False
-    if is_table(path):
-        return True
-    return is_video(path) or is_dataset(path) or is_bag(path) or is_picture_folder(path)
+    A part may lack a topic that is named, and one that has nothing in it is left out.
+    """
+    parts: list[ImageStream] = []
+    refusal: UsageError | None = None
+    empty: list[NothingLoggedError] = []
+    with contextlib.ExitStack() as opened:
+        for file in sorted(path.glob("*.mcap"), key=by_number):
+            try:
+                parts.append(McapImages(file, topic, salvage=salvage, reading=reading))
+                opened.callback(parts[-1].close)
+            except NothingLoggedError as error:
+                empty.append(error)
+            except UsageError as error:
+                refusal = refusal or error
+        if refusal is not None and (topic is None or not parts):
+            raise refusal
+        if not parts:
+            raise empty[0]
+        if len(topics := sorted({part.topic for part in parts})) > 1:
+            raise UsageError(f"{path}: name one --topic or more; it has {', '.join(topics)}")
+        opened.pop_all()
+    return joined(path, parts, [f"{error}: left out" for error in empty])
 
 
 def identity_of(path: Location, streams: Sequence[ImageStream]) -> Identity:
@@ -110,59 +161,85 @@ def identity_of(path: Location, streams: Sequence[ImageStream]) -> Identity:
     return FilesIdentity(path, (file for file in found if file.is_file()))
 
 
-def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
-    """Open the images on a topic of a log in parts.
+def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
+    """The topics of a camera log with images, or with the messages that are wanted.
 
-    A part may lack a topic that is named, and one that has nothing in it is left out.
+    Raises:
+        LogDamagedError: it cannot be read.
+        CdmisfaError: a package that reads it is missing.
     """
-    parts: list[ImageStream] = []
-    refusal: UsageError | None = None
-    empty: list[NothingLoggedError] = []
-    try:
-        for file in sorted(path.glob("*.mcap"), key=by_number):
-            try:
-                parts.append(McapImages(file, topic, salvage=salvage, reading=reading))
-            except NothingLoggedError as error:
-                empty.append(error)
-            except UsageError as error:
-                refusal = refusal or error
-        if refusal is not None and (topic is None or not parts):
-            raise refusal
-        if not parts:
-            raise empty[0]
-        topics = {part.topic for part in parts}
-        if len(topics) > 1:
-            raise UsageError(
-                f"{path}: name one --topic or more; it has {', '.join(sorted(topics))}"
-            )
-    except BaseException:
-        for part in parts:
-            part.close()
-        raise
-    return JoinedImages(path, parts, [f"{error}: left out" for error in empty])
+    kind = log_format(path)
+    if isinstance(path, Url) or kind == "mcap":
+        return mcap_topics(path, reading)
+    if kind == "dataset":
+        return dataset_cameras(path)
+    if kind == "bag":
+        return bag_topics(path, reading)
+    if kind != "split":
+        return [path.resolve().name if kind == "pictures" else path.stem]
+    topics: dict[str, None] = {}
+    for part in sorted(path.glob("*.mcap")):
+        with contextlib.suppress(NothingLoggedError):
+            topics |= dict.fromkeys(mcap_topics(part, reading))
+    return list(topics)
 
 
-def is_video(path: Path) -> bool:
-    """Whether a file is a video, by its name."""
-    return path.suffix.lower() in VIDEOS and path.is_file()
+def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
+    """What is on each topic of a camera log that is not in MCAP files.
+
+    Args:
+        path: the log.
+        whole: read all of a bag, of which otherwise an index may do.
+
+    Raises:
+        LogDamagedError: it cannot be read.
+        CdmisfaError: a package that reads it is missing.
+    """
+    kind = log_format(path)
+    if kind == "dataset":
+        return dataset_channels(path)
+    if kind == "bag":
+        return bag_channels(path, whole=whole)
+    if kind == "table":
+        return table_channels(path)
+    with contextlib.closing(_open(path, None, salvage=False, reading=IMAGES)) as images:
+        ends = [int(t) for t in images.times[[0, -1]]] if len(images.times) else [None, None]
+        kind_of_image = "picture" if kind == "pictures" else "video"
+        return [ChannelFacts(images.topic, images.encoding, kind_of_image, images.count, *ends)]
 
 
-def is_bag(path: Path) -> bool:
-    """A ROS bag that is not in MCAP files."""
-    if path.is_dir():
-        return (path / "metadata.yaml").exists() and not any(path.glob("*.mcap"))
-    return path.suffix in BAGS
+def named_streams(
+    files: Sequence[Location], topics: Sequence[str], reading: Reading = IMAGES
+) -> list[tuple[Location, str | None]]:
+    """The log and the topic of each stream that is meant.
+
+    Without topics each log has one stream. As many topics as logs are one of each log in turn;
+    otherwise a topic, or every one that a pattern fits, is looked for in every log.
+
+    Raises:
+        UsageError: a log has no topic that a pattern fits, or no log has a topic.
+    """
+    if not topics:
+        return [(file, None) for file in files]
+    if not any(letter in topic for topic in topics for letter in "*?["):
+        if len(files) == 1 or len(topics) == 1:
+            return [(file, topic) for topic in topics for file in files]
+        if len(topics) == len(files):
+            return list(zip(files, topics, strict=True))
+    known = [(file, name) for file in files for name in image_topics(file, reading)]
+    found: dict[tuple[Location, str | None], None] = {}
+    for topic in topics:
+        fits = [(file, name) for file, name in known if fits_topic(name, topic)]
+        if not known:
+            raise UsageError(holds_none(files[0], reading))
+        if not fits:
+            there = ", ".join(sorted({name for _, name in known}))
+            where = files[0] if len(files) == 1 else f"none of the {len(files)} logs"
+            raise UsageError(f"{where}: no topic {topic}; there are: {there}")
+        found |= dict.fromkeys(fits)
+    return list(found)
 
 
-def is_picture_folder(path: Path) -> bool:
-    """Whether a folder holds pictures, and no log."""
-    return (
-        path.is_dir()
-        and not any(path.glob("*.mcap*"))
-        and any(p.suffix.lower() in PICTURES for p in path.iterdir())
-    )
-
-
-def is_split(path: Path) -> bool:
-    """Whether a folder is a rosbag2 of MCAP files, which are parts of one log."""
-    return (path / "metadata.yaml").is_file() and any(path.glob("*.mcap"))
+def fits_topic(name: str, topic: str) -> bool:
+    """Whether a topic is the one that is asked for, or of the pattern."""
+    return name == topic or fnmatch.fnmatchcase(name, topic)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cdmisfa.core.options import TIME, setting
-from recorder.images.options import Clock, ImageOptions
+from recorder.images.options import Clock, ImageOptions, Reading
 
 Align = Literal["index", "time"]
 Gaps = Literal["skip", "hold"]
@@ -48,3 +48,8 @@ class CameraOptions(ImageOptions):
         "Put camera streams that differ on one clock: the i-th image of each, or the "
         "last image at each time. By default they are refused.",
     )
+
+    @property
+    def reading(self) -> Reading:
+        """What is taken of messages and files."""
+        return Reading(self.depth, tuple(self.fields), self.time, self.stamp, self.color)

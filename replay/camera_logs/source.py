@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,8 @@ from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.options import option_words
-from recorder.images.decoding import Reading
 from recorder.images.fields import rounded
 from recorder.images.framing import framings
-from recorder.images.options import Clock, Depth, Fit, Size
 from recorder.images.pixels import Shown, UnknownPixels
 from recorder.images.videos import COLOR_RECIPE
 from replay.camera_logs.alignment import (
@@ -27,21 +25,27 @@ from replay.camera_logs.alignment import (
     counts,
     gaps_by_time,
     in_words,
+    known_times,
     missing,
     of_other_rate,
     overlap,
     pauses,
+    rate_of,
     retimed,
     step_of,
     unlike,
     with_gaps,
 )
-from replay.camera_logs.catalogue import named_streams
-from replay.camera_logs.joined import excerpts, join_parts, known_times, rate_of
-from replay.camera_logs.names import stream_names
-from replay.camera_logs.opening import identity_of, image_logs, open_images
-from replay.camera_logs.options import Align, CameraOptions, Gaps
-from replay.camera_logs.salvaged import BROKEN, SALVAGE, WholeImages
+from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
+from replay.camera_logs.options import Align, CameraOptions
+from replay.camera_logs.selected import (
+    BROKEN,
+    SALVAGE,
+    WholeImages,
+    excerpts,
+    join_parts,
+    unique_names,
+)
 from replay.camera_logs.stream import ImageStream
 from replay.storage.identity import Identity, LoggedSource
 from replay.storage.location import Location, Url
@@ -59,24 +63,10 @@ class ForeignSource(LoggedSource):
         paths: one log, or one log, video, table or folder of pictures a stream. Logs that follow
             one another in time are parts of one stream, unless they are aligned by index.
         topics: the topics, a stream each, or patterns; see `named_streams`.
-        size: (height, width) of a frame; by default `default_size` of the first image.
-        fit: how images of another aspect ratio become frames: see `fitted`.
-        align: how streams of unequal length, start or rate are put on one clock: "index"
-            takes the i-th image of each, "time" the last image at or before each tick.
-            None refuses such streams.
-        gaps: whether the frames of a pause are left out, so that no block reaches across, or
-            show the last image; see `pauses`.
-        start: seconds after the first image of all, before which images are left out.
-        stop: seconds after it from which on they are left out.
-        depth: distances in metres that are shown black and white.
-        fields: the numbers that are taken instead of images, one after the other.
-        time: the column of a table's times.
-        color: show red, green and blue beside one another, (height, 3 width).
-        stamp: the times of messages: those of the log, or those in their headers.
-        rate: frames a second; the first stream's where not given.
         loop: begin again at the end.
         salvage: leave out what is damaged, and broken images; see `WholeImages`.
         goal: the command and the folder of its result that a refusal names in what would work.
+        **chosen: how images become frames; see `CameraOptions`.
 
     Attributes:
         alignment: for each stream the counts of its messages, of repeated frames and of
@@ -95,21 +85,10 @@ class ForeignSource(LoggedSource):
         paths: str | Location | Sequence[str | Location],
         topics: Sequence[str] = (),
         *,
-        size: Size | None = None,
-        fit: Fit = "crop",
-        align: Align | None = None,
-        gaps: Gaps = "skip",
-        start: float = 0.0,
-        stop: float | None = None,
-        depth: Depth | None = None,
-        fields: Sequence[str] = (),
-        time: str | None = None,
-        stamp: Clock = "log",
-        color: bool = False,
-        rate: float | None = None,
         loop: bool = False,
         salvage: bool = False,
         goal: tuple[str, str] = ("learn", "RUN"),
+        **chosen: Any,
     ) -> None:
         """Open the logs and find their images.
 
@@ -118,83 +97,83 @@ class ForeignSource(LoggedSource):
                 need `align`.
             LogDamagedError: a log is damaged.
         """
-        slowest, fastest = RECORDED_FPS
-        if rate is not None and not slowest <= rate <= fastest:
-            raise UsageError(f"--rate is {rate}: it must be in [{slowest:g}, {fastest:.0f}]")
-        if size is not None and min(size) < 1:
-            raise UsageError(f"--size is {size[1]}x{size[0]}: it must be above 0")
-        if stop is not None and not start < stop:
-            raise UsageError(
-                f"--from {start:g} is no earlier than --to {stop:g}, both in seconds after the "
-                "first image: no image lies between them"
-            )
-        named = [paths] if isinstance(paths, str | Path | Url) else paths
-        self._files = image_logs(named)
-        self._loop = loop
-        self._reading = reading = Reading(depth, tuple(fields), time, stamp, color)
-        chosen = CameraOptions(**dataclasses.asdict(reading), size=size, fit=fit, gaps=gaps)
-        self._asked = dataclasses.replace(chosen, start=start, stop=stop)
-        self._goal, self._salvage = goal, salvage
+        self._options = options = CameraOptions(topics=tuple(topics), **chosen)
+        _check(options)
+        self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
+        self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
         self.changes: dict[int, str] = {}
         self._shown: dict[int, tuple[int, Shown]] = {}
         try:
-            for path, topic in named_streams(self._files, topics, reading):
-                self._streams.append(open_images(path, topic, salvage=salvage, reading=reading))
-            if align != "index":
-                self._streams = join_parts(self._streams)
-            if len({bool(stream.fields) for stream in self._streams}) > 1:  # with any --align
-                framings([self._image(i, 0) for i in range(len(self._streams))], None, fit)
-            self._align_by = align
-            self._fps = rate or rate_of(self._streams)
-            self._times = known_times(self._streams, self._fps)
-            if start or stop is not None:
-                self._streams = excerpts(self._streams, self._times, start, stop)
-                self._times = known_times(self._streams, self._fps)
-            if salvage:
-                self._streams = [WholeImages(stream) for stream in self._streams]
-            start_ns, self._rows, self._gaps = self._put_on_clock(align)
+            self._open()
+            start_ns, self._rows, self._gaps = self._put_on_clock()
             firsts = [self._image(stream, int(rows[0])) for stream, rows in enumerate(self._rows)]
-            if (
-                depth is not None
-                and firsts[0].ndim > 1
-                and not any(s.distances() for s in self._streams)
-            ):
+            images = firsts[0].ndim > 1
+            if options.depth and images and not any(s.distances() for s in self._streams):
                 raise UsageError(
                     f"{self._files[0]}: it holds no distances (16UC1, 32FC1): --range is for these"
                 )
-            self._framings = framings(firsts, size, fit, color=color)
-            shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
+            self._framings = framings(firsts, options.size, options.fit, color=options.color)
             for stream, rows in enumerate(self._rows):  # refused before anything is written
                 self._frame(stream, int(rows[0]))
         except BaseException:
             self.close()
             raise
         self._count = len(self._rows[0])
-        held_back: list[list[Span]] = self._gaps if gaps == "skip" else [[] for _ in self._gaps]
-        names, length = stream_names(self._streams), None if loop else self._count
+        names, length = unique_names(self._streams), None if loop else self._count
+        shape, dtype = self._framings[0].shape, str(firsts[0].dtype)
         self._spec = SourceSpec(names, shape, dtype, (), self._fps, start_ns, length)
-        self.alignment = dict(
-            zip(names, map(counts, self._times, self._rows, held_back), strict=True)
-        )
+        self.gaps = options.gaps == "skip" and any(self._gaps)
+        left_out = self._gaps if self.gaps else [[] for _ in self._gaps]
+        counted = map(counts, self._times, self._rows, left_out)
+        self.alignment = dict(zip(names, counted, strict=True))
         self.pauses = dict(zip(names, self._gaps, strict=True))
-        self.gaps = gaps == "skip" and any(self._gaps)
-        self._held = [outside(own, self._count) for own in self._gaps]
         self.shapes = dict(zip(names, map(str, self._framings), strict=True))
-        warnings = [w for s in self._streams for w in s.warnings]
-        warnings += [self._said_of_gaps(stream) for stream, own in enumerate(self._gaps) if own]
-        if align is None and (said := retimed(self._times[0], self._rows[0], self._fps)):
+        self._held = [outside(own, self._count) for own in self._gaps]
+        self.warnings = tuple(dict.fromkeys(self._warned()))
+
+    def _open(self) -> None:
+        """Open the streams, and find what is taken of them and when each image was."""
+        options, reading = self._options, self._options.reading
+        for path, topic in named_streams(self._files, options.topics, reading):
+            images = open_images(path, topic, salvage=self._salvage, reading=reading)
+            self._streams.append(images)
+        if options.align != "index":
+            self._streams = join_parts(self._streams)
+        if len({bool(stream.fields) for stream in self._streams}) > 1:  # refused with any --align
+            framings(self._firsts(), None, options.fit)
+        self._fps = options.rate or rate_of(self._streams)
+        self._times = known_times(self._streams, self._fps)
+        if options.start or options.stop is not None:
+            self._streams = excerpts(self._streams, self._times, options.start, options.stop)
+            self._times = known_times(self._streams, self._fps)
+        if self._salvage:
+            self._streams = [WholeImages(stream) for stream in self._streams]
+
+    def _firsts(self) -> list[Shown]:
+        return [self._image(stream, 0) for stream in range(len(self._streams))]
+
+    def _warned(self) -> Iterator[str]:
+        for images in self._streams:
+            yield from images.warnings
+        held = "no block reaches across" if self.gaps else "the last image is shown"
+        for images, own in zip(self._streams, self._gaps, strict=True):
+            if own:
+                said = in_words(own, self._fps)
+                yield f"{images.path}: {images.topic} has {said}: {held}"
+        if self._options.align is not None:
+            return
+        if said := retimed(self._times[0], self._rows[0], self._fps):
             one, way = self._streams[0], f"--align time --rate {self._fps:g} to keep its times"
             said = f"{one.path}: {one.topic} is taken by number, {said}"
-            warnings.append(f"{said}; convert or learn it with {way}")
-        self.warnings = tuple(dict.fromkeys(warnings))
+            yield f"{said}; convert or learn it with {way}"
 
     def scene(self) -> Mapping[str, str]:
-        """What was recorded: nobody says."""
+        """Not stated by the log."""
         return {}
 
     def _logs(self) -> list[Identity]:
-        parts = [part for stream in self._streams for part in stream.parts]
+        parts = [part for stream in self._streams for part in stream.logs]
         return [identity_of(path, parts) for path in self._files]
 
     def _described(self, logs: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -205,8 +184,8 @@ class ForeignSource(LoggedSource):
             "files": list(logs),
             "topics": [s.topic for s in self._streams],
             "size": list(self._spec.frame_shape),
-            "recipe": COLOR_RECIPE if self._reading.color else "; ".join(recipes),
-            "align": self._align_by,
+            "recipe": COLOR_RECIPE if self._options.color else "; ".join(recipes),
+            "align": self._options.align,
             "rate": self._fps,
             **self._chosen(),
             "alignment": self.alignment,
@@ -248,22 +227,22 @@ class ForeignSource(LoggedSource):
 
     def _chosen(self) -> dict[str, Any]:
         """What of the options changed the frames, as JSON values."""
+        options = self._options
         chosen: dict[str, Any] = {}
         if any(self._gaps):
             chosen["gaps"] = {name: [list(gap) for gap in own] for name, own in self.pauses.items()}
             chosen["gaps_are"] = "left out" if self.gaps else "the last image"
         if any(framing.lossy for framing in self._framings):
-            chosen["fit"] = self._asked.fit
-        if self._reading.depth is not None:
-            key = "range_metres" if self._spec.images else "range"
-            chosen[key] = list(self._reading.depth)
+            chosen["fit"] = options.fit
+        if options.depth is not None:
+            chosen["range_metres" if self._spec.images else "range"] = list(options.depth)
         if not self._spec.images:
             chosen["fields"] = [list(s.fields) for s in self._streams]
-        if self._reading.time is not None:
-            chosen["time"] = self._reading.time
-        if self._reading.stamp != "log":
-            chosen["stamp"] = self._reading.stamp
-        if self._reading.color:
+        if options.time is not None:
+            chosen["time"] = options.time
+        if options.stamp != "log":
+            chosen["stamp"] = options.stamp
+        if options.color:
             chosen["color"] = "red, green and blue beside one another"
         return chosen
 
@@ -316,12 +295,13 @@ class ForeignSource(LoggedSource):
         except UsageError as error:
             raise UsageError(f"{images.where(row)}: {error}") from None
 
-    def _put_on_clock(self, align: Align | None) -> tuple[int, list[Rows], list[list[Span]]]:
+    def _put_on_clock(self) -> tuple[int, list[Rows], list[list[Span]]]:
         """When frame 0 is, which image of each stream every frame shows, and each one's gaps."""
-        first, of = self._times[0], range(len(self._times))
+        first, align = self._times[0], self._options.align
         if align == "time":
             start, stop = overlap(self._times)
             if stop < start:
+                of = range(len(self._times))
                 ends = self._streams[min(of, key=lambda i: int(self._times[i][-1]))]
                 begins = self._streams[max(of, key=lambda i: int(self._times[i][0]))]
                 raise UsageError(
@@ -341,12 +321,6 @@ class ForeignSource(LoggedSource):
             one = self._streams[0]
             raise UsageError(f"{one.path}: {one.topic}: {error}") from None
         return int(first[0]), rows, [shared for _ in rows]
-
-    def _said_of_gaps(self, stream: int) -> str:
-        """What the user should know of a stream's gaps."""
-        held = "no block reaches across" if self.gaps else "the last image is shown"
-        images, said = self._streams[stream], in_words(self._gaps[stream], self._fps)
-        return f"{images.path}: {images.topic} has {said}: {held}"
 
     def _refuse_unequal(self) -> None:
         """Refuse streams that are not on one clock, or not of the rate asked for."""
@@ -379,16 +353,30 @@ class ForeignSource(LoggedSource):
 
     def _command(self, align: Align = "time") -> str:
         """A command that takes these streams; numbers that no clock puts together are refused."""
-        if self._reading.fields:
+        if self._options.fields:
             try:
-                firsts = [self._image(i, 0) for i in range(len(self._streams))]
+                firsts = self._firsts()
             except UsageError as error:
                 said = f"{error}; --field is of every stream, images are no numbers"
                 raise UsageError(said) from None
-            framings(firsts, None, self._asked.fit)
+            framings(firsts, None, self._options.fit)
         words = ["cdmisfa", self._goal[0], *map(str, self._files)]
         for stream in self._streams:
             words += ["--topic", stream.topic]
-        words += option_words(self._asked)
+        words += option_words(replace(self._options, topics=(), align=None, rate=None))
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
+
+
+def _check(options: CameraOptions) -> None:
+    """Refuse what no log can be read with."""
+    slowest, fastest = RECORDED_FPS
+    if options.rate is not None and not slowest <= options.rate <= fastest:
+        raise UsageError(f"--rate is {options.rate}: it must be in [{slowest:g}, {fastest:.0f}]")
+    if options.size is not None and min(options.size) < 1:
+        raise UsageError(f"--size is {options.size[1]}x{options.size[0]}: it must be above 0")
+    if options.stop is not None and not options.start < options.stop:
+        raise UsageError(
+            f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in seconds "
+            "after the first image: no image lies between them"
+        )

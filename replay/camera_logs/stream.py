@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted.memory import BUDGET, budget
-from recorder.images.decoding import MessageKind, Reading, Stamp, Taken, decoder_of, stamp_of
+from cdmisfa.core.untrusted import BUDGET, budget
+from recorder.images.decoding import MessageKind, Stamp, Taken, decoder_of, stamp_of
 from recorder.images.messages import SCHEMAS, holds_distances
-from recorder.images.options import Size
+from recorder.images.options import Reading, Size
 from recorder.images.pixels import RECIPE, Shown
 from recorder.log.messages import VECTOR_SCHEMA
 from replay.storage.location import Location
@@ -41,7 +41,7 @@ class ChannelFacts:
         encoding: of its messages: "cdr", "ros1", the codec of a video, "png".
         schema: type of its messages.
         messages: how many there are.
-        start_ns: time of the first, nanoseconds; None where nobody knows.
+        start_ns: time of the first, nanoseconds; None where it is not known.
         end_ns: time of the last.
         images: whether they are images that are read.
     """
@@ -50,8 +50,8 @@ class ChannelFacts:
     encoding: str
     schema: str
     messages: int
-    start_ns: int | None
-    end_ns: int | None
+    start_ns: int | None = None
+    end_ns: int | None = None
     images: bool = True
 
 
@@ -61,7 +61,7 @@ class ImageStream(ABC):
     Attributes:
         path: the log or the folder they are in.
         topic: the topic, or what stands for it.
-        times: (n,) uint64, when each was taken, in nanoseconds; empty where nobody knows,
+        times: (n,) uint64, when each was taken, in nanoseconds; empty where that is not known,
             in which case they are `count` images at any even rate.
         encoding: how its images are stored, where they are no messages of a log.
         recipe: how an image becomes a frame, for the record.
@@ -87,7 +87,7 @@ class ImageStream(ABC):
         return len(self.times)
 
     @property
-    def parts(self) -> Sequence[ImageStream]:
+    def logs(self) -> Sequence[ImageStream]:
         """The streams of single logs that it is made of."""
         return (self,)
 
@@ -100,21 +100,21 @@ class ImageStream(ABC):
             LogDamagedError: the log is damaged there.
         """
 
+    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
+        """What a function takes of a message; raises as `image`."""
+        raise NotImplementedError
+
     def stamp(self, row: int) -> int:
         """When an image was made, as its message says, nanoseconds.
 
         Raises:
-            UsageError: it is in no message, or this says nothing.
+            UsageError: it is in no message, or this states no time.
             MalformedRecord, LogDamagedError: as for `image`.
         """
         raise UsageError(f"{self.path}: {self.topic} is no topic of messages: leave out --stamp")
 
     def distances(self) -> bool:
-        """Whether its first image holds distances.
-
-        Raises:
-            MalformedRecord, LogDamagedError: as for `image`.
-        """
+        """Whether its first image holds distances; raises as `image`."""
         return False
 
     def stated_size(self, row: int) -> Size | None:
@@ -125,8 +125,7 @@ class ImageStream(ABC):
         """How an error names an image."""
         return f"{self.path}: {self.topic} at {self.times[row]} ns"
 
-    @abstractmethod
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - some keep no file open
         """Let go of the files; harmless when called twice."""
 
 
@@ -141,12 +140,7 @@ class MessageImages(ImageStream):
     decode: Taken
 
     @abstractmethod
-    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
-        """What is taken of a message.
-
-        Raises:
-            MalformedRecord, LogDamagedError: as for `image`.
-        """
+    def taken(self, row: int, take: Callable[[Any], Found]) -> Found: ...
 
     def image(self, row: int) -> Shown:
         return self.taken(row, self.decode)
@@ -164,48 +158,6 @@ class MessageImages(ImageStream):
     @cached_property
     def _stamp(self) -> Stamp | None:
         return stamp_of(self.kind)
-
-
-class ImagesOf(ImageStream):
-    """Images of another stream; a class that derives from it says which, or what is done to them.
-
-    Args:
-        images: the other stream, which is closed with this one.
-        times: of those that are taken of it, (n,) nanoseconds; empty where nobody knows.
-    """
-
-    def __init__(self, images: ImageStream, times: NDArray[np.uint64]) -> None:
-        self.path, self.topic, self.encoding = images.path, images.topic, images.encoding
-        self.recipe, self.fields, self.warnings = images.recipe, images.fields, images.warnings
-        self.told_rounded = images.told_rounded
-        self.times = times
-        self._images = images
-
-    @property
-    def parts(self) -> Sequence[ImageStream]:
-        return self._images.parts
-
-    def _row(self, row: int) -> int:
-        """Which row of the other stream a row is."""
-        return row
-
-    def image(self, row: int) -> Shown:
-        return self._images.image(self._row(row))
-
-    def stamp(self, row: int) -> int:
-        return self._images.stamp(self._row(row))
-
-    def distances(self) -> bool:
-        return self._images.distances()
-
-    def stated_size(self, row: int) -> Size | None:
-        return self._images.stated_size(self._row(row))
-
-    def where(self, row: int) -> str:
-        return self._images.where(self._row(row))
-
-    def close(self) -> None:
-        self._images.close()
 
 
 def choose_images(

@@ -23,7 +23,7 @@ from PIL import Image
 from cdmisfa.core.blocks import Block, SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.images.videos import pyav
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.recordings.view_file import intersection
 from replay.stored import Span
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import UsageError
 from replay.export.frames import file_names, pieces, pixel_format, shared_spans, write_film
-from replay.inputs.opening import Logged
+from replay.inputs import Logged
 from replay.stored import Span
 
 VERSION = "v3.0"

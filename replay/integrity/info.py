@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, Problem
-from replay.camera_logs.catalogue import channels_of
-from replay.camera_logs.opening import only_foreign
-from replay.inputs.words import places
+from replay.camera_logs.opening import channels_of, only_foreign
+from replay.inputs import places
 from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.log.files import make_folder
 from recorder.log.logfile import LogFile
-from recorder.log.whole import make_folder
 from recorder.mcap.chunks import UNUSED
 from recorder.mcap.mending import mended
 from recorder.mcap.reader import LogReader
@@ -205,8 +205,8 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:
                     known[number],
                     int(table.log_time[row]),
                     table.payload(row),
-                    int(table.headers["sequence"][row]),
-                    int(table.headers["publish_time"][row]),
+                    int(table.records["sequence"][row]),
+                    int(table.records["publish_time"][row]),
                 )
         _tally(tallies, table)
     _count_lost(reader, tallies)

@@ -12,11 +12,10 @@ from typing import Any
 from cdmisfa.core.errors import LogDamagedError
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import MalformedRecord, Problem, Segment
-from replay.camera_logs.catalogue import channels_of
-from replay.camera_logs.formats.table import is_table, table_notes
-from replay.camera_logs.opening import only_foreign, open_images
+from replay.camera_logs.opening import channels_of, log_format, only_foreign, open_images
 from replay.camera_logs.stream import ImageStream
-from replay.inputs.words import places
+from replay.camera_logs.table import table_notes
+from replay.inputs import places
 from replay.integrity.run_files import RunPass
 from replay.integrity.survey import SCHEMA, Crc, kind_of, moved, said, survey
 from replay.recordings.source import RecordedSource
@@ -105,7 +104,7 @@ def _check_images(path: Path) -> LogCheck:
     problems: list[Problem] = []
     notes: dict[str, None] = {}
     try:
-        if is_table(path):
+        if log_format(path) == "table":
             notes |= dict.fromkeys(table_notes(path))
         for channel in channels_of(path, whole=True):
             if channel.images and channel.messages:

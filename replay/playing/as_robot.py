@@ -7,12 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged
-from replay.playing.feed import Feed, opened_feed
-from replay.playing.pace import SLICE, Played, paced, rounds
+from replay.playing.feed import SLICE, Playback, Played, Topic, opened_messages, paced
 
 HOST: Final = "127.0.0.1"
 
@@ -28,17 +24,11 @@ LAST_SECONDS: Final = 0.5
 
 def play_as_robot(
     paths: Sequence[Path],
+    how: Playback,
     *,
-    rate: float = 1.0,
-    loop: bool = False,
-    fps: float | None = None,
-    cameras: CameraOptions | None = None,
-    about: Callable[[Logged], None] = lambda source: None,
     port: int = PORT,
     wait: int = 1,
     say: Callable[[str], None] = lambda line: None,
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[float, float | None], None] = lambda done, total: None,
 ) -> Played:
     """Serve a recording's messages on this machine when they are due.
 
@@ -47,16 +37,10 @@ def play_as_robot(
 
     Args:
         paths: the recording's folder, or files; or camera logs of others.
-        rate: how many seconds of the recording pass in one.
-        fps: frames a second of logs that tell none, as folders of pictures.
-        cameras: what is taken of camera logs of others; their rate is `fps`.
-        about: given what is played frame by frame before that, to say what it is.
-        loop: begin again at the end.
+        how: it is played.
         port: to listen at; 0 for a free one.
         wait: begin once clients have subscribed to so many topics.
         say: told the address.
-        stop: asked while waiting; true ends it.
-        progress: told the seconds that were played, and all that there are.
 
     Raises:
         UsageError: no such log, or foxglove-sdk is missing.
@@ -64,22 +48,20 @@ def play_as_robot(
         CdmisfaError: the port is taken.
     """
     played = Played()
-    with opened_feed(paths, fps, cameras, about) as feed, _Robot(feed, port) as robot:
+    with opened_messages(paths, how) as feed, _Robot(feed.topics, port) as robot:
         say(f"playing at ws://{HOST}:{robot.port}{', once watched' if wait else ''}")
-        while robot.watched < wait and not stop():
+        while robot.watched < wait and not how.stop():
             time.sleep(SLICE / 10)
-        total = None if loop else (feed.stop - feed.start) / NANOSECONDS
-        items = rounds(feed.messages, feed.start, feed.stop, loop=loop)
-        for since, message in paced(items, rate, played, stop=stop):
-            robot.publish(message.topic, message.data, feed.start + round(since / rate))
-            progress(played.seconds, total)
+        for since, message in paced(feed, how, played):
+            robot.publish(message.topic, message.data, feed.start + round(since / how.rate))
+            how.progress(played.seconds, feed.seconds(how))
     return played
 
 
 class _Robot:
     """The server, with a channel for each topic."""
 
-    def __init__(self, feed: Feed, port: int) -> None:
+    def __init__(self, topics: Sequence[Topic], port: int) -> None:
         try:
             import foxglove
             from foxglove.websocket import ServerListener
@@ -100,8 +82,8 @@ class _Robot:
 
         self._subscribed = subscribed
         self._context = context = foxglove.Context()  # channels are gone with it
-        self._channels: dict[Any, Any] = {}
-        for topic in feed.topics:
+        self._channels: dict[Topic, Any] = {}
+        for topic in topics:
             schema = foxglove.Schema(
                 name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema
             )
@@ -135,7 +117,7 @@ class _Robot:
         """Subscriptions that there are."""
         return len(self._subscribed)
 
-    def publish(self, topic: Any, data: bytes, time_ns: int) -> None:
+    def publish(self, topic: Topic, data: bytes, time_ns: int) -> None:
         """Tell a message to who has subscribed to its topic."""
         self._channels[topic].log(data, log_time=time_ns)
 

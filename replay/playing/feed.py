@@ -1,17 +1,19 @@
-"""Messages to be played: those of MCAP files as they are, the frames of other logs as images."""
+"""What is played, and when it is due: messages of MCAP files as they are, frames of other logs."""
 
 from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import UsageError
 from recorder.log.messages import (
     ENCODING,
@@ -22,13 +24,67 @@ from recorder.log.messages import (
     view_topic,
 )
 from recorder.mcap.reader import LogReader
-from replay.camera_logs.catalogue import fits_topic
+from replay.camera_logs.opening import fits_topic
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged, open_to_look, refuse_what_is_no_log
+from replay.inputs import Logged, open_to_look, refuse_what_is_no_log
 from replay.storage.opening import log_files, open_store, starts_as_log
 
-READ_AHEAD = 50
+READ_AHEAD: Final = 50
 """Frames that are read at once."""
+
+SLICE: Final = 0.1
+"""Most seconds between two looks at whether to stop."""
+
+
+@dataclass(frozen=True, slots=True)
+class Playback:
+    """How a recording, or camera logs of others, are played.
+
+    Attributes:
+        rate: how many seconds of the recording pass in one.
+        loop: begin again at the end, after the mean step between two times.
+        fps: frames a second of logs that tell none, as folders of pictures.
+        cameras: what is taken of camera logs of others; their rate is `fps`.
+        about: given what is played frame by frame before that, to say what it is.
+        stop: asked while waiting; true ends it.
+        progress: told the seconds that were played, and all that there are.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    fps: float | None = None
+    cameras: CameraOptions = CameraOptions()
+    about: Callable[[Logged], None] = lambda source: None
+    stop: Callable[[], bool] = lambda: False
+    progress: Callable[[float, float | None], None] = lambda done, total: None
+
+
+@dataclass
+class Played:
+    """What was played.
+
+    Attributes:
+        count: how many items.
+        seconds: of log time, all rounds together.
+        behind: seconds by which the last item came late.
+        stopped: whether it was ended before the last item.
+    """
+
+    count: int = 0
+    seconds: float = 0.0
+    behind: float = 0.0
+    stopped: bool = False
+
+
+class Timed(Protocol):
+    """Something with a log time."""
+
+    @property
+    def time_ns(self) -> int:
+        """The log time, in nanoseconds."""
+
+
+Item = TypeVar("Item", bound=Timed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +98,8 @@ class Topic:
     schema: bytes
 
 
-class Told(NamedTuple):
-    """A message with its log time, in nanoseconds."""
+class DueMessage(NamedTuple):
+    """A message with its log time, in nanoseconds, at which it is due."""
 
     time_ns: int
     topic: Topic
@@ -51,136 +107,156 @@ class Told(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What every stream shows at frame t, None where it shows nothing, and what the world knows."""
+    """What every stream shows at a frame, None where it shows nothing, and what the world knows."""
 
     time_ns: int
-    t: int
     shown: tuple[NDArray[Any] | None, ...]
     truth: NDArray[np.float64] | None
 
 
-class Feed(Protocol):
-    """Messages of a log, from its first to its last, as often as they are gone through.
+@dataclass(frozen=True, slots=True)
+class Feed(Generic[Item]):
+    """Messages or frames of a log, as often as they are gone through.
 
     Attributes:
-        topics: all that there are.
-        start: log time of the first message, in nanoseconds.
+        start: log time of the first, in nanoseconds.
         stop: log time of the last.
+        items: gives them in the order of their times.
+        topics: of messages, all that there are.
     """
 
-    topics: tuple[Topic, ...]
     start: int
     stop: int
+    items: Callable[[], Iterable[Item]]
+    topics: tuple[Topic, ...] = ()
 
-    def messages(self) -> Iterator[Told]:
-        """The messages in the order of their times."""
+    def seconds(self, how: Playback) -> float | None:
+        """Seconds from the first to the last; None where it never ends."""
+        return None if how.loop else (self.stop - self.start) / NANOSECONDS
+
+
+def paced(
+    feed: Feed[Item],
+    how: Playback,
+    played: Played,
+    *,
+    now: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[tuple[int, Item]]:
+    """Give each item at its own time, counted from the first: what is late delays none after it.
+
+    Args:
+        feed: of the items.
+        how: the rate, whether it loops, and when it stops.
+        played: told of what was given.
+        now: the time, in seconds.
+        sleep: waits so many seconds.
+
+    Yields:
+        The nanoseconds of log time since the first item, and the item.
+    """
+    begin = None
+    for since, item in _rounds(feed, loop=how.loop):
+        begin = now() if begin is None else begin
+        due = begin + since / NANOSECONDS / how.rate
+        while (left := due - now()) > 0 and not how.stop():
+            sleep(min(left, SLICE))
+        if how.stop():
+            played.stopped = True
+            return
+        played.count += 1
+        played.seconds = since / NANOSECONDS
+        played.behind = max(-left, 0.0)
+        yield since, item
+
+
+def _rounds(feed: Feed[Item], *, loop: bool) -> Iterator[tuple[int, Item]]:
+    """Items with the nanoseconds since the first, again and again where it loops."""
+    before = 0
+    while True:
+        times, last = 0, -1
+        for item in feed.items():
+            times, last = times + (item.time_ns != last), item.time_ns
+            yield before + item.time_ns - feed.start, item
+        if not loop or times == 0:
+            return
+        before += round((feed.stop - feed.start) * times / max(times - 1, 1)) or NANOSECONDS
 
 
 @contextlib.contextmanager
-def opened_source(
-    paths: Sequence[Path],
-    fps: float | None,
-    cameras: CameraOptions | None = None,
-    about: Callable[[Logged], None] = lambda source: None,
-) -> Iterator[Logged]:
+def opened_source(paths: Sequence[Path], how: Playback) -> Iterator[Logged]:
     """The frames of a recording, or of camera logs of others, from the first on.
-
-    Args:
-        paths: see `play_as_robot`.
-        fps: frames a second of logs that tell none.
-        cameras: what else is taken of camera logs of others, and how.
-        about: given them once they are open, to say what they are.
 
     Raises:
         UsageError: there is no such log, or it is a run.
         LogDamagedError: it is damaged.
     """
     try:
-        source = open_to_look(paths, replace(cameras or CameraOptions(), rate=fps))
+        source = open_to_look(paths, replace(how.cameras, rate=how.fps))
     except UsageError as error:  # where --rate is how fast it is played
         raise UsageError(str(error).replace("with --rate", "with --fps")) from None
     with contextlib.closing(source):
-        about(source)
+        how.about(source)
         yield source
 
 
 @contextlib.contextmanager
-def opened_feed(
-    paths: Sequence[Path],
-    fps: float | None = None,
-    cameras: CameraOptions | None = None,
-    about: Callable[[Logged], None] = lambda source: None,
-) -> Iterator[Feed]:
-    """The messages of a recording, or of camera logs of others; see `opened_source`.
-
-    Raises:
-        UsageError: there is no such log, or it is a run.
-        LogDamagedError: it is damaged.
-    """
+def opened_messages(paths: Sequence[Path], how: Playback) -> Iterator[Feed[DueMessage]]:
+    """The messages of a recording, or of camera logs of others; raises as `opened_source`."""
     for path in paths:
         refuse_what_is_no_log(path)
-    cameras = cameras or CameraOptions()
-    as_they_are = replace(cameras, topics=()) == CameraOptions()
+    as_they_are = replace(how.cameras, topics=()) == CameraOptions()
     with contextlib.ExitStack() as stack:
-        if as_they_are and all(_is_mcap(path) for path in paths):
+        if as_they_are and all(map(_is_mcap, paths)):
             files = log_files(paths)
             readers = [stack.enter_context(LogReader(open_store(file))) for file in files]
-            yield LoggedFeed(readers, cameras.topics)
+            yield _logged_messages(readers, how.cameras.topics)
         else:
-            yield FrameFeed(stack.enter_context(opened_source(paths, fps, cameras, about)))
+            yield _encoded_frames(stack.enter_context(opened_source(paths, how)))
 
 
 def _is_mcap(path: Path) -> bool:
-    if path.is_dir():
-        return any(path.glob("*.mcap*"))
-    return starts_as_log(path)
+    return any(path.glob("*.mcap*")) if path.is_dir() else starts_as_log(path)
 
 
-class LoggedFeed:
+def _logged_messages(readers: Sequence[LogReader], wanted: Sequence[str]) -> Feed[DueMessage]:
     """The messages of MCAP files, bytes and times as they are; what two files tell is told once.
 
     Args:
         readers: of the files.
-        topics: those that are played, or patterns of them; without any all.
+        wanted: topics that are played, or patterns of them; without any all.
 
     Raises:
         UsageError: there are no messages, or no such topic.
     """
+    known = [_topics(reader) for reader in readers]
+    path, there = readers[0].path, sorted({topic.name for one in known for topic in one.values()})
+    for asked in wanted:
+        if not any(fits_topic(name, asked) for name in there):
+            raise UsageError(f"{path}: no topic {asked}; it has: {', '.join(there)}")
+    if wanted:
+        chosen = {name for name in there if any(fits_topic(name, asked) for asked in wanted)}
+        known = [{n: t for n, t in one.items() if t.name in chosen} for one in known]
+    segments = [s for reader in readers for s in reader.segments if s.size]
+    if not segments:
+        raise UsageError(f"{path} has no messages: there is nothing to play")
 
-    def __init__(self, readers: Sequence[LogReader], topics: Sequence[str] = ()) -> None:
-        self._readers = readers
-        self._known = [_topics(reader) for reader in readers]
-        there = sorted({topic.name for known in self._known for topic in known.values()})
-        for asked in topics:
-            if not any(fits_topic(name, asked) for name in there):
-                raise UsageError(f"{readers[0].path}: no topic {asked}; it has: {', '.join(there)}")
-        if topics:
-            self._known = [
-                {
-                    n: t
-                    for n, t in known.items()
-                    if any(fits_topic(t.name, asked) for asked in topics)
-                }
-                for known in self._known
-            ]
-        self.topics = tuple(dict.fromkeys(t for known in self._known for t in known.values()))
-        segments = [s for reader in readers for s in reader.segments if s.size]
-        if not segments:
-            raise UsageError(f"{readers[0].path} has no messages: there is nothing to play")
-        self.start = min(segment.start for segment in segments)
-        self.stop = max(segment.end for segment in segments)
-
-    def messages(self) -> Iterator[Told]:
-        """See `Feed`."""
-        files = zip(self._readers, self._known, strict=True)
-        now, told = -1, set[Told]()
-        each = [_told(reader, known) for reader, known in files]
+    def messages() -> Iterator[DueMessage]:
+        now, told = -1, set[DueMessage]()
+        each = [_of_topics(reader, one) for reader, one in zip(readers, known, strict=True)]
         for message in heapq.merge(*each, key=lambda message: message.time_ns):
             if message.time_ns != now:
                 now, told = message.time_ns, set()
             if message not in told:  # every file of a recording has the truth
                 told.add(message)
                 yield message
+
+    return Feed(
+        start=min(segment.start for segment in segments),
+        stop=max(segment.end for segment in segments),
+        items=messages,
+        topics=tuple(dict.fromkeys(topic for one in known for topic in one.values())),
+    )
 
 
 def _topics(reader: LogReader) -> dict[int, Topic]:
@@ -192,67 +268,55 @@ def _topics(reader: LogReader) -> dict[int, Topic]:
     return topics
 
 
-def _told(reader: LogReader, known: dict[int, Topic]) -> Iterator[Told]:
+def _of_topics(reader: LogReader, known: dict[int, Topic]) -> Iterator[DueMessage]:
     for message in reader.messages():
         if message.channel.id in known:
-            yield Told(message.log_time, known[message.channel.id], message.data)
+            yield DueMessage(message.log_time, known[message.channel.id], message.data)
 
 
-class FrameFeed:
-    """The frames of a source as messages, as a recording of them would hold.
+def _encoded_frames(source: Logged) -> Feed[DueMessage]:
+    """The frames of a source as messages, as a recording of them would hold."""
+    spec, frames = source.spec, frames_feed(source)
+    encoders: list[Any] = [VectorEncoder() for _ in spec.streams]
+    if spec.images:
+        height, width = spec.frame_shape
+        encoders = [ImageEncoder(height, width, name) for name in spec.streams]
+    names = [view_topic(name) for name in spec.streams]
+    if spec.truth:
+        encoders.append(TruthEncoder(spec.truth))
+        names.append(TRUTH_TOPIC)
+    topics = [
+        Topic(name, ENCODING, encoder.schema, ENCODING, encoder.schema_data())
+        for name, encoder in zip(names, encoders, strict=True)
+    ]
 
-    Args:
-        source: of frames; left open.
-    """
+    def messages() -> Iterator[DueMessage]:
+        for frame in frames.items():
+            values = (*frame.shown, frame.truth)
+            for topic, encode, value in zip(topics, encoders, values, strict=False):
+                if value is not None:
+                    yield DueMessage(frame.time_ns, topic, encode(frame.time_ns, value))
 
-    def __init__(self, source: Logged) -> None:
-        self._source, spec = source, source.spec
-        self._first = source.t
-        self.start = spec.time_ns(self._first)
-        self.stop = spec.time_ns(self._first + source.frames - 1)
-        self._encoders: list[Any] = [
-            ImageEncoder(spec.frame_shape[0], spec.frame_shape[1], name)
-            if spec.images
-            else VectorEncoder()
-            for name in spec.streams
-        ]
-        topics = [
-            _topic(view_topic(name), encoder)
-            for name, encoder in zip(spec.streams, self._encoders, strict=True)
-        ]
-        self._truth = TruthEncoder(spec.truth) if spec.truth else None
-        if self._truth is not None:
-            topics.append(_topic(TRUTH_TOPIC, self._truth))
-        self.topics = tuple(topics)
-
-    def messages(self) -> Iterator[Told]:
-        """See `Feed`."""
-        for frame in frames_of(self._source, self._first):
-            told = zip(self.topics, self._encoders, frame.shown, strict=False)
-            for topic, encode, shown in told:
-                if shown is not None:
-                    yield Told(frame.time_ns, topic, encode(frame.time_ns, shown))
-            if self._truth is not None and frame.truth is not None:
-                data = self._truth(frame.time_ns, frame.truth)
-                yield Told(frame.time_ns, self.topics[-1], data)
+    return Feed(frames.start, frames.stop, messages, tuple(topics))
 
 
-def _topic(name: str, encoder: Any) -> Topic:
-    return Topic(name, ENCODING, encoder.schema, ENCODING, encoder.schema_data())
+def frames_feed(source: Logged) -> Feed[Frame]:
+    """Every frame of a source from its clock on, with what each stream shows at it."""
+    spec, first = source.spec, source.t
+    end = first + source.frames
 
+    def frames() -> Iterator[Frame]:
+        for start in range(first, end, READ_AHEAD):
+            stop = min(start + READ_AHEAD, end)
+            source.seek(start)
+            blocks = source.take_all(stop - start)
+            for t in range(start, stop):
+                shown: list[NDArray[Any] | None] = [None] * len(spec.streams)
+                truth = None
+                for block in blocks:
+                    if block.t <= t < block.t + len(block):
+                        shown[block.stream] = block.frames[t - block.t]
+                        truth = block.truth[t - block.t]
+                yield Frame(spec.time_ns(t), tuple(shown), truth)
 
-def frames_of(source: Logged, first: int) -> Iterator[Frame]:
-    """Every frame of a source from `first` on, with what each stream shows at it."""
-    spec, end = source.spec, first + source.frames
-    for start in range(first, end, READ_AHEAD):
-        stop = min(start + READ_AHEAD, end)
-        source.seek(start)
-        blocks = source.take_all(stop - start)
-        for t in range(start, stop):
-            shown: list[NDArray[Any] | None] = [None] * len(spec.streams)
-            truth = None
-            for block in blocks:
-                if block.t <= t < block.t + len(block):
-                    shown[block.stream] = block.frames[t - block.t]
-                    truth = block.truth[t - block.t]
-            yield Frame(spec.time_ns(t), t, tuple(shown), truth)
+    return Feed(spec.time_ns(first), spec.time_ns(end - 1), frames)

@@ -18,9 +18,9 @@ from rerun.chunk import Chunk
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import refuse_taken, whole
+from recorder.log.files import atomic_write, refuse_taken
 from replay.camera_logs.options import CameraOptions
-from replay.inputs.opening import Logged, holds_run, open_to_look
+from replay.inputs import Logged, holds_run, open_to_look
 from replay.recordings.poses import head_poses
 from replay.recordings.source import RecordedSource
 from replay.runs.columns import Blocks
@@ -135,7 +135,7 @@ def recording_to(
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
     recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))
     recording.set_log_time_enabled(False)
-    with whole(out) as partial:
+    with atomic_write(out) as partial:
         try:
             recording.save(partial)
             if not partial.exists():

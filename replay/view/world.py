@@ -13,7 +13,7 @@ import rerun as rr
 
 from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader

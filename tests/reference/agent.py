@@ -1,18 +1,18 @@
 """The curious agent in plain Python: what the kernels must come to, up to rounding.
 
-Its memory is that of the learner, an `Agent`; its rules are `Rules`.
+Its memory is that of the learner, an `Agent`; its rules are those of `rules`.
 """
 
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace as Rules
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.agents.agent import Agent, Rules
-from cdmisfa.agents.gate import CONSTANT, NOVEL, Frozen
+from cdmisfa.agents.agent import CONSTANT, NOVEL, Agent, Frozen
 from cdmisfa.core.arrays import FloatArray
 
 CONSTANT_VARIANCE, BAND, FORGOTTEN, TIE, IDLE_EPSILON = 1e-12, 2.0, 0.5, 1e-12, 1e-3
@@ -90,7 +90,12 @@ def known_to(
 
 
 def recognise(
-    agent: Agent, rules: Rules, frozen: Frozen, frames: NDArray[Any], x: FloatArray, scale: float
+    agent: Agent,
+    rules: Rules,
+    frozen: Frozen,
+    frames: NDArray[Any],
+    x: FloatArray,
+    scale: float,
 ) -> tuple[int, FloatArray, FloatArray, FloatArray]:
     """What knows a block; outputs, slowness and clustering error of the modules."""
     M, J = frozen.band_mean.shape

@@ -3,13 +3,13 @@
 import numpy as np
 
 from cdmisfa.core.config import LearnerConfig
-from cdmisfa.features.incsfa import State
+from cdmisfa.features.incsfa import IncSFAState
 
 
 class PlainIncSFA:
     """The rule frame by frame, in any float type and with any way to sum over the inputs."""
 
-    def __init__(self, state: State, config: LearnerConfig, dtype=np.float64, dot=np.dot):
+    def __init__(self, state: IncSFAState, config: LearnerConfig, dtype=np.float64, dot=np.dot):
         self.dot = dot
         self.config, self.n, self.dtype = config, 0, dtype
         self.mean, self.v, self.w = (x.astype(dtype) for x in (state.mean, state.v, state.w))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.features.recursive import PIECE, State
+from cdmisfa.features.recursive import PIECE, RecursiveState
 
 
 def most_different(rows: FloatArray, most: int, least: float) -> FloatArray:
@@ -29,7 +29,7 @@ def eigen(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return values[::-1], vectors.T[::-1]
 
 
-def learn_piece(state: State, x: FloatArray, gap: bool, window: int) -> float:
+def learn_piece(state: RecursiveState, x: FloatArray, gap: bool, window: int) -> float:
     """Take in a piece of a block (m, I) of values; the change of the outputs."""
     rank, seen, pairs = state.counts.tolist()
     size, (m, _) = len(state.variance), x.shape
@@ -60,7 +60,7 @@ def learn_piece(state: State, x: FloatArray, gap: bool, window: int) -> float:
     return change(state.weights[:, :k], before, variance)
 
 
-def solve(state: State, rank: int) -> None:
+def solve(state: RecursiveState, rank: int) -> None:
     """The slow features: least difference among the whitened components."""
     k = min(rank, len(state.spectrum))
     scale = 1 / np.sqrt(state.variance[:k])
@@ -80,7 +80,7 @@ def change(weights: FloatArray, before: FloatArray, variance: FloatArray) -> flo
     return float(np.sqrt(max(0.0, 2 - 2 * np.linalg.svd(alike, compute_uv=False).mean())))
 
 
-def update(state: State, frames: FloatArray, gap: bool, window: int) -> FloatArray:
+def update(state: RecursiveState, frames: FloatArray, gap: bool, window: int) -> FloatArray:
     """Learn from consecutive frames of values; what `RecursiveSFA.update` returns."""
     out = np.full(len(frames), np.nan)
     for start in range(0, len(frames), PIECE):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cdmisfa import kernels
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.learning import overwrite
-from cdmisfa.features.recursive import RecursiveSFA, State
-from cdmisfa.features.slowness import slowness, window_rate
+from cdmisfa.features.outputs import slowness_by_moments, window_rate
+from cdmisfa.features.recursive import RecursiveSFA, RecursiveState
 
 WHITE_NOISE = math.sqrt(2.0) / (2.0 * math.pi)
 """Slowness of white noise."""
@@ -23,6 +23,12 @@ FEWEST = 4
 
 ERRORS = 90
 """Blocks whose learning error is kept."""
+
+HELD = 32
+"""At most; those of other streams are begun anew when they are watched."""
+
+MEMORY = 2 * 1024**3
+"""Bytes that they may take together; where frames are large fewer of them are held."""
 
 _TINY = 1e-12
 
@@ -152,7 +158,7 @@ class Candidate:
         """(J,) slowness of each output on frames not yet learned from; NaN before any."""
         return np.array(
             [
-                slowness(derivative, square - mean * mean) if self.tests else math.nan
+                slowness_by_moments(derivative, square - mean * mean) if self.tests else math.nan
                 for mean, square, derivative in self._moments.T
             ]
         )
@@ -196,7 +202,7 @@ class Candidate:
             "last": self._last,
             "reference": self._reference,
         }
-        sfa = zip(State._fields, self.sfa.state, strict=True)
+        sfa = zip(RecursiveState._fields, self.sfa.state, strict=True)
         return own | {f"sfa.{name}": array for name, array in sfa}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -209,3 +215,59 @@ class Candidate:
         overwrite(own, arrays)
         self.blocks, self.tests, self._reference_age = own["counters"].tolist()
         self.change, self.regret = own["measures"].tolist()
+
+
+class Candidates(dict[int, Candidate]):
+    """Those that are held, by their streams.
+
+    Args:
+        new: makes one.
+        size: bytes of one.
+
+    Attributes:
+        most: held at once.
+    """
+
+    def __init__(self, new: Callable[[], Candidate], size: int) -> None:
+        super().__init__()
+        self._new = new
+        self.most = max(2, min(HELD, MEMORY // size))
+
+    def begun(self, stream: int, learning: NDArray[np.bool_], last: NDArray[Any]) -> Candidate:
+        """The candidate of a stream, for which another may have to go.
+
+        Args:
+            stream: which.
+            learning: (S,) which streams are being learned.
+            last: (S,) iterations of their last blocks.
+        """
+        if stream not in self:
+            while len(self) >= self.most:
+                idle = [s for s in self if not learning[s]]
+                del self[min(idle or self, key=lambda s: last[s])]
+            self[stream] = self._new()
+        return self[stream]
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything that changes in them, by name, a copy."""
+        held = sorted(self)
+        arrays = {
+            f"candidate.{stream}.{name}": array.copy()
+            for stream in held
+            for name, array in self[stream].arrays.items()
+        }
+        return arrays | {"held": np.array(held, dtype=np.int64)}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Hold the candidates that are stored in these arrays, among others.
+
+        Raises:
+            ValueError: an array is missing or of another shape or type.
+        """
+        self.clear()
+        for stream in arrays.get("held", np.zeros(0, np.int64)).tolist():
+            prefix = f"candidate.{stream}."
+            parts = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+            self[stream] = self._new()
+            self[stream].restore(parts)

@@ -15,32 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
+from cdmisfa.agents.blank import signals_of_block
 from cdmisfa.agents.inputs import count_inputs, rows_of
 from cdmisfa.agents.progress.attention import RECENT, RULES, Situation, interest
-from cdmisfa.agents.progress.candidate import Candidate
+from cdmisfa.agents.progress.candidate import Candidate, Candidates
 from cdmisfa.agents.progress.config import ProgressConfig
-from cdmisfa.agents.progress.held import Candidates
 from cdmisfa.agents.progress.judging import (
-    NO_PROGRESS,
-    PATIENCE,
-    hopeless,
-    known_by,
-    mastered,
-    promising,
-    stale,
-)
-from cdmisfa.agents.progress.streams import (
     GIVEN_UP,
     KNOWN,
     LEARNED,
     LEARNING,
+    NO_PROGRESS,
+    PATIENCE,
     REASONS,
     begin_watching,
     decide,
     differs,
+    hopeless,
+    known_by,
+    mastered,
     new_streams,
     outcomes,
-    watch,
+    promising,
+    stale,
+    take_output,
 )
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.blocks import PIXEL, Block, SourceSpec
@@ -48,7 +46,6 @@ from cdmisfa.core.expansion import expand, expanded_size
 from cdmisfa.core.learning import LearnerState, overwrite
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.features.slowness import instantaneous_slowness
 
 FEWEST_BLOCKS = 20
 """Of a window of tests, however long a block is."""
@@ -126,8 +123,11 @@ class ProgressLearner:
     @property
     def over(self) -> str:
         """Whether no stream is being learned, nor was for `learner.watch` blocks; see `Learner`."""
-        learning = (self._streams["state"] == LEARNING).any()
-        return "all_decided" if not learning and self._counts["idle"][0] > self.config.watch else ""
+        return (
+            "all_decided"
+            if not self._learning.any() and self._counts["idle"][0] > self.config.watch
+            else ""
+        )
 
     @property
     def max_modules(self) -> None:
@@ -168,7 +168,7 @@ class ProgressLearner:
         stream, count = block.stream, len(self.modules)
         own, counts = self._streams[stream], self._counts[0]
         novel = int(own["state"]) == LEARNING
-        candidate = self._candidates.begun(stream, self._streams)
+        candidate = self._candidates.begun(stream, self._learning, self._streams["last"])
         y_frozen = kernels.outputs(self._phi, self._offset, frames)
         error = candidate.error
         candidate.learn(frames, gap=int(own["next"]) != block.t)
@@ -176,59 +176,43 @@ class ProgressLearner:
         own["visits"] += 1
         counts["iteration"] += 1
         if int(own["module"]) >= 0:
-            watch(own, y_frozen[:, int(own["module"]) * self._n_outputs], self._window)
+            take_output(own, y_frozen[:, int(own["module"]) * self._n_outputs], self._window)
         self.events = self._judge(stream, candidate) + self._look_again()
-        learning = self._streams["state"] == LEARNING
-        counts["idle"] = 0 if learning.any() else counts["idle"] + 1
-        values, explored = self._choose(self._rng.random(2))
-        y = candidate.y
-        tested = candidate.tested
-        y_frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
-        none, shape = np.full(len(tested), np.nan), (count, self._n_outputs)
-        return BlockSignals(
-            iteration=self.iteration - 1,
-            t=block.t,
-            log_time=self.spec.time_ns(block.t),
-            stream=stream,
-            module=count + 1,
-            novel=novel and candidate.alive,
-            known_by=int(own["module"]) + 1 if candidate.alive else -1,
-            saved=len(self.modules) > count,
-            share=math.nan,
-            novel_blocks=candidate.blocks,
-            y=y,
-            y_frozen=np.ascontiguousarray(y_frozen),
-            eta=tested,
-            eta_dot=none,
-            variance=candidate.variance if candidate.tests else none,
-            eta_inst=instantaneous_slowness(y),
-            gate_mean=none,
-            gate_sd=none,
-            eta_inst_frozen=np.array([instantaneous_slowness(y) for y in y_frozen]).reshape(shape),
-            band_mean=np.array([m.eta for m in self.modules[:count]]).reshape(shape),
-            band_sd=np.full(shape, np.nan),
-            roc_error_inst=math.nan,
-            roc_error=math.nan,
-            roc_error_frozen=np.full(count, np.nan),
-            xi=math.nan,
-            xi_dot=math.nan,
-            curiosity=error - candidate.error,
-            expert=math.nan,
-            reward=error - candidate.error,
-            R=np.empty((0, 2, 0)),
-            Q=np.full((len(learning), 2), np.nan),
-            policy=self._policy,
-            epsilon=self.config.explore,
-            explored=explored,
-            action=int(self.stream != stream),
-            next_stream=self.stream,
-            change=candidate.change,
-            tested=float(tested[0]),
-            fitted=candidate.fitted,
-            learning_error=candidate.error,
-            interest=values,
-            state=self._streams["state"].copy(),
-        )
+        counts["idle"] = 0 if self._learning.any() else counts["idle"] + 1
+        interesting, explored = self._choose(self._rng.random(2))
+        tested, gained = candidate.tested, error - candidate.error
+        frozen = y_frozen.reshape(len(block), count, self._n_outputs).transpose(1, 0, 2)
+        shape = (count, self._n_outputs)
+        said: dict[str, Any] = {
+            "novel": novel and candidate.alive,
+            "known_by": int(own["module"]) + 1 if candidate.alive else -1,
+            "saved": len(self.modules) > count,
+            "novel_blocks": candidate.blocks,
+            "y": candidate.y,
+            "y_frozen": np.ascontiguousarray(frozen),
+            "eta": tested,
+            "eta_inst": kernels.instantaneous_slowness(candidate.y),
+            "eta_inst_frozen": _stacked([kernels.instantaneous_slowness(y) for y in frozen], shape),
+            "band_mean": _stacked([module.eta for module in self.modules[:count]], shape),
+            "curiosity": gained,
+            "reward": gained,
+            "R": np.empty((0, 2, 0)),
+            "policy": self._policy,
+            "epsilon": self.config.explore,
+            "explored": explored,
+            "action": int(self.stream != stream),
+            "next_stream": self.stream,
+            "change": candidate.change,
+            "tested": float(tested[0]),
+            "fitted": candidate.fitted,
+            "learning_error": candidate.error,
+            "interest": interesting,
+            "state": self._streams["state"].copy(),
+        }
+        if candidate.tests:
+            said["variance"] = candidate.variance
+        sizes = {"outputs": len(tested), "modules": count}
+        return signals_of_block(block, self.spec, self.iteration - 1, **sizes, **said)
 
     def summary(self) -> dict[str, Any]:
         """What became of each stream, as JSON values."""
@@ -241,9 +225,14 @@ class ProgressLearner:
         }
 
     @property
+    def _learning(self) -> NDArray[np.bool_]:
+        """(S,) which streams are being learned."""
+        return np.asarray(self._streams["state"] == LEARNING)
+
+    @property
     def _policy(self) -> NDArray[np.int64]:
         """(S,): 0 stay with a stream, for it is being learned; 1 switch."""
-        return np.where(self._streams["state"] == LEARNING, 0, 1)
+        return np.where(self._learning, 0, 1)
 
     def _new_candidate(self) -> Candidate:
         c = self.config
@@ -317,7 +306,7 @@ class ProgressLearner:
     def _look_again(self) -> tuple[str, ...]:
         """Begin what was given up once more, before all is over; the lines that say so."""
         streams = self._streams
-        if (streams["state"] == LEARNING).any():
+        if self._learning.any():
             return ()
         again = (streams["state"] == GIVEN_UP) & (streams["looks"] < self.config.looks - 1)
         for stream in np.flatnonzero(again).tolist():
@@ -350,7 +339,7 @@ class ProgressLearner:
 
     def _choose(self, draws: FloatArray) -> tuple[FloatArray, bool]:
         """Choose the next stream; what each promises, and whether one was drawn at random."""
-        counts, learning = self._counts[0], self._streams["state"] == LEARNING
+        counts, learning = self._counts[0], self._learning
         held = np.zeros(len(learning), dtype=bool)
         held[list(self._candidates)] = True
         if (learning & held).sum() >= self._candidates.most:
@@ -365,3 +354,7 @@ class ProgressLearner:
             counts["stay"] = 0
             counts["stream"], explored = RULES[self.config.attention](situation)
         return interest(situation), explored
+
+
+def _stacked(rows: list[FloatArray], shape: tuple[int, int]) -> FloatArray:
+    return np.array(rows).reshape(shape)

@@ -58,18 +58,20 @@ def arena_command(
     are run, or, with --page, the page made from the results that are there. Most sets need the
     extra [arena]; the set small needs nothing.
     """
-    from cdmisfa.arena.page import draw, table, write_page
-    from cdmisfa.arena.results import write_results
+    from cdmisfa.studies.arena.page import arena_table, draw_curves, write_arena_page
+    from cdmisfa.studies.arena.results import arena_results
 
     folder = out or Path("arena")
     failed = () if page is not None and not sets else _run(folder, sets, learners, seeds, each)
-    document = write_page(folder, page) if page is not None else write_results(folder)
-    figure, _ = draw(document, folder)
+    document = arena_results(folder)
+    figure, _ = draw_curves(document, folder)
+    if page is not None:
+        write_arena_page(document, figure, page)
     click.echo(f"figure {figure}" + (f", page {page}" if page is not None else ""), err=True)
     if as_json:
         print_json(document | {"schema": SCHEMA, "folder": folder})
     else:
-        print_table(*table(document))
+        print_table(*arena_table(document))
     for row in failed:
         at = " ".join(f"{key}={value}" for key, value in row["point"].items())
         click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=True)
@@ -81,13 +83,13 @@ def _run(
     folder: Path, sets: tuple[str, ...], learners: str | None, seeds: str, each: dict[str, Any]
 ) -> Any:
     """Compute what is missing; the rows of the trials that failed."""
-    from cdmisfa.arena.arena import arena
-    from cdmisfa.arena.sets import SETS, SUITE
+    from cdmisfa.studies.arena.arena import run_arena
+    from cdmisfa.studies.arena.streams import SETS, SUITE
 
     names = [name for word in sets for name in (SETS if word == ALL else (word,))]
     chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
     with bar("arena", "trials") as shown:
-        report = arena(
+        report = run_arena(
             folder,
             names or SUITE,
             chosen,

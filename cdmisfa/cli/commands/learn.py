@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,10 +29,12 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.core.learning import Sink
 
 if TYPE_CHECKING:
+    from cdmisfa.cli.interrupts import Stop
     from cdmisfa.core.blocks import Block, FrameSource
     from cdmisfa.core.learning import Learner
     from cdmisfa.core.signals import BlockSignals
-    from cdmisfa.experiments.runs import RunResult
+    from cdmisfa.experiments.run_folder import RunResult
+    from cdmisfa.experiments.sources import Configuration
     from recorder.cameras.options import LiveOptions
     from replay.camera_logs.options import CameraOptions
 
@@ -44,7 +46,7 @@ TICK = 0.1
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
-@uploads.out("Folder of the run, or s3://...; without it nothing is written.")
+@uploads.out_option("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed
 @options.preset
 @options.settings
@@ -104,27 +106,15 @@ def learn_command(
     /,
     source: tuple[str, ...],
     out: Path | None,
-    seed: int,
-    preset: str | None,
-    settings: tuple[str, ...],
-    algorithm: str | None,
-    max_iterations: int | None,
-    max_modules: int | None,
-    loop: bool,
     resume: bool,
-    salvage: bool,
-    live_view: bool,
-    no_rerun: bool,
-    follow: bool,
-    follow_timeout: float,
-    record_to: Path | None,
-    keyframes: int | None,
-    fsync_every: float | None,
     force: bool,
     as_json: bool,
     dry_run: bool,
+    no_rerun: bool,
+    live_view: bool,
     live: LiveOptions,
     cameras: CameraOptions,
+    **told: Any,
 ) -> None:
     """Learn slow feature modules from a scene, a recording, logs or cameras.
 
@@ -147,98 +137,127 @@ def learn_command(
     if not source:
         learn_as_begun(ctx, out if resume else None)
         return
+    from cdmisfa.experiments.command import command_of
     from cdmisfa.experiments.loop import INTERRUPTED
-    from cdmisfa.experiments.resume import command_of
-    from cdmisfa.experiments.runs import RunExhaustedError, run
-    from cdmisfa.experiments.sources import open_source, refuse_keys_of_scenes
+    from cdmisfa.experiments.session import run
     from recorder.cameras.words import is_live
 
-    frames: FrameSource
-    if algorithm is not None:
-        settings = (*settings, f"learner.algorithm={algorithm}")
-    if not resume:
-        refuse_keys_of_scenes(settings, source[0])
-    with contextlib.ExitStack() as stack:
-        if any(map(is_live, source)):
-            if resume or loop or salvage or follow or dry_run:
-                raise UsageError(
-                    "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
-                    "and --dry-run, or learn from a recording of them"
-                )
-            opened = live_source(
-                source,
-                replace(live, seed=seed),
-                cameras,
+    of_cameras = any(map(is_live, source))
+    if of_cameras:
+        opened = opened_live(ctx.params, source, live, cameras)
+    else:
+        opened = opened_logs(ctx.params, source, cameras)
+    with opened as (frames, configuration):
+        if dry_run:
+            print_plan(frames, as_json=as_json)
+            return
+        with learning(told["max_iterations"], as_json=as_json) as (stop, reporter):
+            if hasattr(frames, "stop"):
+                frames.stop = stop  # waiting for frames ends with a signal, too
+            kept = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
+            result = run(
+                frames,
+                configuration.learner,
                 out,
-                record_to,
-                preset=preset,
-                settings=settings,
-                fsync_every=fsync_every,
+                sections=configuration.tables(),
+                command=command_of(source, ctx.params, out or Path()),
                 force=force,
+                resume=resume,
+                rerun=not no_rerun,
+                live=live_view,
+                announce=announce,
+                sinks=(reporter,),
+                stop=stop,
+                hashing=reporter.hashing,
+                **{name: told[name] for name in kept},
             )
-            frames, configuration = stack.enter_context(opened)
-        else:
-            if record_to is not None:
-                raise UsageError(
-                    "--record is for live streams: leave it out, or see cdmisfa record"
-                )
-            frames, configuration = open_source(
-                source,
-                preset=preset,
-                settings=settings,
-                seed=seed,
-                loop=loop,
-                salvage=salvage,
-                cameras=cameras,
-                follow=follow_timeout if follow else None,
-            )
-            stack.callback(frames.close)
-            if dry_run:
-                print_plan(frames, as_json=as_json)
-                return
-            say_about(frames)
-            stack.callback(say_changes, frames)
-        try:
-            with bar("learning", "blocks") as shown, stoppable() as stop:
-                if hasattr(frames, "stop"):
-                    frames.stop = stop  # waiting for frames ends with a signal, too
-                reporter = Reporter(shown, max_iterations)
-                result = run(
-                    frames,
-                    configuration.learner,
-                    out,
-                    seed=seed,
-                    max_iterations=max_iterations,
-                    max_modules=max_modules,
-                    sections=configuration.tables(),
-                    force=force,
-                    rerun=not no_rerun,
-                    sinks=(reporter,),
-                    stop=stop,
-                    resume=resume,
-                    keyframes=keyframes,
-                    fsync_every=fsync_every,
-                    live=live_view,
-                    announce=announce,
-                    command=command_of(source, ctx.params, out or Path()),
-                    hashing=reporter.hashing,
-                )
-        except RunExhaustedError as error:
-            show(error.result, as_json=as_json)
-            raise
     if resume and not reporter.told and not stop():
         click.echo("nothing was left to do: the run had come as far before", err=True)
     show(result, as_json=as_json)
     if result.ended == INTERRUPTED:
-        if result.run is not None and not any(map(is_live, source)):
+        if result.run is not None and not of_cameras:
             again = f"cdmisfa learn --resume -o {quoted(result.run)}"
             click.echo(f"go on with {again}", err=True)
         ctx.exit(stop.exit_code)
 
 
+@contextlib.contextmanager
+def opened_logs(
+    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions
+) -> Iterator[tuple[FrameSource, Configuration]]:
+    """A scene, a recording or logs, and what is said of them before and after.
+
+    Args:
+        told: the options of the command.
+        source: its words.
+        cameras: how images of others become frames.
+    """
+    from cdmisfa.experiments.sources import open_source
+
+    if told["record_to"] is not None:
+        raise UsageError("--record is for live streams: leave it out, or see cdmisfa record")
+    frames, configuration = open_source(
+        source,
+        settings=settings_of(told),
+        cameras=cameras,
+        follow=told["follow_timeout"] if told["follow"] else None,
+        resumed=told["resume"],
+        **{name: told[name] for name in ("preset", "seed", "loop", "salvage")},
+    )
+    with contextlib.closing(frames):
+        if told["dry_run"]:
+            yield frames, configuration
+            return
+        say_about(frames)
+        try:
+            yield frames, configuration
+        finally:
+            say_changes(frames)
+
+
+def opened_live(
+    told: Mapping[str, Any], source: tuple[str, ...], live: LiveOptions, cameras: CameraOptions
+) -> contextlib.AbstractContextManager[tuple[FrameSource, Configuration]]:
+    """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
+    if any(told[name] for name in ("resume", "loop", "salvage", "follow", "dry_run")):
+        raise UsageError(
+            "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
+            "and --dry-run, or learn from a recording of them"
+        )
+    return live_source(
+        source,
+        replace(live, seed=told["seed"]),
+        cameras,
+        told["out"],
+        told["record_to"],
+        settings=settings_of(told),
+        **{name: told[name] for name in ("preset", "fsync_every", "force")},
+    )
+
+
+def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
+    """The settings of a command, --algorithm among them."""
+    algorithm = told["algorithm"]
+    named = () if algorithm is None else (f"learner.algorithm={algorithm}",)
+    return (*told["settings"], *named)
+
+
+@contextlib.contextmanager
+def learning(max_iterations: int | None, *, as_json: bool) -> Iterator[tuple[Stop, Reporter]]:
+    """Show the progress of a run, end it at a signal, and print its result if its source ended."""
+    from cdmisfa.experiments.run_folder import RunExhaustedError
+
+    try:
+        with bar("learning", "blocks") as shown, stoppable() as stop:
+            yield stop, Reporter(shown, max_iterations)
+    except RunExhaustedError as error:
+        show(error.result, as_json=as_json)
+        raise
+
+
 def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
     """Resume a run with the command that began it; options that are given win."""
-    from cdmisfa.experiments.resume import read_command
+    from cdmisfa.experiments.command import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")

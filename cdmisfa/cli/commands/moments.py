@@ -9,11 +9,9 @@ from typing import Any, TypeVar
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.learn import Reporter, outcome_line, show
-from cdmisfa.cli.interrupts import stoppable
+from cdmisfa.cli.commands.learn import learning, outcome_line, show
 from cdmisfa.cli.making import option
 from cdmisfa.cli.printing import SCHEMA, print_json, quoted
-from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -55,11 +53,11 @@ def at_command(
     keyframe no source is needed. --json prints all of its memory.
     """
     from cdmisfa.core.signals import ACTIONS
-    from cdmisfa.experiments.recompute.check import learner_after
-    from cdmisfa.experiments.runs import module_table
-    from replay.runs.folders import run_log
+    from cdmisfa.experiments.run_folder import module_table
+    from cdmisfa.experiments.session import Session
 
-    learner, t = learner_after(run, iterations, source)
+    with Session.at(run, iterations, source) as again:
+        log, learner, t = again.log, again.learner, again.t
     state, streams = learner.state, learner.spec.streams  # type: ignore[attr-defined]
     if save_module is not None:
         _save_unfinished(learner, save_module, force=force)
@@ -67,7 +65,7 @@ def at_command(
         print_json(
             {
                 "schema": SCHEMA,
-                "run": str(run_log(run).parent),
+                "run": str(log.parent),
                 "iterations": iterations,
                 "t": t,
                 "stream": streams[learner.stream],
@@ -97,7 +95,7 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
     """Write what a learner is learning as a file of one module."""
     import dataclasses
 
-    from recorder.log.whole import refuse_taken
+    from recorder.log.files import refuse_taken
     from replay.runs.modules import save_modules
 
     module = getattr(learner, "unfinished", None)
@@ -135,9 +133,9 @@ def check_command(
     files are no longer those it learned from, and exits with 4 if there are any. A part begins at
     the newest keyframe before it.
     """
-    from cdmisfa.experiments.recompute.check import check_run
+    from cdmisfa.experiments.session import Session
 
-    checked = check_run(run, source, start, stop)
+    checked = Session.check(run, source, start, stop)
     if as_json:
         print_json({"schema": SCHEMA, "run": str(run), **checked.as_json()})
     else:
@@ -180,51 +178,38 @@ def check_command(
 @click.pass_context
 def fork_command(
     ctx: click.Context,
+    /,
     run: Path,
-    at: int,
     out: Path,
-    settings: tuple[str, ...],
-    seed: int | None,
     max_iterations: int | None,
     max_modules: int | None,
-    source: tuple[str, ...],
     no_rerun: bool,
     keyframes: int | None,
     fsync_every: float | None,
-    force: bool,
     as_json: bool,
+    **told: Any,
 ) -> None:
     """Go on from some iteration of a run with other settings, as a run of its own.
 
     It has the run's first K iterations as they are; resume, check and view it like any run.
     """
     from cdmisfa.experiments.loop import INTERRUPTED
-    from cdmisfa.experiments.recompute.forks import fork_run
-    from cdmisfa.experiments.runs import RunExhaustedError
+    from cdmisfa.experiments.session import Session
 
     given = {"max_iterations": max_iterations, "max_modules": max_modules}
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            reporter = Reporter(shown, max_iterations)
-            result = fork_run(
-                run,
-                at,
-                out,
-                settings=settings,
-                seed=seed,
-                source=source,
-                limits={name: value for name, value in given.items() if value is not None},
-                force=force,
-                rerun=not no_rerun,
-                sinks=(reporter,),
-                stop=stop,
-                keyframes=keyframes,
-                fsync_every=fsync_every,
-                hashing=reporter.hashing,
-            )
-    except RunExhaustedError as error:
-        show(error.result, as_json=as_json)
-        raise
+    limits = {name: value for name, value in given.items() if value is not None}
+    with (
+        learning(max_iterations, as_json=as_json) as (stop, reporter),
+        Session.fork(run, folder=out, limits=limits, **told) as session,
+    ):
+        result = session.learn(
+            sinks=(reporter,),
+            stop=stop,
+            keyframes=keyframes,
+            fsync_every=fsync_every,
+            rerun=not no_rerun,
+            hashing=reporter.hashing,
+        )
     show(result, as_json=as_json)
     both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
     click.echo(f"both in one view: {both}", err=True)

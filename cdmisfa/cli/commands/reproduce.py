@@ -15,7 +15,7 @@ from cdmisfa.cli.printing import SCHEMA, print_json
 from cdmisfa.cli.progress import bar
 
 if TYPE_CHECKING:
-    from cdmisfa.paper.reproduce import Request
+    from cdmisfa.studies.paper.experiment import Request
 
 
 @click.command("reproduce")
@@ -52,13 +52,13 @@ def reproduce_command(
     not come out. Without NAME, --page makes the page from the results that are there.
     """
     from cdmisfa.core.errors import UsageError
-    from cdmisfa.paper.page import write_page
-    from cdmisfa.paper.reproduce import NAMES, Request, check
+    from cdmisfa.studies.paper.experiment import Request
+    from cdmisfa.studies.paper.reproduce import EXPERIMENTS, check_claims, write_paper_page
 
     root = out or Path("reproduction")
     if name is None and page is None:
-        raise UsageError(f"say which experiment: {', '.join(NAMES)} or all")
-    names = NAMES if name == "all" else (name,) if name else ()
+        raise UsageError(f"say which experiment: {', '.join(EXPERIMENTS)} or all")
+    names = tuple(EXPERIMENTS) if name == "all" else (name,) if name else ()
     documents: list[dict[str, Any]] = []
     for each in names:
         if each == "icub" and recording is None:
@@ -66,21 +66,21 @@ def reproduce_command(
         request = Request(trials, quick, recording, root / each, jobs, force)
         documents.append(_reproduce(each, request, engine=engine, scheduler=scheduler))
     if page is not None:
-        write_page(root, page)
+        write_paper_page(root, page)
         click.echo(f"page {page}", err=True)
     if as_json:
         print_json({"schema": SCHEMA, "experiments": documents})
     else:
         sys.stdout.write(_words(documents))
     for document in documents:
-        check(document)
+        check_claims(document)
 
 
 def _reproduce(
     name: str, request: Request, *, engine: str, scheduler: str | None
 ) -> dict[str, Any]:
     """Reproduce an experiment, and say on stderr how it went."""
-    from cdmisfa.paper.reproduce import reproduce
+    from cdmisfa.studies.paper.reproduce import reproduce
 
     started, finished = time.monotonic(), list[int]()
     with bar(name, "trials") as shown:
@@ -101,7 +101,7 @@ def _reproduce(
 
 
 def _words(documents: list[dict[str, Any]]) -> str:
-    from cdmisfa.paper.reproduce import markdown_table
+    from cdmisfa.studies.paper.reproduce import markdown_table
 
     parts = []
     for document in documents:

@@ -214,24 +214,18 @@ def play_command(
     if wait is not None and target != "foxglove":
         raise UsageError("--wait is for --to foxglove: a viewer that comes late is shown all")
     with bar("playing", "s") as shown, stoppable(notice="") as stop:
-        how: dict[str, Any] = {
-            "rate": rate,
-            "fps": fps,
-            "cameras": cameras,
-            "about": say_about,
-            "loop": loop,
-            "stop": stop,
-            "progress": shown.update,
-        }
+        from replay.playing.feed import Playback
+
+        how = Playback(rate, loop, fps, cameras, say_about, stop, shown.update)
         if target == "foxglove":
             from replay.playing.as_robot import PORT, play_as_robot
 
             at, begin = PORT if port is None else port, 1 if wait is None else wait
-            played = play_as_robot(recording, port=at, wait=begin, say=tell, **how)
+            played = play_as_robot(recording, how, port=at, wait=begin, say=tell)
         else:
             from replay.playing.in_rerun import play_in_rerun
 
-            played = play_in_rerun(recording, port=port, announce=announce, **how)
+            played = play_in_rerun(recording, how, port=port, announce=announce)
     if played.behind > 1:
         tell(f"it came to lag {played.behind:.1f} s behind: play it with a smaller --rate")
     what = "messages" if target == "foxglove" else "frames"

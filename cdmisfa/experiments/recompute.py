@@ -1,0 +1,375 @@
+"""Compute iterations of a run again: put its learner at a keyframe and learn on from there."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+import replay.runs.run
+from cdmisfa.agents.learners import open_learner
+from cdmisfa.core.blocks import SeekableSource, description
+from cdmisfa.core.errors import (
+    LogDamagedError,
+    LogExhaustedError,
+    NotReproducedError,
+    UsageError,
+)
+from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
+from cdmisfa.core.signals import BlockSignals
+from cdmisfa.experiments.command import read_command, source_of
+from cdmisfa.experiments.resume import config_history, reconfigured, restore
+from replay.runs.columns import SignalColumns, columns_of_records
+from replay.runs.compare import Difference, differing, first_differing
+from replay.runs.folders import run_log
+from replay.runs.keyframes import arrays_of, read_keyframe, read_keyframes
+from replay.runs.log import RunHeader, read_columns, read_header
+from replay.runs.run import other_files, stated_source
+
+SAME = ("streams", "frame_shape", "dtype", "fps", "start_ns")
+"""What a source must have in common with the one that a run learned from."""
+
+ROUNDING = 1e-6
+"""Share of a signal's largest number up to which another arithmetic explains a difference."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What came of computing the iterations [start, stop) of a run again.
+
+    Attributes:
+        difference: the first one, of the log from what was computed again.
+        arithmetic: version of the log's, and of what was computed again; where they differ, all
+            is compared up to rounding.
+        other_files: names of files that are not those the run learned from.
+    """
+
+    start: int
+    stop: int
+    difference: Difference | None
+    arithmetic: tuple[int, int] = (1, 1)
+    other_files: tuple[str, ...] = ()
+
+    @property
+    def same_arithmetic(self) -> bool:
+        """Whether bits can be compared."""
+        then, now = self.arithmetic
+        return then == now
+
+    @property
+    def holds(self) -> bool:
+        """Whether there are the same signals, of the same files."""
+        return self.difference is None and not self.other_files
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        found = self.difference
+        return {
+            "from": self.start,
+            "to": self.stop,
+            "identical": found is None and self.same_arithmetic,
+            "same_up_to_rounding": found is None,
+            "first_difference": None if found is None else found.as_json(),
+            "arithmetic": list(self.arithmetic),
+            "other_files": list(self.other_files),
+        }
+
+    def __str__(self) -> str:
+        files = ", ".join(self.other_files)
+        other = f"{files}: no longer what the run learned from" if files else ""
+        if self.difference is None:
+            what = f"iterations {self.start} to {self.stop - 1}"
+            how = "identical, bit for bit" if self.same_arithmetic else "the same up to rounding"
+            same = f"{what}: learned again, they are {how}"
+            if not self.same_arithmetic:
+                same += f" ({versions_differ(*self.arithmetic)})"
+            return f"{same}; but {other}" if other else same
+        why = other or ("" if self.same_arithmetic else versions_differ(*self.arithmetic))
+        return f"{self.difference} when learned again{why and f': {why}'}"
+
+
+def versions_differ(then: int, now: int) -> str:
+    """Two versions of the arithmetic, in words."""
+    return f"the run was learned with arithmetic {then}, this version computes with {now}"
+
+
+class Recomputation:
+    """A run's learner at the newest keyframe at or before an iteration, to learn on from there.
+
+    Args:
+        run: the run's folder, or its log.
+        iteration: iterations done.
+        source: words that name its source, where it is not what the run says.
+
+    Attributes:
+        log: of the run.
+        header: of the log.
+        learner: in its state after `learner.iteration` iterations.
+        t: the source's next frame.
+
+    Raises:
+        UsageError: there is no such run.
+        LogDamagedError: it cannot be read.
+    """
+
+    def __init__(self, run: Path, iteration: int, source: Sequence[str] = ()) -> None:
+        self.log = run_log(Path(run))
+        self.header: RunHeader = read_header(self.log)
+        self._words = tuple(source)
+        self._source: SeekableSource | None = None
+        spans = config_history(self.log, self.header.manifest)
+        keyframe = read_keyframe(self.log, iteration)
+        at = keyframe.iteration if keyframe else 0
+        span = [span for span in spans if span.start <= at][-1]
+        self._later = [span for span in spans if span.start > at]
+        self.learner: Learner = open_learner(span.config, self.header.spec, span.seed)
+        self.t = 0
+        if keyframe is not None:
+            restore(self.learner, keyframe)
+            self.t = keyframe.t
+
+    @classmethod
+    def after(cls, run: Path, iterations: int, source: Sequence[str] = ()) -> Self:
+        """A run's learner after so many iterations, bit for bit; to be closed.
+
+        What is computed again to get there is compared with the log.
+
+        Args:
+            run: its folder, or its log.
+            iterations: done before; 0 is the beginning.
+            source: words that name its source, where it is not what the run says.
+
+        Raises:
+            UsageError: there is no such run or iteration, or the source that is needed.
+            LogDamagedError: the log cannot be read.
+            NotReproducedError: computing again gives other signals than the log holds.
+        """
+        if iterations < 0:
+            raise UsageError(f"{iterations} iterations: a run begins after 0")
+        again = cls(Path(run), iterations, source)
+        with contextlib.ExitStack() as failing:
+            failing.callback(again.close)
+            at, found = again.compare(iterations)
+            if found is not None:
+                then, now = again.arithmetic
+                why = "name its own source with --source"
+                if then != now:
+                    why = f"{versions_differ(then, now)}: only states at its keyframes are exact"
+                raise NotReproducedError(f"{again.log}: learned again, {found}: {why}")
+            if at < iterations:
+                raise UsageError(f"{again.log} holds {at} iterations: name one of 0 to {at}")
+            failing.pop_all()
+        return again
+
+    @property
+    def arithmetic(self) -> tuple[int, int]:
+        """Version of the log's arithmetic, and of the learner's here."""
+        return self.header.arithmetic, arithmetic_of(self.learner)
+
+    def steps(self, count: int) -> Iterator[BlockSignals]:
+        """Learn so many blocks again.
+
+        Raises:
+            UsageError: the run's source is not there.
+            LogExhaustedError: it ended.
+        """
+        for _ in range(count):
+            if self._source is None:
+                self._source = self._open()
+                self._source.seek(self.t)
+            block = self._source.take(self.learner.stream, self.learner.tau)
+            signals = self.learner.step(block)
+            self.t = self._source.t
+            if self._later and self._later[0].start == self.learner.iteration:
+                try:
+                    span = self._later.pop(0)
+                    self.learner = reconfigured(self.learner, span, self.header.spec)
+                except ValueError as error:
+                    raise LogDamagedError(f"{self.log}: its fork cannot be ({error})") from error
+            yield signals
+
+    def compare(
+        self, stop: int | None, keyframes: Iterable[Keyframe] = (), rounding: float = 0.0
+    ) -> tuple[int, Difference | None]:
+        """Learn up to an iteration, or to the log's end: how far, and the log's first difference.
+
+        Args:
+            stop: the iteration.
+            keyframes: that are compared, too.
+            rounding: see `first_differing`.
+        """
+        left = iter(keyframes)
+        at, kept = self.learner.iteration, next(left, None)
+        for logged in self._logged(stop):
+            records: list[BlockSignals] = []
+            other: Difference | None = None
+            with contextlib.suppress(LogExhaustedError):
+                for signals in self.steps(len(logged)):
+                    records.append(signals)
+                    if kept is not None and kept.iteration == self.learner.iteration:
+                        other = other or self._difference_from(kept, rounding)
+                        kept = next(left, None)
+            learned = columns_of_records(records)
+            found = first_differing(iter([logged]), learned, self.header.schema, at, rounding)
+            at += len(logged)
+            both = [one for one in (found, other) if one is not None]
+            if both:
+                return at, min(both, key=lambda one: one.iteration)
+        return at, None
+
+    def other_files(self) -> list[str]:
+        """Names of the source's files that are not those it learned from.
+
+        None are named of a source of other words, of one that was not needed, and of a recording
+        that was still written.
+        """
+        if self._source is None or self._words or read_command(self.log.parent)[1].get("follow"):
+            return []
+        return other_files(stated_source(self.log), description(self._source, at_once=True))
+
+    def close(self) -> None:
+        """Let go of the source."""
+        if self._source is not None:
+            self._source.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _logged(self, stop: int | None) -> Iterator[SignalColumns]:
+        """The records of the log from the learner's iteration on, up to another one."""
+        at = self.learner.iteration
+        if at == stop:
+            return
+        for columns in read_columns(self.log, self.header, start=self.t):
+            kept = len(columns) if stop is None else min(len(columns), stop - at)
+            if kept <= 0:
+                return
+            if int(columns.iterations[0]) != at:
+                raise LogDamagedError(f"{self.log}: iteration {at} is missing, see cdmisfa verify")
+            yield columns.rows(0, kept)
+            at += kept
+
+    def _difference_from(self, keyframe: Keyframe, rounding: float) -> Difference | None:
+        """Where a keyframe differs from the learner after as many iterations."""
+        last, state = keyframe.iteration - 1, self.learner.state
+        kept, own = arrays_of(keyframe.state), arrays_of(state)
+        if kept.keys() != own.keys():
+            return Difference(last, "keyframe", (), ", ".join(kept), ", ".join(own))
+        for name, array in kept.items():
+            if (found := _first_element(array, own[name], rounding)) is not None:
+                return Difference(last, f"keyframe {name}", *found)
+        plain = {
+            "t": (keyframe.t, self.t),
+            "policy_rng": (dict(keyframe.state.policy_rng), dict(state.policy_rng)),
+        }
+        for name, (one, two) in plain.items():
+            if one != two:
+                return Difference(last, f"keyframe {name}", (), repr(one), repr(two))
+        return None
+
+    def _open(self) -> SeekableSource:
+        try:
+            source = source_of(self.log.parent, self._words)
+        except UsageError as error:
+            raise UsageError(
+                f"{error} (what it learned from is needed after {self.learner.iteration} "
+                "iterations, where it stands in its log: name it with --source)"
+            ) from error
+        now, then = source.spec, self.header.spec
+        if any(getattr(now, name) != getattr(then, name) for name in SAME):
+            source.close()
+            raise UsageError(
+                f"{' '.join(self._words) or 'its source'} shows other streams than {self.log} was "
+                "learned from: name its source with --source"
+            )
+        return source
+
+
+class Run(replay.runs.run.Run):
+    """What a run left behind, read where it is needed and only then.
+
+    Args:
+        path: the run's folder, or its log.
+
+    Raises:
+        UsageError: there is no such run, or it is of a later version of this software.
+        LogDamagedError: its log cannot be read, here or in any later access.
+    """
+
+    def at(self, iterations: int, source: Sequence[str] = ()) -> Learner:
+        """Its learner as it was after so many iterations, bit for bit.
+
+        Args:
+            iterations: done before; 0 is the beginning.
+            source: words that name what it learned from, where it is not what the run says.
+
+        Raises:
+            UsageError: it has not so many, or its source is not there; what stands in its log, a
+                keyframe every some hundred iterations, needs none.
+            NotReproducedError: learning again gives other signals than its log holds.
+        """
+        with Recomputation.after(self.log, iterations, source) as again:
+            return again.learner
+
+
+def check_run(
+    run: Path, source: Sequence[str] = (), start: int = 0, stop: int | None = None
+) -> Checked:
+    """Compute the iterations [start, stop) of a run again, and compare signals and keyframes.
+
+    Args:
+        run: its folder, or its log.
+        source: words that name its source, where it is not what the run says.
+        start: the newest keyframe at or before it is where learning begins.
+        stop: by default where its log ends.
+
+    Raises:
+        UsageError: there is no such run, source or part.
+        LogDamagedError: the log cannot be read.
+    """
+    if stop is not None and 0 < start >= stop:
+        raise UsageError(
+            f"from {start} to {stop} there is nothing to check: --from comes before --to"
+        )
+    with Recomputation(run, start, source) as again:
+        first, arithmetic = again.learner.iteration, again.arithmetic
+        rounding = 0.0 if arithmetic[0] == arithmetic[1] else ROUNDING
+        at, found = again.compare(stop, read_keyframes(again.log, first), rounding)
+        others = tuple(again.other_files())
+    if found is None:
+        if at <= start and (at or stop):
+            raise UsageError(f"{again.log} holds {at} iterations: choose a part of these")
+        if stop is not None and at < stop:
+            raise UsageError(f"{again.log} holds {at} iterations: end at one of these")
+    return Checked(first, at, found, arithmetic, others)
+
+
+def _first_element(
+    a: NDArray[Any], b: NDArray[Any], rounding: float
+) -> tuple[tuple[int, ...], str, str] | None:
+    """Place and values of the first element in which two arrays differ."""
+    if (a.dtype, a.shape) != (b.dtype, b.shape):
+        return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
+    if a.tobytes() == b.tobytes():
+        return None
+    if rounding and a.dtype.names:
+        fields = (_first_element(a[name], b[name], rounding) for name in a.dtype.names)
+        return next((found for found in fields if found is not None), None)
+    if rounding and a.dtype.kind == "f":
+        differ = differing(a, b, rounding).reshape(-1).tolist()
+    else:
+        pairs = zip(a.reshape(-1), b.reshape(-1), strict=True)
+        differ = [x.tobytes() != y.tobytes() for x, y in pairs]
+    if True not in differ:
+        return None
+    i = differ.index(True)
+    place = tuple(int(n) for n in np.unravel_index(i, a.shape))
+    return place, repr(a.reshape(-1)[i].item()), repr(b.reshape(-1)[i].item())

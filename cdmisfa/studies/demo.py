@@ -1,0 +1,140 @@
+"""The demonstration: record the iCub scene, learn from the log, check, and show."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cdmisfa.core.blocks import Block, SeekableSource
+from cdmisfa.core.errors import NotReproducedError
+from cdmisfa.core.learning import Learner, Sink
+from cdmisfa.core.modules import Module
+from cdmisfa.core.signals import ACTIONS, BlockSignals
+from cdmisfa.experiments.run_folder import RunResult
+from cdmisfa.experiments.session import run
+from cdmisfa.experiments.sources import configure, open_source
+from cdmisfa.experiments.statistics import correlation
+
+SCENE = "icub"
+MODULES = 2
+"""Views whose object has something slow about it: the one in the centre is pure noise."""
+
+CHECKED_ITERATIONS = 200
+"""Length of the stretch on which live and recorded signals are compared."""
+
+SCORED_FRAMES = 4000
+"""Frames on which a module's output is compared with the object's true position."""
+
+Stage = Callable[[str, str], AbstractContextManager[Any]]
+"""Opens a stage by its title and the unit that it counts; reports to a `cli.progress.Bar`."""
+
+
+def demo(out: Path, *, seed: int, frames: int, jobs: int, stage: Stage) -> dict[str, Any]:
+    """Record the scene, learn from the recording, compare with live, draw figures.
+
+    Args:
+        out: folder that gets `recordings/demo-icub` and `runs/demo-icub`; replaced.
+        seed: of world and learner.
+        frames: of the recording; the learner starts it again at its end.
+        jobs: processes that render.
+        stage: opens each stage's report of progress.
+
+    Returns:
+        What `demo --json` prints: files, and each module with the true quantity it follows.
+
+    Raises:
+        CdmisfaError: there is no simulator, or files cannot be written.
+        NotReproducedError: live and recorded signals differ.
+    """
+    from recorder.recording import record_scene
+    from replay.export.figures import draw_figures
+
+    configuration = configure(SCENE, seed=seed)
+    recording, folder = out / "recordings" / "demo-icub", out / "runs" / "demo-icub"
+
+    def learn(bar: Any, word: str | Path, out: Path | None, most: int | None) -> RunResult:
+        modules = MODULES if most is None else None
+        with _opened(word, seed) as source:
+            return run(
+                source,
+                configuration.learner,
+                out,
+                seed=seed,
+                sections=configuration.tables(),
+                force=True,
+                sinks=(ProgressSink(bar, most),),
+                max_iterations=most,
+                max_modules=modules,
+            )
+
+    with stage(f"1/4 recording three views, {frames} frames each", "frames") as bar:
+        record_scene(
+            SCENE,
+            recording,
+            configuration.scene,
+            configuration.record,
+            frames=frames,
+            jobs=jobs,
+            force=True,
+            progress=lambda done: bar.update(done, frames),
+        )
+    with stage("2/4 learning from the recording", "blocks") as bar:
+        result = learn(bar, recording, folder, None)
+    with stage("3/4 checking live against recorded", "blocks") as bar:
+        most = min(CHECKED_ITERATIONS, frames // 40)
+        live, recorded = (learn(bar, w, None, most).signals_sha256 for w in (SCENE, recording))
+        if live != recorded:
+            raise NotReproducedError(
+                f"live and recorded signals differ within {most} iterations of seed {seed}: "
+                "see `cdmisfa doctor`"
+            )
+        bar.say(f"live and recorded signals of {most} iterations are the same, bit for bit")
+    with stage("4/4 drawing figures", "modules"), _opened(recording, seed) as source:
+        return {
+            "schema": 1,
+            "recording": recording,
+            "run": folder,
+            "figures": draw_figures(folder, None, force=True),
+            "iterations": result.iterations,
+            "live_equals_recorded": True,
+            "modules": [followed_by(module, source) for module in result.modules],
+        }
+
+
+class ProgressSink(Sink):
+    """Says how far a run is."""
+
+    def __init__(self, bar: Any, max_iterations: int | None) -> None:
+        self._bar, self._max_iterations = bar, max_iterations
+
+    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
+        """See `Sink`."""
+        if learner.iteration % 10 == 0:
+            note = f"{len(learner.modules)} saved, ε {signals.epsilon:.2f}"
+            self._bar.update(learner.iteration, self._max_iterations, note)
+
+
+def _opened(word: str | Path, seed: int) -> AbstractContextManager[SeekableSource]:
+    return contextlib.closing(open_source([word], seed=seed, loop=True)[0])
+
+
+def followed_by(module: Module, source: SeekableSource) -> dict[str, Any]:
+    """A module, and the true quantity that its first output on its own view follows best."""
+    source.seek(0)
+    block = source.take(module.stream_index, SCORED_FRAMES)
+    y = module.transform(block.frames)[:, 0]
+    r = [correlation(y, column) for column in block.truth.T]
+    best = int(np.argmax(r))
+    return {
+        "module": module.index,
+        "view": module.stream,
+        "policy": [ACTIONS[action] for action in module.policy],
+        "iteration": module.iteration,
+        "follows": source.spec.truth[best],
+        "correlation": r[best],
+    }

@@ -1,0 +1,140 @@
+"""The images on one topic of an MCAP log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import UsageError
+from recorder.images.decoding import MessageKind, decoder_of
+from recorder.images.fields import NUMBERS_RECIPE
+from recorder.images.options import IMAGES, Reading
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Channel, MalformedRecord, Segment
+from recorder.mcap.tables import MessageTable
+from replay.camera_logs.stream import (
+    MessageImages,
+    NothingLoggedError,
+    choose_images,
+    explained,
+    sorted_times,
+)
+from replay.storage.location import Location
+from replay.storage.opening import open_store
+
+Found = TypeVar("Found")
+
+
+class McapImages(MessageImages):
+    """The images, or the numbers, on one topic of one log, in the order of log time.
+
+    Raises:
+        UsageError: no such topic, or not what is wanted on it.
+        LogDamagedError: the log is damaged.
+    """
+
+    def __init__(
+        self,
+        path: Location,
+        topic: str | None,
+        *,
+        salvage: bool = False,
+        reading: Reading = IMAGES,
+    ) -> None:
+        self.path = path
+        self._own: tuple[MessageTable | None, NDArray[np.intp]] = None, np.empty(0, np.intp)
+        if reading.fields:
+            self.recipe, self.fields = NUMBERS_RECIPE, reading.fields
+        self.reader = LogReader(open_store(path), salvage=salvage)
+        try:
+            _refuse_nothing(self.reader)
+            channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
+            own, self.decode = choose_images(path, topic, channels, reading)
+            self._channels = [channel.id for channel in own]
+            self.topic, self.kind = own[0].topic, _kind(self.reader, own[0])
+            found = list(self._by_index() if self.reader.by_index else self._by_pass())
+            if not any(len(own) for _, own in found):
+                raise UsageError(f"{path}: there is no message on {self.topic}")
+            self._segments = [segment for segment, _ in found]
+            log_times = np.concatenate([own for _, own in found])
+            order = np.argsort(log_times, kind="stable")
+            self.times = sorted_times(f"{path}: {self.topic}", log_times[order])
+            counts = [len(own) for _, own in found]
+            self._segment_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)[order]
+            self._row_in = np.concatenate([np.arange(count) for count in counts])[order]
+            self.reader.expect(self._segments)
+        except BaseException:
+            self.reader.close()
+            raise
+        self.warnings = self.reader.warnings
+
+    def taken(self, row: int, take: Callable[[memoryview], Found]) -> Found:
+        table = self.reader.table(self._segments[int(self._segment_of[row])])
+        if table is None:
+            raise MalformedRecord("it is damaged")
+        if self._own[0] is not table:
+            self._own = table, self._rows_of(table)
+        own, place = self._own[1], int(self._row_in[row])
+        if place >= len(own) or table.log_time[own[place]] != self.times[row]:
+            raise MalformedRecord("its chunk holds other messages than the summary names")
+        with explained(self.path, "its decoder", held=table.data.nbytes):
+            return take(table.view(int(own[place])))
+
+    def close(self) -> None:
+        self._own = None, self._own[1]
+        self.reader.close()
+
+    def _rows_of(self, table: MessageTable) -> NDArray[np.intp]:
+        """The rows of a chunk's table that are of the topic."""
+        return np.flatnonzero(np.isin(table.channel, self._channels))
+
+    def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
+        """The chunks with messages of the topic, and their log times, read and checked."""
+        for segment, table in self.reader.tables(ordered=False):
+            own = self._rows_of(table)
+            if len(own):
+                yield segment, table.log_time[own]
+
+    def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
+        """As `_by_pass`, by the message indexes: a chunk is checked when its images are read."""
+        segments = [
+            segment
+            for segment in self.reader.segments
+            if any((segment.channel_counts() or {}).get(channel) for channel in self._channels)
+        ]
+        self.reader.expect(segments, indexes=True)
+        for segment in segments:
+            index = self.reader.index(segment)
+            own = (pairs for channel, pairs in index if channel in self._channels)
+            pairs = np.concatenate([np.empty((0, 2), np.uint64), *own])
+            yield segment, pairs[np.argsort(pairs[:, 1], kind="stable"), 0]
+
+
+def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
+    """The topics of an MCAP log with what is wanted.
+
+    Raises:
+        LogDamagedError: it is no MCAP file, or has nothing in it.
+    """
+    with LogReader(open_store(path), salvage=True) as reader:
+        _refuse_nothing(reader)
+        channels = reader.channels.values()
+        found = (c.topic for c in channels if decoder_of(_kind(reader, c), reading) is not None)
+        return list(dict.fromkeys(found))
+
+
+def _refuse_nothing(reader: LogReader) -> None:
+    """Refuse a log that was cut before its first message."""
+    there = reader.channels and any(segment.size for segment in reader.segments)
+    if not reader.complete and not there:
+        raise NothingLoggedError(f"{reader.path}: {reader.missing}: there is no message before")
+
+
+def _kind(reader: LogReader, channel: Channel) -> MessageKind:
+    schema = reader.schemas.get(channel.schema_id)
+    if schema is None:
+        return MessageKind("no schema", channel.encoding)
+    return MessageKind(schema.name, channel.encoding, schema.data, schema.encoding)

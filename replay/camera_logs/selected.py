@@ -1,0 +1,332 @@
+"""Streams made of others: joined, cut, in another order, and with broken images replaced."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.clock import NANOSECONDS
+from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.images.options import Size
+from recorder.images.pixels import MalformedImage, Shown
+from recorder.images.videos import VIDEO_RECIPE, VideoPackets
+from recorder.mcap.records import MalformedRecord
+from replay.camera_logs.stream import ImageStream, UnreadableError, sorted_times
+from replay.storage.location import Location, Url
+
+Found = TypeVar("Found")
+
+BROKEN = (MalformedImage, MalformedRecord, UnreadableError)
+"""What is raised of one image, behind which there may be whole ones."""
+
+SALVAGE: Final = "learn and convert pass over what is broken with --salvage"
+"""What to do about it."""
+
+
+class Selected(ImageStream):
+    """Images of other streams, which are closed with this one.
+
+    Args:
+        streams: the others, of one topic; what is known of the first is taken to hold for all.
+        of: (n,) which of the streams each image is of.
+        rows: (n,) its row there.
+        times: (n,) when it was taken, nanoseconds; empty where that is not known.
+    """
+
+    def __init__(
+        self,
+        streams: Sequence[ImageStream],
+        of: NDArray[Any],
+        rows: NDArray[Any],
+        times: NDArray[np.uint64],
+    ) -> None:
+        first = streams[0]
+        self.path, self.topic, self.encoding = first.path, first.topic, first.encoding
+        self.recipe, self.fields, self.decode = first.recipe, first.fields, first.decode
+        self.warnings = [warning for stream in streams for warning in stream.warnings]
+        self.told_rounded = all(stream.told_rounded for stream in streams)
+        self.times = times
+        self._streams, self._of, self._rows = streams, of, rows
+
+    @property
+    def count(self) -> int:
+        return len(self._rows)
+
+    @property
+    def logs(self) -> Sequence[ImageStream]:
+        return [log for stream in self._streams for log in stream.logs]
+
+    def _at(self, row: int) -> tuple[ImageStream, int]:
+        return self._streams[int(self._of[row])], int(self._rows[row])
+
+    def image(self, row: int) -> Shown:
+        stream, own = self._at(row)
+        return stream.image(own)
+
+    def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
+        stream, own = self._at(row)
+        return stream.taken(own, take)
+
+    def stamp(self, row: int) -> int:
+        stream, own = self._at(row)
+        return stream.stamp(own)
+
+    def stated_size(self, row: int) -> Size | None:
+        stream, own = self._at(row)
+        return stream.stated_size(own)
+
+    def where(self, row: int) -> str:
+        stream, own = self._at(row)
+        return stream.where(own)
+
+    def distances(self) -> bool:
+        return any(stream.distances() for stream in self._streams)
+
+    def close(self) -> None:
+        for stream in self._streams:
+            stream.close()
+
+
+def selected(stream: ImageStream, rows: IntArray, times: NDArray[np.uint64]) -> Selected:
+    """Some rows of a stream, with their times."""
+    return Selected([stream], np.zeros(len(rows), np.int32), rows, times)
+
+
+def joined(
+    path: Location, streams: Sequence[ImageStream], warnings: Sequence[str] = ()
+) -> ImageStream:
+    """The images on one topic of several logs, by their times, ties in the order of the logs."""
+    times = np.concatenate([stream.times for stream in streams])
+    order = np.argsort(times, kind="stable")
+    of = np.repeat(np.arange(len(streams)), [stream.count for stream in streams])
+    rows = np.concatenate([np.arange(stream.count) for stream in streams])
+    found = Selected(streams, of[order], rows[order], times[order])
+    found.path = path
+    said = [*warnings]
+    if len(streams) > 1:
+        said = [f"{path}: {found.topic} is joined from {len(streams)} logs, by time", *said]
+    found.warnings = [*said, *found.warnings]
+    return found
+
+
+def join_parts(streams: Sequence[ImageStream]) -> list[ImageStream]:
+    """Join logs with one topic of which each begins after another ends; others stay streams."""
+    found: list[ImageStream] = []
+    for topic in dict.fromkeys(stream.topic for stream in streams):
+        own = [stream for stream in streams if stream.topic == topic]
+        ordered = sorted(own, key=lambda s: int(s.times[0]) if len(s.times) else 0)
+        follow = len(own) > 1 and all(
+            len(one.times) and len(two.times) and int(one.times[-1]) < int(two.times[0])
+            for one, two in itertools.pairwise(ordered)
+        )
+        found += [joined(ordered[0].path, ordered)] if follow else own
+    return found if len(found) < len(streams) else list(streams)
+
+
+def by_stamps(images: ImageStream) -> ImageStream:
+    """The images of a stream in the order and at the times that their messages state.
+
+    Every message is read for it.
+
+    Raises:
+        UsageError: they state none.
+        LogDamagedError: a message cannot be read.
+    """
+    stamps = np.empty(images.count, np.int64)
+    for row in range(images.count):
+        try:
+            stamps[row] = images.stamp(row)
+        except (MalformedRecord, MalformedImage) as error:
+            raise LogDamagedError(f"{images.where(row)}: {error}") from None
+    if len(stamps) > 1 and stamps.min() == stamps.max():
+        raise UsageError(
+            f"{images.path}: the headers on {images.topic} all say {stamps[0]} ns: leave out "
+            "--stamp header"
+        )
+    order = np.argsort(stamps, kind="stable")
+    times = sorted_times(f"{images.path}: {images.topic}", stamps[order])
+    return selected(images, order, times)
+
+
+def excerpts(
+    streams: Sequence[ImageStream],
+    times: Sequence[NDArray[np.uint64]],
+    start: float,
+    stop: float | None,
+) -> list[ImageStream]:
+    """What streams show from one moment to another, in seconds after the first image of all.
+
+    Args:
+        streams: the streams.
+        times: of their images, (n,) nanoseconds each.
+        start: of the first images.
+        stop: no image is so late; None for all.
+
+    Raises:
+        UsageError: a stream has no image there.
+    """
+    zero = min(int(t[0]) for t in times)
+    ends = [None if s is None else zero + round(s * NANOSECONDS) for s in (start, stop)]
+    found: list[ImageStream] = []
+    for images, own in zip(streams, times, strict=True):
+        low, high = (len(own) if e is None else int(np.searchsorted(own, e)) for e in ends)
+        if low >= high:
+            lasts = (int(own[-1]) - zero) / NANOSECONDS
+            raise UsageError(
+                f"{images.path}: {images.topic} has no images there, its last is at {lasts:g} s: "
+                "choose another --from or --to"
+            )
+        found.append(selected(images, np.arange(low, high), images.times[low:high]))
+    return found
+
+
+class VideoMessages(Selected):
+    """The pictures of a video in a log's messages, in any order.
+
+    They are those from the first on that needs none before it.
+
+    Args:
+        messages: the log's.
+        packets: their decoder.
+
+    Raises:
+        UsageError: no picture needs none before it.
+        LogDamagedError: the log is damaged.
+    """
+
+    def __init__(self, messages: ImageStream, packets: VideoPackets) -> None:
+        self._messages, self._packets = messages, packets
+        self._next = -1
+        self._broken: dict[int, MalformedImage | MalformedRecord] = {}
+        rows = np.arange(messages.count)
+        first = next((row for row in range(len(rows)) if self._begins(row)), len(rows))
+        if first == len(rows):
+            raise UsageError(f"{messages.path}: {messages.topic}: {self._why()}")
+        super().__init__(
+            [messages], np.zeros(len(rows) - first, np.int32), rows[first:], messages.times[first:]
+        )
+        self._first = first
+        self.recipe = VIDEO_RECIPE
+        if first:
+            lost = f"{self.path}: {first} pictures that need earlier ones are left out"
+            self.warnings = [*self.warnings, lost]
+
+    def image(self, row: int) -> Shown:
+        row += self._first
+        start = row
+        while start not in (self._first, self._next) and not self._begins(start):
+            start -= 1
+            if start in self._broken:  # of which those behind it are made
+                raise self._broken[start]
+        if start != self._next:
+            self._packets.forget()
+        self._next = -1
+        for at in range(start, row + 1):
+            try:
+                shown = self._messages.taken(at, self._packets)
+            except (MalformedImage, MalformedRecord) as error:
+                self._broken[at] = error
+                raise
+        self._next = row + 1
+        return shown
+
+    def distances(self) -> bool:
+        return False  # known without a message, which may be broken
+
+    def _begins(self, row: int) -> bool:
+        try:
+            return self._messages.taken(row, self._packets.begins)
+        except (MalformedImage, MalformedRecord):
+            return False
+
+    def _why(self) -> str:
+        """Why nothing of the video can be decoded."""
+        try:
+            self._messages.taken(0, self._packets.begins)
+        except (MalformedImage, MalformedRecord) as error:
+            return str(error)
+        return "each picture of its video needs earlier ones"
+
+
+class WholeImages(Selected):
+    """A stream's images, for a broken one the last whole one before it, else the first of all.
+
+    Which one that is depends on the log alone, not on what was asked for before.
+
+    Attributes:
+        broken: the rows of the broken images that were met, each with what is wrong with it.
+    """
+
+    def __init__(self, images: ImageStream) -> None:
+        rows = np.arange(images.count)
+        super().__init__([images], np.zeros(len(rows), np.int32), rows, images.times)
+        self.broken: dict[int, LogDamagedError] = {}
+        self._last: tuple[int, Shown] | None = None
+
+    def image(self, row: int) -> Shown:
+        """Decode an image, or that which stands for it; raises what is wrong if none is whole."""
+        for near in itertools.chain(range(row, -1, -1), range(row + 1, self.count)):
+            if near in self.broken:
+                continue
+            if self._last is not None and self._last[0] == near:
+                return self._last[1]
+            try:
+                self._last = near, super().image(near)
+                return self._last[1]
+            except BROKEN as error:
+                self.broken[near] = error
+        raise self.broken[row]
+
+    def distances(self) -> bool:
+        try:
+            return super().distances()
+        except BROKEN:
+            return True  # the image that would tell is broken
+
+    def said(self) -> str | None:
+        """That images are broken, as far as they were met; None where none was."""
+        if not self.broken:
+            return None
+        first = min(self.broken)
+        what = "messages" if self.fields else "images"
+        return (
+            f"{self.where(first)}: {self.broken[first]}: {len(self.broken)} broken of {self.count} "
+            f"{what}: the last whole one is taken instead"
+        )
+
+
+def unique_names(streams: Sequence[ImageStream]) -> tuple[str, ...]:
+    """Topics as names of streams, with the file's and folders' where topics are shared.
+
+    Raises:
+        UsageError: a topic of a log is named twice.
+    """
+    topics = [s.topic for s in streams]
+    if len(set(topics)) == len(topics):
+        return tuple(topics)
+    paths = [s.path.address if isinstance(s.path, Url) else str(s.path.resolve()) for s in streams]
+    places = list(zip(paths, topics, strict=True))
+    for i, place in enumerate(places):
+        if place in places[:i]:
+            raise UsageError(f"{topics[i]} of {streams[i].path} is named twice: leave one out")
+    for folders in range(max(len(Path(path).parts) for path in paths)):
+        names = [_in_folders(stream, folders) for stream in streams]
+        if len(set(names)) == len(names):
+            return tuple(names)
+    return tuple(f"{i + 1}/{topic}" for i, topic in enumerate(topics))
+
+
+def _in_folders(stream: ImageStream, folders: int) -> str:
+    """A stream's name with those of its file, and of some of the folders this is in."""
+    path, topic = stream.path, stream.topic
+    of_file = topic == path.stem or (isinstance(path, Path) and topic == path.resolve().name)
+    own = topic if of_file else path.stem + topic
+    above = Path(str(path) if isinstance(path, Url) else os.path.abspath(path)).parts[:-1]
+    return "/".join([*above[max(len(above) - folders, 0) :], own]).removeprefix("//")

@@ -1,0 +1,183 @@
+"""What words of a command line name, opened: recordings of ours, and camera logs of others."""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import glob
+import shlex
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from cdmisfa.core.errors import UsageError
+from recorder.mcap.reader import LogReader
+from replay.camera_logs.opening import ALL, WHOLE_FILES, only_foreign
+from replay.camera_logs.options import CameraOptions
+from replay.camera_logs.pictures import by_number
+from replay.camera_logs.source import ForeignSource, UnequalError
+from replay.recordings.source import RecordedSource, SeveralRecordingsError
+from replay.recordings.view_file import NoRecordingError
+from replay.runs.folders import RUN_FILE, RUN_METADATA, is_run
+from replay.storage.location import Location, Url, location
+from replay.storage.opening import log_files, open_store, starts_as_log
+
+Logged = RecordedSource | ForeignSource
+"""Frames from logs."""
+
+
+def open_log(
+    paths: Sequence[Location],
+    cameras: CameraOptions | None = None,
+    *,
+    loop: bool = False,
+    salvage: bool = False,
+    goal: tuple[str, str] = ("learn", "RUN"),
+) -> Logged:
+    """Open a recording of ours, or what else holds images.
+
+    Args:
+        paths: the folder of a recording or its views' files, or camera logs of others.
+        cameras: how images of others become frames; given, the paths are taken as such logs.
+        loop: start again at the end.
+        salvage: pass over what is damaged.
+        goal: the command and the folder of its result that a refusal names in what would work.
+
+    Raises:
+        UsageError: no such log, a run, or as for `ForeignSource`.
+        LogDamagedError: a log is damaged.
+    """
+    cameras = cameras or CameraOptions()
+    for path in paths:
+        refuse_what_is_no_log(path)
+    if cameras == CameraOptions() and not any(map(only_foreign, paths)):
+        with contextlib.suppress(NoRecordingError):
+            return RecordedSource(paths, loop=loop, salvage=salvage)
+        for path in paths:
+            _refuse_remote_run(path)
+    return open_cameras(paths, cameras, loop=loop, salvage=salvage, goal=goal)
+
+
+def open_to_look(
+    paths: Sequence[Location], cameras: CameraOptions | None = None, *, salvage: bool = False
+) -> Logged:
+    """Open what `open_log` does, with every topic of images; those that differ by their times.
+
+    What `cameras` choose is opened as they say.
+
+    Raises:
+        UsageError: as for `open_log`.
+        LogDamagedError: a log is damaged.
+    """
+    for path in paths:
+        refuse_what_is_no_log(path)
+    cameras = cameras or CameraOptions()
+    chosen = bool(cameras.topics or cameras.fields)
+    if not chosen and not any(map(only_foreign, paths)):
+        with contextlib.suppress(NoRecordingError, SeveralRecordingsError):
+            return RecordedSource(paths, salvage=salvage)
+    goal = ("convert", "REC")
+    if not chosen:
+        cameras = replace(cameras, topics=ALL)
+    try:
+        return open_cameras(paths, cameras, salvage=salvage, goal=goal)
+    except UnequalError:
+        return open_cameras(paths, replace(cameras, align="time"), salvage=salvage, goal=goal)
+
+
+def open_cameras(
+    paths: Sequence[str | Location],
+    cameras: CameraOptions,
+    *,
+    loop: bool = False,
+    salvage: bool = False,
+    goal: tuple[str, str] = ("learn", "RUN"),
+) -> ForeignSource:
+    """Open the camera logs of others as streams on one clock; see `ForeignSource`."""
+    chosen: dict[str, Any] = {each.name: getattr(cameras, each.name) for each in fields(cameras)}
+    return ForeignSource(paths, **chosen, loop=loop, salvage=salvage, goal=goal)
+
+
+def holds_run(path: Path) -> bool:
+    """Whether a folder or a file is a run, and no camera log.
+
+    Raises:
+        UsageError: it does not exist.
+        LogDamagedError: it is no log, or a damaged one.
+    """
+    return not only_foreign(path) and is_run(path)
+
+
+def refuse_what_is_no_log(path: Location) -> None:
+    """Refuse a run, and a file of another kind, neither of which is a damaged recording.
+
+    Raises:
+        UsageError: it is one of them.
+    """
+    if isinstance(path, Url):  # opened only once: see `_refuse_remote_run`
+        return
+    if path.is_dir():
+        run = is_run(path)
+    elif not path.exists():
+        raise UsageError(f"{path}: no such file or folder")
+    elif starts_as_log(path):
+        run = path.name.startswith(RUN_FILE) and is_run(path)
+    elif only_foreign(path) or ".mcap" in path.suffixes:  # the latter is a damaged log
+        run = False
+    else:
+        raise UsageError(f"{path} is no MCAP file: name a recording, or logs of cameras")
+    if run:
+        raise _a_run(path)
+
+
+def _refuse_remote_run(path: Location) -> None:
+    """Refuse a run behind a URL, once it is known to be no recording."""
+    if isinstance(path, Url) and not path.folder:
+        with LogReader(open_store(path)) as reader:
+            if any(record.name == RUN_METADATA for record in reader.metadata):
+                raise _a_run(path)
+
+
+def _a_run(path: Location) -> UsageError:
+    return UsageError(
+        f"{path} is a run, not a recording: look at it with cdmisfa view {shlex.quote(str(path))}, "
+        "or learn from what it learned from"
+    )
+
+
+def places(words: Sequence[str | Location]) -> list[Location]:
+    """The places that words name, in their order; a pattern names what matches, by number.
+
+    Raises:
+        UsageError: nothing matches a pattern, or a URL is of a kind that is not read.
+    """
+    found: list[Location] = []
+    for word in words:
+        found += _matches(word) if isinstance(word, str) and _is_pattern(word) else [location(word)]
+    for place in found:
+        if isinstance(place, Url) and place.suffix.lower() in WHOLE_FILES:
+            raise UsageError(f"{place}: of URLs MCAP logs are read: copy this file here first")
+    return found
+
+
+def _is_pattern(word: str) -> bool:
+    return any(letter in word for letter in "*?[") and not Path(word).exists()
+
+
+def _matches(word: str) -> list[Location]:
+    if "://" not in word:
+        matched = [Path(name) for name in glob.glob(word, recursive=True)]
+        matched = [path for path in matched if path.suffix not in (".rrd", ".json")]
+        if not matched:
+            raise UsageError(f"{word}: no file or folder matches")
+        return [*sorted(matched, key=by_number)]
+    if not word.startswith("s3://"):
+        return [location(word)]  # a question mark of a web address, and servers list nothing
+    folder, _, pattern = word.rpartition("/")
+    if _is_pattern(folder):
+        raise UsageError(f"{word}: a pattern is the last part of an s3:// address only")
+    listed = [log for log in log_files(location(folder)) if fnmatch.fnmatchcase(log.name, pattern)]
+    if not listed:
+        raise UsageError(f"{word}: no log matches")
+    return [log for log in listed if isinstance(log, Url)]
