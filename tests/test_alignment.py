@@ -13,7 +13,6 @@ from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.alignment import (
     Times,
-    by_index,
     by_time,
     counts,
     of_other_rate,
@@ -48,14 +47,6 @@ def test_every_frame_shows_the_last_image_at_or_before_it(
         shown = len(set(rows.tolist()))
         found = counts(stream, rows)
         assert (found["repeated"], found["dropped"]) == (len(clock) - shown, len(stream) - shown)
-
-
-def test_the_shortest_stream_ends_all_by_index() -> None:
-    streams = [times(1, 1), times(1, 1, 1, 1)]
-    one, two = by_index(streams)
-    assert one.tolist() == two.tolist() == [0, 1, 2]
-    assert counts(streams[0], one) == {"messages": 3, "repeated": 0, "dropped": 0}
-    assert counts(streams[1], two) == {"messages": 5, "repeated": 0, "dropped": 2}
 
 
 def test_a_rate_is_another_from_a_hundredth_on() -> None:

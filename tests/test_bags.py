@@ -16,7 +16,7 @@ from camera_files import HEIGHT, WIDTH, pictures
 from conftest import Cdmisfa
 
 from cdmisfa.core.blocks import FrameSource
-from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.testing.sources import SourceContract
 from replay.camera_logs.opening import open_images
 from replay.camera_logs.source import ForeignSource
@@ -105,15 +105,6 @@ def test_every_image_is_there_in_its_place(make: Callable[[Path], Path], tmp_pat
     source.close()
 
 
-@pytest.mark.parametrize("make", BAGS)
-def test_what_is_no_image_is_named(make: Callable[[Path], Path], tmp_path: Path) -> None:
-    path = make(tmp_path)
-    with pytest.raises(UsageError, match="/cam_left, /cam_right"):
-        ForeignSource(path)
-    with pytest.raises(UsageError, match="/chatter holds std_msgs"):
-        ForeignSource(path, ["/chatter"])
-
-
 @pytest.mark.parametrize("make", [ros1_bag, ros2_database])
 def test_a_torn_bag_is_one_line(make: Callable[[Path], Path], tmp_path: Path) -> None:
     path = make(tmp_path)
@@ -139,17 +130,6 @@ def test_without_rosbags_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     with pytest.raises(CdmisfaError, match=r"pip install rosbags \(the extra \[ros\]\)"):
         ForeignSource(path, TOPICS)
-
-
-def test_a_bag_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = (ros2_bag(tmp_path), "--topic", TOPICS[0], "--topic", TOPICS[1], "--size", "16x12")
-    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
-    learned = cdmisfa("learn", *words, *quick)
-    assert learned.code == 0, learned.err
-    assert len(learned.json["source"]["files"][0]["sha256"]) == 64
-    assert cdmisfa("convert", *words, "-o", tmp_path / "rec").code == 0
-    again = cdmisfa("learn", tmp_path / "rec", *quick)
-    assert again.json["signals_sha256"] == learned.json["signals_sha256"]
 
 
 def test_a_bag_is_described_by_its_index(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_files import PACKED, packed, raw
 from conftest import Cdmisfa
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from message_files import STEP, every, write_mcap
 from PIL import Image
 
@@ -18,7 +16,6 @@ from cdmisfa import GymSource
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import CAMERAS, CameraKind, open_live
-from recorder.images.decoding import MessageKind
 from recorder.images.framing import Framing
 from recorder.images.messages import image_decoder
 from recorder.images.videos import frame_colors
@@ -37,14 +34,6 @@ def colors(count: int = COUNT) -> np.ndarray:
 
 def beside(images: np.ndarray) -> np.ndarray:
     return np.concatenate([images[..., c] for c in range(3)], axis=-1)
-
-
-def raw(image: np.ndarray, encoding: str) -> bytes:
-    height, width = image.shape[:2]
-    step = image.size // height * image.itemsize
-    message = RawImage(width=width, height=height, step=step, encoding=encoding)
-    message.data = np.ascontiguousarray(image).tobytes()
-    return bytes(message.SerializeToString())
 
 
 @pytest.mark.parametrize(
@@ -105,14 +94,8 @@ def test_colours_of_other_formats_are_taken(tmp_path: Path) -> None:
 def test_colours_are_learned_from_recorded_and_replayed_alike(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    def packed(image: np.ndarray) -> bytes:
-        data = io.BytesIO()
-        Image.fromarray(image).save(data, "PNG")
-        return bytes(CompressedImage(data=data.getvalue(), format="png").SerializeToString())
-
-    kind = MessageKind("foxglove.CompressedImage", "protobuf")
     messages = (packed(image) for image in colors())
-    log = write_mcap(tmp_path / "a.mcap", kind, {"/cam": every(STEP, messages)})
+    log = write_mcap(tmp_path / "a.mcap", PACKED, {"/cam": every(STEP, messages)})
     options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
     out = tmp_path / "run"
     run = cdmisfa("learn", log, "--color", *options, "-o", out, "--no-rerun").json

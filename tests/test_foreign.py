@@ -321,15 +321,6 @@ class TestForeign(SourceContract):
         return ForeignSource(self.path, ["/left", "/right"], size=(3, 4))
 
 
-def test_frames_come_in_order_at_their_rate(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (30, 20)})
-    source = ForeignSource(tmp_path / "a.mcap", ["/right", "/left"], size=(3, 4))
-    assert source.spec.streams == ("/right", "/left")
-    assert (source.spec.fps, source.spec.length) == (50.0, 30)
-    assert source.take(1, 30).frames[:, 0, 0].tolist() == list(range(30))
-    assert source.alignment["/left"] == {"messages": 30, "repeated": 0, "dropped": 0}
-
-
 def test_streams_that_differ_are_refused_with_what_would_work(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (15, 40)})
     topics = ["/left", "/right"]

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from camera_files import HEIGHT, WIDTH, encoded, pictures, write_cameras
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
-from PIL import Image
 
 from cdmisfa.experiments.convert import convert
 from recorder.mcap.reader import LogReader
@@ -55,12 +53,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def pixels(data: bytes) -> np.ndarray:
     return np.frombuffer(RawImage.FromString(data).data, np.uint8).reshape(SIZE)
-
-
-def png(image: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "PNG")
-    return stream.getvalue()
 
 
 def stamp(i: int) -> int:
@@ -115,7 +107,7 @@ def test_logs_of_the_foxglove_sdk_are_streams(
                     width=WIDTH, height=HEIGHT, step=WIDTH, encoding="mono8", data=image.tobytes()
                 )
             else:
-                message = messages.CompressedImage(data=png(image), format="png")
+                message = messages.CompressedImage(data=encoded(image), format="png")
             channel.log(message, log_time=stamp(i))
     _check(tmp_path / "a.mcap")
 
@@ -135,7 +127,7 @@ def test_logs_of_mcap_ros2_are_streams(tmp_path: Path, kind: str) -> None:
                 message |= {"height": HEIGHT, "width": WIDTH, "encoding": "mono8"}
                 message |= {"is_bigendian": 0, "step": WIDTH, "data": image.tobytes()}
             else:
-                message |= {"format": "mono8; png compressed mono8", "data": png(image)}
+                message |= {"format": "mono8; png compressed mono8", "data": encoded(image)}
             writer.write_message("/cam", schema, message, stamp(i), stamp(i), i)
         writer.finish()
     _check(tmp_path / "a.mcap")

@@ -210,21 +210,6 @@ def test_a_video_that_lost_its_end_says_so(tmp_path: Path) -> None:
     source.close()
 
 
-def test_videos_are_learned_from_and_converted(
-    cdmisfa: Cdmisfa, videos: list[Path], tmp_path: Path
-) -> None:
-    words = (*videos, "--size", "16x12")
-    learned = cdmisfa("learn", *words, *QUICK)
-    assert learned.code == 0, learned.err
-    assert "left: 120 images" in learned.err
-    source = learned.json["source"]
-    assert "luma" in source["recipe"]
-    assert [len(file["sha256"]) for file in source["files"]] == [64, 64]
-    assert cdmisfa("convert", *words, "-o", tmp_path / "rec").code == 0
-    again = cdmisfa("learn", tmp_path / "rec", *QUICK)
-    assert again.json["signals_sha256"] == learned.json["signals_sha256"]
-
-
 def test_a_size_too_large_leaves_nothing_behind(
     cdmisfa: Cdmisfa, videos: list[Path], tmp_path: Path
 ) -> None:
