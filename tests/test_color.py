@@ -36,22 +36,24 @@ def beside(images: np.ndarray) -> np.ndarray:
     return np.concatenate([images[..., c] for c in range(3)], axis=-1)
 
 
+def decoded(message: bytes) -> np.ndarray:
+    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
+    assert decode is not None
+    return decode(message)
+
+
 @pytest.mark.parametrize(
     ("encoding", "places"), [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("bgra8", (2, 1, 0, 0))]
 )
 def test_pixels_keep_their_colours(encoding: str, places: tuple[int, ...]) -> None:
-    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
-    assert decode is not None
     image = colors(1)[0]
-    assert (decode(raw(image[:, :, list(places)], encoding)) == image).all()
+    assert (decoded(raw(image[:, :, list(places)], encoding)) == image).all()
 
 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_two_by_two_pixels_of_a_bayer_pattern_are_one_in_colours(bits: int) -> None:
-    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
-    assert decode is not None
     pattern = np.array([[10, 200, 11], [101, 30, 0], [1, 2, 3]]) << (bits - 8)
-    shown = decode(raw(pattern.astype(f"<u{bits // 8}"), f"bayer_grbg{bits}"))
+    shown = decoded(raw(pattern.astype(f"<u{bits // 8}"), f"bayer_grbg{bits}"))
     assert shown.tolist() == [[[200, 20, 101]]]
 
 

@@ -143,11 +143,9 @@ def ros_mcap(folder: Path, *, ros1: bool) -> Path:
     text, _ = store.generate_msgdef(name, ros_version=1 if ros1 else 2)
     pack = store.serialize_ros1 if ros1 else store.serialize_cdr
     rows = (bytes(pack(joint_state(store, row, ros1=ros1), name)) for row in angles())
-    kind = (
-        MessageKind("sensor_msgs/JointState", "ros1", text.encode(), "ros1msg")
-        if ros1
-        else MessageKind(name, "cdr", text.encode(), "ros2msg")
-    )
+    kind = MessageKind(name, "cdr", text.encode(), "ros2msg")
+    if ros1:
+        kind = MessageKind("sensor_msgs/JointState", "ros1", text.encode(), "ros1msg")
     return write_mcap(folder / "joints.mcap", kind, {"/joint_states": every(STEP, rows)})
 
 
