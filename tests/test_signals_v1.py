@@ -147,7 +147,7 @@ def test_a_later_version_is_refused_in_one_line(cdmisfa, tmp_path, monkeypatch, 
 def test_a_run_does_not_go_on_in_another_version() -> None:
     header = read_header(OLD)
     with pytest.raises(UsageError, match=f"signals = 1, not {SCHEMA_VERSION}: "):
-        refuse_difference(OLD, OLD / "run.mcap", header.spec, {ARITHMETIC: 1, **header.manifest})
+        refuse_difference(OLD / "run.mcap", header, header.spec, {ARITHMETIC: 1, **header.manifest})
 
 
 def test_sizes_without_values_allocate_nothing() -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, Problem
 from replay.camera_logs.opening import channels_of, only_foreign

@@ -205,8 +205,8 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:
                     known[number],
                     int(table.log_time[row]),
                     table.payload(row),
-                    int(table.headers["sequence"][row]),
-                    int(table.headers["publish_time"][row]),
+                    int(table.records["sequence"][row]),
+                    int(table.records["publish_time"][row]),
                 )
         _tally(tallies, table)
     _count_lost(reader, tallies)

@@ -12,7 +12,6 @@ import contextlib
 import re
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from replay.viewer.program import (
     open_privately,
     private_host,
     running,
+    until,
 )
 from replay.viewer.web import page_of, page_server, served
 
@@ -49,9 +49,6 @@ REGISTER_SECONDS = 300
 
 START_SECONDS = 60.0
 """Longest wait for the server to listen."""
-
-LAST_SECONDS = 5.0
-"""Longest wait, at the end, for the view that is being built."""
 
 Progress = Callable[[int, int], None]
 
@@ -155,7 +152,6 @@ def serve_catalogue(
         LogDamagedError: a run without a run.json cannot be read.
         CdmisfaError: the server ended with an error.
     """
-    ended = threading.Event()
     with contextlib.ExitStack() as opened:
         table = opened.enter_context(served_table(folder, None if web else port))
         if table is None:
@@ -167,13 +163,16 @@ def serve_catalogue(
         print(shown, file=sys.stderr, flush=True)
         if has_display() and not web:
             open_privately(table.address)
-        follow = threading.Thread(target=_follow, args=(table, tab, progress, ended), daemon=True)
-        follow.start()
         try:
-            table.server.wait()
-        finally:
-            ended.set()
-            follow.join(LAST_SECONDS)
+            set_layout(table.runs, table.dataset, table.place, tab)
+        except (CdmisfaError, *REFUSALS) as error:
+            print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
+        try:
+            add_views(table.runs, table.dataset, table.place, progress)
+        except REFUSALS as error:
+            time.sleep(1.0)  # when interrupted the server may die before us; that is no error
+            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+        table.server.wait()
 
 
 @contextlib.contextmanager
@@ -193,31 +192,11 @@ def _created(address: str, name: str, server: Program) -> Any:
     Raises:
         CdmisfaError: it does not listen in time.
     """
-    end, refusal = time.monotonic() + START_SECONDS, ""
-    while time.monotonic() < end:
-        if server.poll() is not None:
-            return None
-        try:
-            return CatalogueClient(address).create_dataset(name)
-        except REFUSALS as error:
-            refusal = str(error).splitlines()[0]
-        time.sleep(0.01)
-    raise CdmisfaError(f"the server did not start within {START_SECONDS:.0f} s: {refusal}")
 
+    def create() -> Any:
+        return CatalogueClient(address).create_dataset(name)
 
-def _follow(
-    table: Table, tab: str | None, progress: Progress | None, ended: threading.Event
-) -> None:
-    """Lay the runs of a table out, and add their views."""
-    try:
-        set_layout(table.runs, table.dataset, table.place, tab)
-    except (CdmisfaError, *REFUSALS) as error:
-        print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
-    try:
-        add_views(table.runs, table.dataset, table.place, progress, ended)
-    except REFUSALS as error:
-        if not ended.wait(1.0):  # when interrupted the server may die before us; that is no error
-            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+    return until(create, START_SECONDS, "the server did not start", server)
 
 
 def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None = None) -> None:
@@ -263,7 +242,6 @@ def add_views(
     dataset: Any,
     place: Path,
     progress: Progress | None = None,
-    ended: threading.Event | None = None,
 ) -> None:
     """Add the views of runs to the rows that a server has, building what is missing or old.
 
@@ -274,13 +252,10 @@ def add_views(
         dataset: the server's.
         place: folder for copies of views.
         progress: called with the runs that are done, and all.
-        ended: set once the server has ended.
     """
     for start in range(0, len(runs), TOGETHER):
         views: list[Path] = []
         for i, run in enumerate(runs[start : start + TOGETHER], start + 1):
-            if ended is not None and ended.is_set():
-                return
             try:
                 views.append(ready_view(run))
             except (CdmisfaError, OSError) as error:

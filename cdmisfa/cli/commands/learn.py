@@ -46,7 +46,7 @@ TICK = 0.1
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
-@uploads.out("Folder of the run, or s3://...; without it nothing is written.")
+@uploads.out_option("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed
 @options.preset
 @options.settings

@@ -43,7 +43,7 @@ LIVE = ("cameras", "gym")
 
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
 @click.argument("source", nargs=-1)
-@uploads.out("Folder of the recording, or s3://...")
+@uploads.out_option("Folder of the recording, or s3://...")
 @option(
     "--frames",
     type=click.IntRange(1),
@@ -268,7 +268,7 @@ def record_streams(
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
 @click.argument("source", nargs=-1, required=True)
-@uploads.out("Folder of the recording, or s3://...; --dry-run needs none.")
+@uploads.out_option("Folder of the recording, or s3://...; --dry-run needs none.")
 @options.log_options
 @options.dry_run
 @options.live_options
