@@ -15,7 +15,7 @@ from run_data import IMAGE, VECTOR, write_run
 from test_view import rows_of, scalars
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import STATES
 from recorder.log.scenery import NECK, scenery_of, turned
@@ -30,7 +30,7 @@ from replay.view.build import build_view
 from replay.view.world.known import PRESET, world_of_run
 from replay.view.world.wall import places
 
-CONFIG = as_table(IcubConfig())
+CONFIG = section_table(IcubConfig())
 SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)
 LIVE = {"kind": "icub", "seed": 0, "scene": CONFIG}
 ITERATIONS, TAU, EVERY = 12, 40, 20
@@ -62,7 +62,7 @@ def layout_names(path):
 @pytest.mark.parametrize("yaw", [45.0, 0.0, -20.0])
 def test_eyes_stand_where_those_of_the_simulator_stand(yaw):
     config = IcubConfig(eyes=dataclasses.replace(IcubConfig().eyes, yaw=(yaw,), views=("a",)))
-    (gaze,) = scenery_of(as_table(config)).gazes
+    (gaze,) = scenery_of(section_table(config)).gazes
     for side, eye in zip((1, -1), gaze.eyes, strict=True):
         view = np.array(eye_matrix(config.eyes, np.array(NECK), yaw, side)).reshape(4, 4).T
         right, up, back = view[:3, :3]

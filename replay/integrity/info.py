@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Problem, Segment
