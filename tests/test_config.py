@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 
 from cdmisfa.core.config import (
     LearnerConfig,
-    as_table,
     build,
-    convert,
+    convert_value,
     load_preset,
     parse_settings,
     presets,
+    section_table,
 )
 from cdmisfa.core.errors import UsageError
 
@@ -211,7 +211,7 @@ def test_nested_mistakes_name_the_whole_key(layer: dict[str, Any], message: str)
     )
 )
 def test_as_table_and_build_are_inverse(outer: Outer) -> None:
-    assert build(Outer, "scene", as_table(outer)) == outer
+    assert build(Outer, "scene", section_table(outer)) == outer
 
 
 @given(
@@ -224,7 +224,7 @@ def test_as_table_and_build_are_inverse(outer: Outer) -> None:
     )
 )
 def test_a_learners_table_survives_json_and_texts(config: LearnerConfig) -> None:
-    table = as_table(config)
+    table = section_table(config)
     assert list(table) == KEYS
     assert build(LearnerConfig, "learner", table) == config
     assert build(LearnerConfig, "learner", {k: str(v) for k, v in table.items()}) == config
@@ -309,7 +309,7 @@ def test_any_text_is_a_value_or_a_plain_error(text: str, key: str) -> None:
 
 def test_fields_that_cannot_be_configured_are_a_programmers_error() -> None:
     with pytest.raises(TypeError, match="cannot be configured"):
-        convert(1, dict, "scene.x")
+        convert_value(1, dict, "scene.x")
 
 
 def test_the_page_of_keys_explains_each() -> None:

@@ -101,16 +101,16 @@ class LearnerConfig:
         positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
         positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
         positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
-        within(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
-        within(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
-        within(self, "learner", 0.0, 1.0, "nu")
-        within(self, "learner", 1e-6, 1.0, "alpha")
-        within(self, "learner", 0.0, math.inf, "epsilon_knee")
-        within(self, "learner", 1, MAX_COMPONENTS, "components")
-        within(self, "learner", 3, MAX_TAU, "tau")
-        within(self, "learner", 0.0, 0.999999, "gamma")
+        in_range(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
+        in_range(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
+        in_range(self, "learner", 0.0, 1.0, "nu")
+        in_range(self, "learner", 1e-6, 1.0, "alpha")
+        in_range(self, "learner", 0.0, math.inf, "epsilon_knee")
+        in_range(self, "learner", 1, MAX_COMPONENTS, "components")
+        in_range(self, "learner", 3, MAX_TAU, "tau")
+        in_range(self, "learner", 0.0, 0.999999, "gamma")
         if self.beta is not None:
-            within(self, "learner", 0.0, math.inf, "beta")
+            in_range(self, "learner", 0.0, math.inf, "beta")
         outputs_within_components(self, "learner")
 
     def reward_beta(self, n_streams: int) -> float:
@@ -130,7 +130,7 @@ def convert_fields(section: Any, prefix: str) -> None:
         UsageError: a value does not fit; it names the key.
     """
     for name, hint in _hints(type(section)).items():
-        value = convert(getattr(section, name), hint, f"{prefix}.{name}")
+        value = convert_value(getattr(section, name), hint, f"{prefix}.{name}")
         object.__setattr__(section, name, value)
 
 
@@ -149,7 +149,7 @@ def positive(section: Any, prefix: str, *names: str) -> None:
             raise UsageError(f"{prefix}.{name} is {value}: it must be above 0 and finite")
 
 
-def within(section: Any, prefix: str, low: float, high: float, *names: str) -> None:
+def in_range(section: Any, prefix: str, low: float, high: float, *names: str) -> None:
     """Refuse values outside [low, high], naming the key.
 
     Raises:
@@ -298,7 +298,7 @@ def build(
                     f"unknown key {prefix}.{shown(key)}: {prefix}.{name} has no keys of its own"
                 )
             else:
-                values[name] = convert(value, hints[name], f"{prefix}.{name}")
+                values[name] = convert_value(value, hints[name], f"{prefix}.{name}")
     for name, parts in nested.items():
         start = getattr(base, name) if base is not None else _default(fields[name])
         values[name] = build(hints[name], f"{prefix}.{name}", *parts, base=start)
@@ -307,7 +307,7 @@ def build(
     return cls(**values)
 
 
-def convert(value: Any, hint: Any, key: str) -> Any:
+def convert_value(value: Any, hint: Any, key: str) -> Any:
     """A value, or its text, as the type of a field.
 
     Raises:
@@ -322,7 +322,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
     if origin is types.UnionType or origin is typing.Union:
         if value is None or value == "auto" or (value == "none" and str not in arguments):
             return None
-        return convert(value, next(a for a in arguments if a is not types.NoneType), key)
+        return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
     if origin is tuple:
         parts = (
             [p.strip() for p in value.strip("()[] ").split(",") if p.strip()]
@@ -334,7 +334,7 @@ def convert(value: Any, hint: Any, key: str) -> Any:
         inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
         if len(inner) != len(parts):
             raise UsageError(f"{key} is {shown(value)}: it must have {len(inner)} values")
-        return tuple(convert(p, h, key) for p, h in zip(parts, inner, strict=True))
+        return tuple(convert_value(p, h, key) for p, h in zip(parts, inner, strict=True))
     try:
         if hint is bool:
             if isinstance(value, str):
@@ -365,13 +365,13 @@ def convert(value: Any, hint: Any, key: str) -> Any:
     raise TypeError(f"{key}: fields of type {hint} cannot be configured")
 
 
-def as_table(section: Any) -> dict[str, Any]:
+def section_table(section: Any) -> dict[str, Any]:
     """A section as plain JSON values, nested sections as tables, `None` as "auto"."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         if dataclasses.is_dataclass(value):
-            table[field.name] = as_table(value)
+            table[field.name] = section_table(value)
         elif value is None:
             table[field.name] = "auto"
         else:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS, open_learner
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.config import as_table, build, differences, parse_settings
+from cdmisfa.core.config import build, differences, parse_settings, section_table
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, LearnerState
 from cdmisfa.core.signals import SCHEMA_VERSION
@@ -211,7 +211,7 @@ def continued(
 
 def changes(manifest: Mapping[str, Any], span: ConfigSpan) -> dict[str, list[Any]]:
     """What a fork changes of the configuration of its parent: values before and now, by key."""
-    each = differences(manifest["config"]["learner"], as_table(span.config))
+    each = differences(manifest["config"]["learner"], section_table(span.config))
     changed = {f"learner.{key}": [before, now] for key, before, now in each}
     if span.reseeded:
         changed["seed"] = [int(manifest["seed"]), span.seed]
@@ -226,7 +226,9 @@ def _config_of_fork(before: Mapping[str, Any], settings: Sequence[str]) -> Any:
         raise UsageError(f"{other}.* is the parent's and stays: a fork changes learner.* alone")
     kind = LEARNERS[before["algorithm"]].configuration
     config = build(kind, "learner", before, words.get("learner", {}))
-    for key, old, new in differences(as_table(build(kind, "learner", before)), as_table(config)):
+    for key, old, new in differences(
+        section_table(build(kind, "learner", before)), section_table(config)
+    ):
         if key in KEPT:
             raise UsageError(
                 f"learner.{key} is {old} and stays: what was learned depends on it, so {new} is "

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from cdmisfa.agents.learners import open_learner
 from cdmisfa.core.blocks import FrameSource, SeekableSource, description
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
 from cdmisfa.experiments.command import COMMAND, SET_ASIDE, command_of, command_of_fork, source_of
@@ -100,7 +100,7 @@ class Session:
         described = described or description(source, at_once=True)
         self._versions = versions_used(config, source, described)
         self.manifest: dict[str, Any] = {
-            "config": {**(sections or {}), "learner": as_table(config)},
+            "config": {**(sections or {}), "learner": section_table(config)},
             "seed": seed,
             "source": described,
             ARITHMETIC: arithmetic_of(self.learner),

@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import WorkerDied, run_all
-from cdmisfa.core.untrusted.memory import BUDGET, MAX_LIST, budget, parse_json
-from cdmisfa.core.untrusted.regular import opened_regular
+from cdmisfa.core.untrusted import BUDGET, MAX_LIST, budget, opened_regular, parse_json
 from recorder.log.files import held, make_folder, refuse_special, to_disk
 
 ROWS = "rows.jsonl"

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from cdmisfa.agents.learners import LEARNERS
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.untrusted.memory import MAX_LIST
+from cdmisfa.core.untrusted import MAX_LIST
 from cdmisfa.experiments.documents import as_text, write_json
 from cdmisfa.experiments.run_folder import module_table
 from cdmisfa.experiments.session import run
@@ -174,7 +174,7 @@ def plan(
         told = configured((*settings, *(f"{key}={value}" for key, value in point.items())))
         for seed in each:
             configuration = told.seeded(seed)
-            depends: list[Any] = [as_table(configuration.learner)]
+            depends: list[Any] = [section_table(configuration.learner)]
             used = LEARNERS.versions(configuration.learner.algorithm)
             if scene:  # the world's part counts only where it is live
                 depends.append(configuration.tables())

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.agents.progress.config import ATTENTIONS
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.registry import Registry
@@ -123,7 +123,7 @@ def plan_arena(
             point = {"set": name, "learner": learner, **more}
             for seed in each:
                 trial = ArenaTrial(
-                    id=identity(shown, as_table(config), seed, version),
+                    id=identity(shown, section_table(config), seed, version),
                     point=point,
                     seed=seed,
                     code=version,

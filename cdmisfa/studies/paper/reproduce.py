@@ -20,8 +20,7 @@ from pyarrow import parquet
 
 from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.registry import did_you_mean
-from cdmisfa.core.untrusted.memory import MAX_LIST
-from cdmisfa.core.untrusted.regular import read_json
+from cdmisfa.core.untrusted import MAX_LIST, read_json
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.store import StoredTrial, answer, code, identity, read_rows, run_trials
 from cdmisfa.studies.pages import Page
