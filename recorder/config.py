@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 from cdmisfa.core.blocks import told_apart
 from cdmisfa.core.clock import RECORDED_FPS, START_NS
-from cdmisfa.core.config import within
+from cdmisfa.core.config import in_range
 from cdmisfa.core.errors import UsageError
 
 Compression = Literal["zstd", "lz4", "none"]
@@ -58,9 +58,9 @@ class RecordConfig:
     chunk_size: int = 1024 * 1024
 
     def __post_init__(self) -> None:
-        within(self, "record", *RECORDED_FPS, "fps")
-        within(self, "record", 0, 2**62, "start_ns")
-        within(self, "record", 1024, 2**27, "chunk_size")
+        in_range(self, "record", *RECORDED_FPS, "fps")
+        in_range(self, "record", 0, 2**62, "start_ns")
+        in_range(self, "record", 1024, 2**27, "chunk_size")
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 from cdmisfa.core.blocks import Block, FrameSource, HeadPose, description
 from cdmisfa.core.clock import RECORDED_FPS
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig, SceneConfig, Split
 from recorder.log.files import (
@@ -374,7 +374,7 @@ def recording_spec(
         scene.name,
         scene.config.seed or 0,
         spec,
-        {"scene": scene.table(), "record": as_table(clock)},
+        {"scene": scene.table(), "record": section_table(clock)},
         SCENES[scene.name].packages,
     )
 

@@ -27,7 +27,7 @@ from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap import store
 from recorder.mcap.mending import MendedStore
 from recorder.mcap.reader import LogReader
-from recorder.mcap.store import Excerpt, FileStore, OnePass
+from recorder.mcap.store import FileStore, OnePass
 from recorder.recording import RecordingStoppedError, record, record_scene, recorded
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
@@ -127,7 +127,6 @@ def test_a_file_that_was_replaced_is_not_read_on(files: list[Path], there: bool)
         lambda store: list(store.blocks(0, store.size)),
         lambda store: store.crc(0, store.size),
         lambda store: store.grow(),
-        lambda store: Excerpt(store, 1, 6),
         lambda store: OnePass(store).pass_to(6),
         lambda store: MendedStore(store).read(1, 5),
     ],

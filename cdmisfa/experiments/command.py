@@ -91,6 +91,20 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     return tuple(found_path(word, run) for word in source), options
 
 
+def command_of_fork(
+    parent: Path, source: Sequence[str], sections: Mapping[str, Any], settings: Sequence[str]
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """The command of a fork: that of its parent, with the settings of both."""
+    try:
+        words, options = read_command(parent)
+    except UsageError:
+        words, options = (), {}
+    world = sections.get("scene", {}).get("seed")
+    kept = () if world is None else (f"scene.seed={world}",)  # only the learner's changes
+    options["settings"] = (*options.get("settings", ()), *kept, *settings)
+    return tuple(source) or words, options
+
+
 def _packages_gone(log: Path) -> str:
     """The packages of plugins that a run used and that are not installed any more."""
     keyframe = read_keyframe(log)

@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.clock import RECORDED_FPS, frames_of, times_of
+from cdmisfa.core.clock import RECORDED_FPS, nearest_frames, times_of
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.untrusted.memory import MAX_JSON, parse_json
-from cdmisfa.core.untrusted.regular import read_regular
+from cdmisfa.core.untrusted import MAX_JSON, parse_json, read_regular
 from recorder.log.files import RECORDING, atomic_write, to_disk
 from recorder.log.messages import SCHEMA_VERSION
 
@@ -156,7 +155,7 @@ class ViewMetadata:
 
     def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
         """Frames at log times, (n,) nanoseconds, or near those that are not exactly a frame's."""
-        return np.clip(frames_of(times, self.fps, self.start_ns), -1, MAX_FRAMES)
+        return np.clip(nearest_frames(times, self.fps, self.start_ns), -1, MAX_FRAMES)
 
     def record(self) -> dict[str, str]:
         """The file's metadata record."""

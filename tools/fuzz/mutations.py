@@ -187,11 +187,10 @@ def _chunk_parts(content: bytes) -> tuple[bytes, int, str, bytes]:
 
 
 def _inner(content: bytes) -> list[Record]:
-    from recorder.mcap.compression import Decompressor
+    from recorder.mcap.chunks import decompressed
 
     _, size, name, stored = _chunk_parts(content)
-    records = np.empty(size, np.uint8)
-    Decompressor().decompress(memoryview(stored), name, records)
+    records = decompressed(np.frombuffer(stored, np.uint8), name, size)
     return _records(records.tobytes(), 0, size)
 
 
