@@ -45,6 +45,13 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
 
 
+def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
+    """Say which trials failed."""
+    for row in rows:
+        at = " ".join(f"{key}={value}" for key, value in row["point"].items())
+        click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
+
+
 def tell(line: str) -> None:
     """A line on stderr."""
     click.echo(line, err=True)

@@ -15,7 +15,7 @@ from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options, uploads
 from cdmisfa.cli.cameras import live_source
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     print_json,
     print_plan,
@@ -47,13 +47,13 @@ TICK = 0.1
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
 @uploads.out("Folder of the run, or s3://...; without it nothing is written.")
-@options.seed
+@options.seed()
 @options.preset
-@options.settings
-@option(
+@options.settings()
+@word(
     "--algorithm",
-    metavar="NAME",
-    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
+    "NAME",
+    f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
     group="Learner",
 )
@@ -65,23 +65,16 @@ TICK = 0.1
     "streams.",
 )
 @options.loop
-@option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
+@flag("--resume", "Resume the run in -o where it was stopped.")
 @options.salvage
-@option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
+@flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
-@option(
-    "--follow",
-    is_flag=True,
-    help="Wait for the frames of a recording being written.",
-    group="Source",
-)
-@option(
+@flag("--follow", "Wait for the frames of a recording being written.", group="Source")
+@number(
     "--follow-timeout",
-    type=click.FloatRange(0.1, 1e6),
+    "With --follow, give up when no frame came for so long.",
+    *(0.1, 1e6, "SECONDS"),
     default=60.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="With --follow, give up when no frame came for so long.",
     group="Source",
 )
 @option(
