@@ -8,9 +8,9 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.learn import learning, outcome_line, show
 from cdmisfa.cli.making import number, option, word
-from cdmisfa.cli.printing import print_document, quoted, tell
+from cdmisfa.cli.printing import outcome_line, print_document, print_result, quoted, tell
+from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 source = word(
@@ -183,7 +183,7 @@ def fork_command(
             rerun=not no_rerun,
             hashing=reporter.hashing,
         )
-    show(result, as_json=as_json)
+    print_result(result, as_json=as_json)
     both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
     tell(f"both in one view: {both}")
     if result.ended == INTERRUPTED:
