@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.report import save
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 
 SHAPE = (240, 320)
@@ -27,10 +27,10 @@ MEGABYTE = 10**6
 def write(folder: Path, frames: NDArray[np.uint8], *, size: int = 0, **keys: str) -> Path:
     """Record frames as one view, again and again until its file has `size` bytes; the file."""
     spec = SourceSpec(("left",), frames.shape[1:], "uint8", ("x", "y"), 50.0, 10**18)
-    log = ViewLog(folder, "left", Identity("plain", 0, spec, {}), RecordConfig(**keys))
+    log = ViewLog(folder, "left", RecordingSpec("plain", 0, spec, {}), RecordConfig(**keys))
     while not log.t or log.file.size < size:
         log.write(Block(0, log.t, frames, np.zeros((len(frames), 2))))
-    log.file.finish()
+    log.finish()
     return log.file.path
 
 

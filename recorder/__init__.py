@@ -6,9 +6,8 @@ __getattr__, __dir__, __all__ = exports(
     __name__,
     {
         "recorder.cameras.stepped": "ArraySource GymSource",
-        "recorder.config": "RecordConfig SceneConfig",
+        "recorder.config": "RecordConfig SceneConfig Split",
         "recorder.live": "RecordedWhileWatched record_watched",
-        "recorder.log.split": "Split",
         "recorder.recording": "RecordingStoppedError ViewRecording record record_scene",
         "recorder.world.scenes": "SCENES Scene open_scene",
     },

@@ -10,13 +10,10 @@ from typing import Any, Final, Self
 
 from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, check_request, take_unbroken
 from cdmisfa.core.errors import LogExhaustedError
-from recorder.config import RecordConfig
-from recorder.log.begun import Begun, keep_recording
-from recorder.log.folder import folder_here, prepared_folder, refuse_existing
-from recorder.log.resume import other_recordings
-from recorder.log.split import Split
-from recorder.log.viewlog import ViewParts
-from recorder.recording import ViewRecording, check_block, identity_of, view_recording
+from recorder.config import RecordConfig, Split
+from recorder.log.files import folder_here, prepared_folder, refuse_existing
+from recorder.log.resume import begin_view, other_recordings
+from recorder.recording import ViewLogs, ViewRecording, recording_spec
 from recorder.world.scenes import BLOCK
 
 COUNTS: Final = "cdmisfa.live"
@@ -64,29 +61,16 @@ class RecordedWhileWatched:
         self.gaps = bool(getattr(source, "gaps", False))
         refuse_existing(self.folder, force=force, goes_on=False)
         settings = settings or RecordConfig()
-        identity = identity_of(source, None, settings, None)
-        self._views = identity.spec.streams
-        self._parts: dict[str, list[tuple[Path, int]]] = {view: [] for view in self._views}
+        recording = recording_spec(source, None, settings, None)
+        views = recording.spec.streams
+        places = {view: begin_view(self.folder, view, split, source.t) for view in views}
         with ExitStack() as stack:
-            stale = other_recordings(self.folder, identity) if force else []
-            stack.enter_context(prepared_folder(self.folder, self._views if force else (), stale))
-            most = {"frames": dict.fromkeys(self._views, 1), "split": {}, "seed": identity.seed}
-            keep_recording(self.folder, self._views, Begun((identity.kind,), most))
-            self._logs = []
-            for view, parts in self._parts.items():
-                log = ViewParts(
-                    self.folder,
-                    view,
-                    identity,
-                    settings,
-                    split,
-                    None,
-                    parts,
-                    source.t,
-                    fsync_every,
-                )
-                stack.callback(log.abandon)
-                self._logs.append(log)
+            stale = other_recordings(self.folder, recording) if force else []
+            stack.enter_context(prepared_folder(self.folder, views if force else (), stale))
+            self._logs = ViewLogs(
+                self.folder, recording, settings, places, 1, split, fsync_every=fsync_every
+            )
+            stack.callback(self._logs.abandon)
             self._open = stack.pop_all()
 
     @property
@@ -127,8 +111,7 @@ class RecordedWhileWatched:
             self.ended = str(error)
             raise
         for block in blocks:
-            check_block(block, self.spec)
-            self._logs[block.stream].write(block)
+            self._logs.write(block)
         return blocks
 
     def describe(self) -> Mapping[str, Any]:
@@ -137,14 +120,11 @@ class RecordedWhileWatched:
 
     def finish(self) -> None:
         """Finish the files."""
-        for view, log in zip(self._views, self._logs, strict=True):
+        for stream, view in enumerate(self.spec.streams):
             if counts := self.alignment.get(view):
-                log.state(COUNTS, {name: str(count) for name, count in counts.items()})
-            log.finish()
-        keep_recording(self.folder, self._views)
-        self.files = [
-            view_recording(view, path, n) for view, done in self._parts.items() for path, n in done
-        ]
+                counted = {name: str(count) for name, count in counts.items()}
+                self._logs.add_metadata(stream, COUNTS, counted)
+        self.files = self._logs.finish()
 
     def close(self) -> None:
         """Let go of the source, and of the files as they are."""

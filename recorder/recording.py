@@ -6,35 +6,36 @@ import contextlib
 import dataclasses
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, description
+from cdmisfa.core.blocks import Block, FrameSource, HeadPose, description
 from cdmisfa.core.clock import RECORDED_FPS
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.config import RecordConfig, SceneConfig
-from recorder.log.begun import Begun, keep_recording
-from recorder.log.folder import (
+from recorder.config import RecordConfig, SceneConfig, Split
+from recorder.log.files import (
+    atomic_write,
     folder_here,
     holds_recording,
     prepared_folder,
     refuse_existing,
+    refuse_taken,
+    refuse_unless_png,
 )
+from recorder.log.manifest import RecordingSpec, RecordingStart, store_start
 from recorder.log.resume import (
+    ViewResume,
+    begin_view,
     finished_logs,
     other_recordings,
-    resume_view,
     resume_views,
     set_log_aside,
 )
-from recorder.log.split import Split
-from recorder.log.viewfacts import Identity
-from recorder.log.viewlog import ViewParts
-from recorder.log.whole import refuse_taken, refuse_unless_png, whole
+from recorder.log.viewlog import ViewLog
 from recorder.world.scenes import (
     SCENES,
     OpenScene,
@@ -140,70 +141,136 @@ def record(
         refuse_existing(folder, force=force)
     elif not holds_recording(folder):
         raise UsageError(f"{folder} holds no recording to go on with: choose another folder")
-    identity = identity_of(source, names, settings, scene)
-    streams = identity.spec.streams
-    for view in views or ():
-        if view not in streams:
-            what = "source" if scene is None else "scene"
-            raise UsageError(f"no view {view!r}: the {what} has {', '.join(streams)}")
-    chosen = [name for name in streams if not views or name in views]
+    recording = recording_spec(source, names, settings, scene)
+    chosen = _chosen(recording, views, "source" if scene is None else "scene")
+    default = length or DEFAULT_FRAMES
     with ExitStack() as open_logs:
-        stale = other_recordings(folder, identity) if force else []
+        stale = other_recordings(folder, recording) if force else []
         open_logs.enter_context(prepared_folder(folder, chosen if force else (), stale))
         if resume:
-            default = length or DEFAULT_FRAMES
-            places, split, frames = resume_views(folder, identity, chosen, split, frames, default)
+            places, split, frames = resume_views(folder, recording, chosen, split, frames, default)
         else:
-            frames = frames or length or DEFAULT_FRAMES
-            places = {v: resume_view(folder, v, identity, split, {}, frames) for v in chosen}
-        unfinished = [view for view, place in places.items() if not place.complete]
-        if unfinished:
-            lengths = dict.fromkeys(unfinished, frames)
-            limits = {} if split is None else dict.fromkeys(unfinished, str(split))
-            options = {"seed": identity.seed, "frames": lengths, "split": limits}
-            keep_recording(folder, unfinished, Begun((identity.kind,), options))
-        poses = dict(zip(streams, getattr(source, "head_poses", ()), strict=False))
-        parts = {view: list(place.parts) for view, place in places.items()}
-        logs: dict[int, ViewParts] = {}
-        for view, place in places.items():
-            log_to_resume = set_log_aside(place)
-            if place.complete:
-                continue
-            log = ViewParts(
-                folder,
-                view,
-                identity,
-                settings,
-                split,
-                poses.get(view),
-                parts[view],
-                place.first,
-                fsync_every,
-            )
-            open_logs.callback(log.abandon)
-            if log_to_resume is not None:
-                log.copy(log_to_resume, place.stop)
-            logs[streams.index(view)] = log
-        starts = {stream: log.t for stream, log in logs.items()}
+            places = {view: begin_view(folder, view, split) for view in chosen}
+        frames = frames or default
+        poses = getattr(source, "head_poses", ())
+        logs = ViewLogs(folder, recording, settings, places, frames, split, poses, fsync_every)
+        open_logs.callback(logs.abandon)
+        starts = logs.starts()
         blocks = (
             render_in_processes(scene, starts, frames, jobs)
-            if scene and jobs > 1 and logs
+            if scene and jobs > 1 and starts
             else take_here(source, starts, frames)
         )
         with contextlib.closing(blocks):
             for block in blocks:
-                check_block(block, identity.spec)
-                logs[block.stream].write(block)
+                logs.write(block)
+                done = min(logs.starts().values())
                 if progress is not None:
-                    progress(min(log.t for log in logs.values()))
-                if stop() and min(log.t for log in logs.values()) < frames:
+                    progress(done)
+                if stop() and done < frames:
                     raise RecordingStoppedError(f"{folder} is not finished: go on with --resume")
-        if logs:
+        if starts:
             source.describe()  # an error where it was replaced while it was read
-        for log in logs.values():
+        return logs.finish()
+
+
+class ViewLogs:
+    """The logs of a recording, while they are written.
+
+    Args:
+        folder: of the recording, made and held.
+        recording: what is recorded.
+        settings: how the files are written.
+        places: where each view is begun or resumed.
+        frames: how many each view shall have.
+        split: where parts end.
+        poses: of the head in each of the recording's views, where there is a head.
+        fsync_every: see `record`.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recording: RecordingSpec,
+        settings: RecordConfig,
+        places: Mapping[str, ViewResume],
+        frames: int,
+        split: Split | None,
+        poses: Sequence[HeadPose] = (),
+        fsync_every: float | None = None,
+    ) -> None:
+        self._folder, self._recording = folder, recording
+        self._parts = {view: list(place.parts) for view, place in places.items()}
+        self._logs: dict[int, ViewLog] = {}
+        streams = recording.spec.streams
+        pose_of = dict(zip(streams, poses, strict=False))
+        if unfinished := [view for view, place in places.items() if not place.complete]:
+            limits = {} if split is None else dict.fromkeys(unfinished, str(split))
+            lengths = dict.fromkeys(unfinished, frames)
+            start = RecordingStart(recording.kind, recording.seed, lengths, limits)
+            store_start(folder, unfinished, start)
+        try:
+            for view, place in places.items():
+                earlier = set_log_aside(place)
+                if place.complete:
+                    continue
+                self._logs[streams.index(view)] = log = ViewLog(
+                    folder,
+                    view,
+                    recording,
+                    settings,
+                    pose=pose_of.get(view),
+                    split=split,
+                    parts=self._parts[view],
+                    first=place.first,
+                    fsync_every=fsync_every,
+                )
+                if earlier is not None:
+                    log.copy(earlier, place.stop)
+        except BaseException:
+            self.abandon()
+            raise
+
+    def starts(self) -> dict[int, int]:
+        """The next frame of each stream that is written."""
+        return {stream: log.t for stream, log in self._logs.items()}
+
+    def write(self, block: Block) -> None:
+        """Write a block, unless it is not what the source says, which would spoil the file."""
+        shape, dtype, spec = block.frames.shape[1:], block.frames.dtype, self._recording.spec
+        if shape != spec.frame_shape or dtype != spec.dtype:
+            raise CdmisfaError(
+                f"{spec.streams[block.stream]} shows {shape} {dtype} at frame {block.t}, not the "
+                f"{spec.frame_shape} {spec.dtype} that its source states: mend the source"
+            )
+        self._logs[block.stream].write(block)
+
+    def add_metadata(self, stream: int, name: str, values: Mapping[str, str]) -> None:
+        """Write what is known only now of a stream, as a metadata record."""
+        self._logs[stream].add_metadata(name, values)
+
+    def finish(self) -> list[ViewRecording]:
+        """Finish the files; all of the views that there are."""
+        for log in self._logs.values():
             log.finish()
-        keep_recording(folder, chosen)
-    return [view_recording(view, path, n) for view, done in parts.items() for path, n in done]
+        store_start(self._folder, list(self._parts))
+        return [
+            view_recording(view, path, n) for view, done in self._parts.items() for path, n in done
+        ]
+
+    def abandon(self) -> None:
+        """Leave the files as they are, readable; nothing where they are finished."""
+        for log in self._logs.values():
+            log.abandon()
+
+
+def _chosen(recording: RecordingSpec, views: Sequence[str] | None, what: str) -> list[str]:
+    """The views that are recorded, in the order of their streams."""
+    streams = recording.spec.streams
+    for view in views or ():
+        if view not in streams:
+            raise UsageError(f"no view {view!r}: the {what} has {', '.join(streams)}")
+    return [name for name in streams if not views or name in views]
 
 
 def _refuse_arguments(
@@ -266,22 +333,12 @@ def view_recording(view: str, path: Path, frames: int) -> ViewRecording:
     return ViewRecording(view, path, frames, path.stat().st_size, checksum)
 
 
-def check_block(block: Block, spec: SourceSpec) -> None:
-    """Refuse a block that is not what its source says, before it spoils a file."""
-    shape, dtype = block.frames.shape[1:], block.frames.dtype
-    if shape != spec.frame_shape or dtype != spec.dtype:
-        raise CdmisfaError(
-            f"{spec.streams[block.stream]} shows {shape} {dtype} at frame {block.t}, not the "
-            f"{spec.frame_shape} {spec.dtype} that its source states: mend the source"
-        )
-
-
-def identity_of(
+def recording_spec(
     source: FrameSource,
     names: Sequence[str] | None,
     settings: RecordConfig,
     scene: OpenScene | None,
-) -> Identity:
+) -> RecordingSpec:
     """What a recording of a source states.
 
     Raises:
@@ -311,13 +368,13 @@ def identity_of(
         seed = stated.get("seed")
         known = seed if isinstance(seed, int) else 0
         gaps = bool(getattr(source, "gaps", False))
-        return Identity(stated["kind"], known, spec, {"source": stated}, gaps=gaps)
+        return RecordingSpec(stated["kind"], known, spec, {"source": stated}, gaps=gaps)
     clock = replace(settings, fps=spec.fps, start_ns=spec.start_ns)
-    return Identity(
+    return RecordingSpec(
         scene.name,
         scene.config.seed or 0,
         spec,
-        {"scene": scene.table(), "record": as_table(clock)},
+        {"scene": scene.table(), "record": section_table(clock)},
         SCENES[scene.name].packages,
     )
 
@@ -338,5 +395,5 @@ def save_picture(name: str, config: SceneConfig, path: Path, *, force: bool = Fa
     refuse_unless_png(path)
     refuse_taken(path, force=force)
     image = draw(config)
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         image.save(partial, format="PNG", optimize=True)

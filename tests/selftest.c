@@ -234,66 +234,43 @@ static uint8_t *put(uint8_t *at, uint64_t x, size_t width) {
   return at + width;
 }
 
-/* A chunk of messages of three channels in turn, and its index; two of them are looked for. Then
- * the same with other bytes here and there, with its end missing, or with wrong layouts. */
-static void test_scan(void) {
-  enum { N = 30, PAYLOAD = 40, SIZE = N * (BEFORE_PAYLOAD + PAYLOAD), EACH = N / 3 * PAIR };
-  uint8_t *sound = bytes(SIZE), *sound_index = room(3 * (BEFORE_PAIRS + EACH)), *at = sound;
-  uint8_t *pair[3];
-  for (int c = 0; c < 3; c++) {
-    uint8_t *head = sound_index + c * (BEFORE_PAIRS + EACH);
-    pair[c] = put(put(put(put(head, INDEX, 1), EACH + 6, 8), (uint64_t)c, 2), EACH, 4);
-  }
+/* A chunk of messages with other bytes here and there, or cut, and values out of its messages. */
+static void test_records(void) {
+  enum { N = 30, PAYLOAD = 40, SIZE = N * (BEFORE_PAYLOAD + PAYLOAD) };
+  uint8_t *sound = bytes(SIZE), *at = sound;
   for (uint64_t i = 0; i < N; i++) {
-    uint64_t c = i % 3, place = (uint64_t)(at - sound);
-    pair[c] = put(put(pair[c], 100 + i, 8), place, 8);
-    at = put(put(put(at, MESSAGE, 1), BEFORE_PAYLOAD - BEFORE_RECORD + PAYLOAD, 8), c, 2);
+    at = put(put(put(at, MESSAGE, 1), BEFORE_PAYLOAD - BEFORE_RECORD + PAYLOAD, 8), i % 3, 2);
     at = put(put(put(at, i, 4), 100 + i, 8), 100 + i, 8) + PAYLOAD;
     at[-3] = 7;
   }
-  int64_t ids[] = {2, 0}, least[] = {PAYLOAD, 3}, places[] = {0, 3, 3, 0};
-  const int64_t counts[] = {N / 3, N / 3};
-  const uint8_t marks[] = {9, 7, 7, 9}, head_bytes[] = {0, 1, 5, 7, 16, 128, 255};
-  const layouts wanted = {.channels = 2, .marks = 2, .ids = ids, .least = least, .places = places,
-                          .bytes = marks};
-  int64_t in_order = 0;
+  const int64_t far[] = {-1, 0, INT64_MIN, INT64_MAX, INT64_MAX - 7, 1ll << 62};
+  const uint8_t heads[] = {0, 1, 5, 7, 16, 128, 255}, marks[] = {7};
+  int64_t whole = 0;
   for (int i = 0; i < 600; i++) {
-    int64_t size = i < 400 ? SIZE : below(SIZE + 1);
-    int64_t index_size = i < 500 ? 3 * (BEFORE_PAIRS + EACH) : below(3 * (BEFORE_PAIRS + EACH) + 1);
-    uint8_t *data = malloc((size_t)size + 1), *index = malloc((size_t)index_size + 1);
-    if (!data || !index) abort();
+    int64_t size = i < 400 ? SIZE : below(SIZE + 1), found[3];
+    uint8_t *data = malloc((size_t)size + 1);
+    if (!data) abort();
     memcpy(data, sound, (size_t)size);
-    memcpy(index, sound_index, (size_t)index_size);
-    uint8_t *changed = i < 200 ? data + below(size) : index + below(index_size + 1);
-    if (i > 0 && i < 400) *changed = head_bytes[below(7)];
-    places[1] = i % 50 == 49 ? (int64_t)word() : 3;
-    int64_t seen[2] = {0}, *ends = malloc(2 * N / 3 * 8);
-    uint64_t *times = malloc(2 * N / 3 * 8);
-    if (!ends || !times) abort();
-    memset(ends, 0, 2 * N / 3 * 8), memset(times, 0, 2 * N / 3 * 8);
-    int code = scan(data, size, index, index_size, 100, 100 + N, &wanted, counts, seen, N / 3, ends,
-                    times);
-    in_order += code == 0;
-    add_number(code), add(ends, 2 * N / 3 * 8), add(times, 2 * N / 3 * 8);
-    free(data), free(index), free(ends), free(times);
+    if (i % 3 && size) data[below(size)] = heads[below(7)];
+    int code = walk_records(data, size, NULL, NULL, found);
+    message *messages = calloc((size_t)found[0] + 1, sizeof *messages);
+    int64_t *others = calloc(2 * (size_t)found[1] + 1, 8);
+    if (!messages || !others || walk_records(data, size, messages, others, found) != code) abort();
+    if (i % 7 == 6 && found[0]) messages[0].at = far[below(6)];
+    if (i % 7 == 5 && found[0]) messages[0].size = far[below(6)];
+    int64_t places[] = {i % 11 ? 3 : far[below(6)]}, at_end[] = {PAYLOAD, i % 13 ? 9 : far[below(6)]};
+    layout l = {.least = PAYLOAD, .values = 2, .width = 8, .marks = 1, .distances = at_end,
+                .places = places, .bytes = marks};
+    uint8_t *out = room(found[0] * 16 + 1);
+    int laid_out = gather(data, size, messages, found[0], &l, out);
+    whole += code == 0 && laid_out == 0;
+    add_number(code), add(found, sizeof found), add(messages, found[0] * (int64_t)sizeof *messages);
+    add(others, 16 * found[1]), add_number(laid_out);
+    if (!laid_out) add(out, found[0] * 16);
+    free(data), free(messages), free(others);
   }
-  if (in_order < 100 || in_order > 500) abort();
-  tell("scan");
-}
-
-static void test_gather(void) {
-  const int64_t far[] = {-1, INT64_MIN, INT64_MAX, INT64_MAX - 7, 1ll << 62};
-  for (int i = 0; i < 500; i++) {
-    int64_t n = below(4), values = below(4), width = below(20), size = below(200), ends[3], at[3];
-    uint8_t *data = bytes(size), *out = room(n * values * width);
-    for (int k = 0; k < 3; k++) {
-      ends[k] = i % 5 ? size - below(size / 4 + 1) : far[below(5)];
-      at[k] = i % 7 ? width + below(60) : far[below(5)];
-    }
-    add_number(gather(data, size, ends, n, at, values, width, out));
-    add(out, n * values * width);
-  }
-  tell("gather");
+  if (whole < 100 || whole > 500) abort();
+  tell("records");
 }
 
 int main(void) {
@@ -302,7 +279,6 @@ int main(void) {
   test_incsfa();
   test_recursive();
   test_agent();
-  test_scan();
-  test_gather();
+  test_records();
   return 0;
 }

@@ -19,15 +19,15 @@ from test_modules import learned
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.core.untrusted.memory import BUDGET, budget
+from cdmisfa.core.untrusted import BUDGET, budget
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS
 from cdmisfa.experiments.sweep import sweep
 from recorder.cameras.video import video_camera
 from recorder.images.videos import most_pixels
-from recorder.log.begun import read_recording
-from recorder.log.folder import RECORDING
+from recorder.log.files import RECORDING
 from recorder.log.logfile import LogFile
+from recorder.log.manifest import read_start
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
 from replay.runs.folders import REQUEST, RUN_JSON, RUN_METADATA, read_run_json
@@ -182,7 +182,7 @@ def test_side_files(tmp_path: Path) -> None:
         for name in (REQUEST, RECORDING, RUN_JSON):
             (tmp_path / name).write_bytes(LISTS)
         with pytest.raises(UsageError, match=rf"{RECORDING}: \d+ bytes, above the limit of"):
-            read_recording(tmp_path)
+            read_start(tmp_path)
         assert read_run_json(tmp_path) == {}
         with pytest.raises(LogDamagedError, match=f"{REQUEST} is damaged: run the sweep again"):
             results(tmp_path)

@@ -14,7 +14,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError
 from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.mcap.reader import LogReader
 from recorder.mcap.store import FileStore, OnePass
@@ -30,11 +30,11 @@ def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of pictures that cannot be compressed, 25 MB."""
     folder = tmp_path_factory.mktemp("noise")
     spec = SourceSpec(("left",), (96, 128), "uint8", ("x",), 50.0, 10**18)
-    log = ViewLog(folder, "left", Identity("plain", 0, spec, {}), RecordConfig())
+    log = ViewLog(folder, "left", RecordingSpec("plain", 0, spec, {}), RecordConfig())
     frames = np.random.default_rng(0).integers(0, 256, (FRAMES, 96, 128), np.uint8)
     log.write(Block(0, 0, frames, np.zeros((FRAMES, 1))))
-    log.file.finish()
-    return log.file.path
+    log.finish()
+    return folder / "left.mcap"
 
 
 def share_read(path: Path, work: str) -> float:

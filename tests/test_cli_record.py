@@ -18,7 +18,7 @@ from folders import contents
 from waiting import wait_for
 
 from cdmisfa.experiments.convert import convert
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 from replay.camera_logs.source import ForeignSource

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from cdmisfa.core.clock import NANOSECONDS, START_NS, frames_of, time_of, times_of
+from cdmisfa.core.clock import NANOSECONDS, START_NS, nearest_frames, time_of, times_of
 
 RATES = st.one_of(
     st.sampled_from([29.97, 30_000 / 1001, 23.976, 59.94, 25.0, 50.0, 1e-3, 1e6, 1e9]),
@@ -31,7 +31,7 @@ def test_one_frame_and_many_have_the_same_times_and_lead_back(
     assert times.dtype == np.int64
     assert times.tolist() == [time_of(int(frame), fps, start) for frame in frames]
     if fps <= 1e8 or fps == NANOSECONDS:  # between, rounding to nanoseconds is half a frame
-        assert frames_of(times, fps, start).tolist() == frames.tolist()
+        assert nearest_frames(times, fps, start).tolist() == frames.tolist()
 
 
 @pytest.mark.parametrize("fps", [29.97, 30_000 / 1001, 50, 50.0])
@@ -39,9 +39,9 @@ def test_every_frame_of_two_hours(fps: float) -> None:
     frames = np.arange(216_000)
     times = times_of(frames, fps, START_NS)
     assert times.tolist() == [time_of(t, fps, START_NS) for t in range(216_000)]
-    np.testing.assert_array_equal(frames_of(times, fps, START_NS), frames)
+    np.testing.assert_array_equal(nearest_frames(times, fps, START_NS), frames)
 
 
 def test_times_of_the_wall_clock_do_not_overflow() -> None:
     """A whole number as the rate must not be multiplied as one."""
-    assert frames_of(np.array([START_NS]), 30, 0).tolist() == [43_548_192_000]
+    assert nearest_frames(np.array([START_NS]), 30, 0).tolist() == [43_548_192_000]

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from folders import contents
 from PIL import Image
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.export import frames
 from replay.export.forms import export
@@ -30,9 +32,9 @@ def record_images(folder, shape=(24, 40), views=("left", "right"), fps=50.0):
     pixels = rng.integers(0, 256, (len(views), FRAMES, *shape), dtype=np.uint8)
     truth = rng.standard_normal((FRAMES, 2))
     for stream, view in enumerate(views):
-        log = ViewLog(folder, view, Identity("test", 3, spec, {}), RecordConfig())
+        log = ViewLog(folder, view, RecordingSpec("test", 3, spec, {}), RecordConfig())
         log.write(Block(stream, 0, freeze(pixels[stream].copy()), freeze(truth.copy())))
-        log.file.finish()
+        log.finish()
     return pixels, truth
 
 
@@ -50,13 +52,6 @@ def decoded(file):
         facts = (stream.codec.canonical_name, stream.average_rate, container.metadata)
         values = np.array([p.to_ndarray(format="gray") for p in pictures])
         return values, [p.time for p in pictures], facts
-
-
-def test_values_have_no_images(oscillatory_recording, tmp_path):
-    for form in ("images", "mp4"):
-        with pytest.raises(UsageError, match="holds no images"):
-            export(oscillatory_recording, tmp_path / form, form)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_becomes_images(tmp_path):
@@ -96,19 +91,6 @@ def test_a_video_is_near_what_was_seen_and_smaller(tmp_path):
     # Which frame it is can still be told: none is missing, doubled or moved.
     far = np.abs(near[:, None].astype(int) - same[None]).mean(axis=(2, 3))
     np.testing.assert_array_equal(far.argmin(axis=1), np.arange(FRAMES))
-
-
-def test_rerun_reads_the_video(tmp_path):
-    from rerun.experimental import Mp4Reader
-
-    record_images(tmp_path / "r", views=("left",))
-    export(tmp_path / "r", tmp_path / "left.mp4", "mp4")
-    samples = sum(
-        chunk.num_rows
-        for chunk in Mp4Reader(str(tmp_path / "left.mp4")).stream()
-        if "VideoStream:sample" in chunk.to_record_batch().schema.names
-    )
-    assert samples == FRAMES
 
 
 @pytest.fixture(scope="module")
@@ -239,27 +221,6 @@ def test_values_become_a_dataset_without_videos(oscillatory_recording, tmp_path)
     source.close()
 
 
-def test_lerobot_knows_whole_frame_rates_only(tmp_path):
-    record_images(tmp_path / "r", fps=29.97)
-    with pytest.raises(UsageError, match="convert --rate"):
-        export(tmp_path / "r", tmp_path / "robot", "lerobot")
-    assert not (tmp_path / "robot").exists()
-
-
-def test_what_is_there_is_kept(tmp_path):
-    record_images(tmp_path / "r", views=("left",))
-    out = tmp_path / "out"
-    export(tmp_path / "r", out, "images")
-    with pytest.raises(UsageError, match="--force"):
-        export(tmp_path / "r", out, "mp4")
-    export(tmp_path / "r", out, "mp4", force=True)
-    assert [p.name for p in out.iterdir()] == ["left.mp4"]
-    (out / "thesis.tex").write_text("mine")
-    with pytest.raises(UsageError, match=r"thesis\.tex"):
-        export(tmp_path / "r", out, "mp4", force=True)
-    assert (out / "thesis.tex").read_text() == "mine"
-
-
 def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     record_images(tmp_path / "r")
 
@@ -275,44 +236,53 @@ def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["r"]
 
 
-def test_a_missing_library_is_named(tmp_path, monkeypatch):
-    record_images(tmp_path / "r")
-    monkeypatch.setitem(__import__("sys").modules, "av", None)
-    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[video\]'"):
-        export(tmp_path / "r", tmp_path / "out", "mp4")
+REFUSED = {
+    "several views": ("mp4", "one.mp4", {}),
+    "loses nothing": ("images", "out", {"lossless": True}),
+    "convert --rate": ("lerobot", "out", {}),
+    r"there\.png exists": ("images", "there.png", {}),
+    r"mine holds other files, such as thesis\.tex": ("lerobot", "mine", {"force": True}),
+    r"pip install 'cdmisfa\[video\]'": ("mp4", "out", {}),
+}
 
 
-def test_wrong_requests_are_named(tmp_path):
-    record_images(tmp_path / "r")
-    with pytest.raises(UsageError, match="several views"):
-        export(tmp_path / "r", tmp_path / "one.mp4", "mp4")
-    with pytest.raises(UsageError, match="loses nothing"):
-        export(tmp_path / "r", tmp_path / "out", "images", lossless=True)
+@pytest.mark.parametrize("why", REFUSED)
+def test_what_cannot_be_exported_is_said_and_nothing_is_touched(why, tmp_path, monkeypatch):
+    form, out, options = REFUSED[why]
+    record_images(tmp_path / "r", fps=29.97)
+    (tmp_path / "there.png").write_text("mine")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("mine")
+    if "pip" in why:
+        monkeypatch.setitem(sys.modules, "av", None)
+    before = contents(tmp_path)
+    with pytest.raises(UsageError, match=why):
+        export(tmp_path / "r", tmp_path / out, form, **options)
+    assert contents(tmp_path) == before
 
 
-def test_a_view_s_name_leads_nowhere_else():
+@pytest.mark.parametrize("form", ["images", "mp4"])
+def test_values_have_no_images(form, oscillatory_recording, tmp_path):
+    with pytest.raises(UsageError, match="holds no images"):
+        export(oscillatory_recording, tmp_path / form, form)
+    assert contents(tmp_path) == {}
+
+
+def test_an_export_replaces_another(tmp_path):
+    record_images(tmp_path / "r", views=("left",))
+    export(tmp_path / "r", tmp_path / "out", "images")
+    export(tmp_path / "r", tmp_path / "out", "mp4", force=True)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["left.mp4"]
+
+
+def test_a_view_s_name_leads_nowhere_else_and_no_two_have_one():
     names = ("../../x", "a/b", "a_b", ".hidden", "", "left")
-    spec = SourceSpec(names, (2, 2), "uint8", (), 50.0, 0, None)
-    found = frames.file_names(spec)
+    found = frames.file_names(SourceSpec(names, (2, 2), "uint8", (), 50.0, 0, None))
     assert len(set(found)) == len(names)
     assert not any("/" in name or name.startswith(".") for name in found)
     assert found[-1] == "left"
-
-
-def test_no_two_views_have_one_name():
     spec = SourceSpec(("a_-3", "a_", "a?", "a!", "a"), (2, 2), "uint8", (), 50.0, 0, None)
     assert frames.file_names(spec) == ("a_-3", "a_", "a_-4", "a_-5", "a")
-
-
-def test_only_exports_are_replaced(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "a.py").write_text("mine")
-    record_images(tmp_path / "r")
-    for form in ("images", "lerobot"):
-        with pytest.raises(UsageError, match="holds other files"):
-            export(tmp_path / "r", out, form, force=True)
-    assert [p.name for p in out.iterdir()] == ["a.py"]
 
 
 def test_the_command_says_what_is_lost(cdmisfa, tmp_path):

@@ -25,7 +25,7 @@ from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from cdmisfa.testing.sources import SourceContract, same
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.mcap.store import FileStore
 from recorder.recording import record, record_scene
 from recorder.world.oscillatory import OscillatoryConfig, OscillatorySource

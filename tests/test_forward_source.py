@@ -17,7 +17,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.experiments.session import run
 from cdmisfa.testing.sources import ForwardContract, same
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record
 from replay.recordings.source import RecordedSource
 
@@ -110,17 +110,6 @@ def test_the_signals_are_the_same_live_and_from_the_recording(recording: Path) -
     assert live.signals_sha256 == recorded.signals_sha256
 
 
-def test_a_run_of_them_is_logged_and_shown(tmp_path: Path) -> None:
-    result = run(Webcams(), CONFIG, tmp_path / "run", seed=3, max_iterations=5)
-    assert result.source == {"kind": "webcams", "devices": [0, 1]}
-    assert (tmp_path / "run" / "run.rrd").exists()
-
-
-def test_one_camera_alone_is_the_same_file(recording: Path, tmp_path: Path) -> None:
-    (file,) = record(Webcams(), tmp_path / "rec", frames=FRAMES, views=["right"])
-    assert file.file.read_bytes() == (recording / "right.mcap").read_bytes()
-
-
 @pytest.mark.parametrize("split", [None, Split(seconds=3), Split(size=12_000)])
 def test_a_resumed_recording_is_the_same_bytes(split: Split | None, tmp_path: Path) -> None:
     """A source that has not come to the missing frames yet passes over those that are there."""
@@ -162,13 +151,6 @@ def test_a_source_that_ends_is_recorded_to_its_end(tmp_path: Path) -> None:
         record(Webcams(length=70), tmp_path / "other", frames=71)
 
 
-def test_streams_that_cannot_name_files_take_other_names(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="'/dev/video0': give different names of files"):
-        record(Webcams(("/dev/video0", "b")), tmp_path / "rec", frames=9)
-    record(Webcams(("/dev/video0", "b")), tmp_path / "rec", frames=9, names=["a", "b"])
-    assert RecordedSource(tmp_path / "rec").spec.streams == ("a", "b")
-
-
 def test_a_dot_in_a_name_is_no_part(tmp_path: Path) -> None:
     for frames in (60, 100):
         files = record(
@@ -179,34 +161,6 @@ def test_a_dot_in_a_name_is_no_part(tmp_path: Path) -> None:
             resume=True,
         )
     assert [f.file.name for f in files][:2] == ["a.b-000.mcap", "a.b-001.mcap"]
-
-
-def test_what_no_recording_can_hold_is_refused(tmp_path: Path) -> None:
-    source = Webcams()
-    for spec, words in (
-        (SourceSpec(("a", "b"), (4, 6, 3), "uint8"), r"\(4, 6, 3\) uint8"),
-        (SourceSpec(("a", "b"), SHAPE, "uint8", fps=1e7), "give its source such an fps"),
-    ):
-        source.spec = spec
-        with pytest.raises(UsageError, match=words):
-            record(source, tmp_path / "rec", frames=9)
-    with pytest.raises(UsageError, match="only a scene can be opened by several processes"):
-        record(Webcams(), tmp_path / "rec", frames=9, jobs=2)
-    assert not (tmp_path / "rec").exists()
-
-
-@pytest.mark.parametrize("names", [["a"], ["a", "b", "c"]])
-def test_every_view_gets_a_name_or_none(tmp_path: Path, names: list[str]) -> None:
-    with pytest.raises(UsageError, match=f"{len(names)} names given for 2 views"):
-        record(Webcams(), tmp_path / "rec", frames=9, names=names)
-    assert not (tmp_path / "rec").exists()
-
-
-def test_a_source_that_shows_what_it_does_not_state_is_stopped_at_once(tmp_path: Path) -> None:
-    source = Webcams()
-    source.spec = SourceSpec(("left", "right"), (9, 9), "uint8")
-    with pytest.raises(CdmisfaError, match=r"left shows \(12, 16\) uint8 at frame 0, not the \(9"):
-        record(source, tmp_path / "rec", frames=9)
 
 
 def test_a_source_that_does_not_say_what_it_is_is_refused(tmp_path: Path) -> None:
@@ -224,8 +178,33 @@ def test_a_source_that_does_not_say_what_it_is_is_refused(tmp_path: Path) -> Non
     assert not (tmp_path / "out").exists()
 
 
-def test_a_url_is_no_folder_for_the_library_either() -> None:
-    with pytest.raises(UsageError, match="s3://x/y is a URL: name a path on this machine"):
-        record(Webcams(), "s3://x/y", frames=9)
-    with pytest.raises(UsageError, match=r"s3:/.*x/y is a URL"):
-        run(Webcams(), CONFIG, Path("s3://x/y"), max_iterations=1)
+IMAGES = SourceSpec(("a", "b"), (4, 6, 3), "uint8")
+FAST = SourceSpec(("a", "b"), SHAPE, "uint8", fps=1e7)
+OTHER = SourceSpec(("left", "right"), (9, 9), "uint8")
+
+
+@pytest.mark.parametrize(
+    ("spec", "options", "words"),
+    [
+        (IMAGES, {}, r"\(4, 6, 3\) uint8"),
+        (FAST, {}, "give its source such an fps"),
+        (OTHER, {}, r"left shows \(12, 16\) uint8 at frame 0, not the \(9"),
+        (None, {"jobs": 2}, "only a scene can be opened by several processes"),
+        (None, {"names": ["a"]}, "1 names given for 2 views"),
+        (None, {"names": ["a", "/b"]}, "'/b': give different names of files"),
+        (None, {"folder": "s3://x/y"}, "s3://x/y is a URL: name a path on this machine"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused(
+    tmp_path: Path, spec: SourceSpec | None, options: dict[str, Any], words: str
+) -> None:
+    source = Webcams()
+    source.spec = spec or source.spec
+    with pytest.raises(CdmisfaError, match=words):
+        record(source, **{"folder": tmp_path / "rec", "frames": 9, **options})
+    assert not list(tmp_path.glob("rec/*.mcap"))
+
+
+def test_views_take_other_names_than_streams(tmp_path: Path) -> None:
+    record(Webcams(("/dev/video0", "b")), tmp_path / "rec", frames=9, names=["a", "b"])
+    assert RecordedSource(tmp_path / "rec").spec.streams == ("a", "b")

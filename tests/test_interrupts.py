@@ -117,8 +117,8 @@ LIVE = ("record", "gym:Pendulum-v1", "--frames", 3)
     ("words", "last"),
     [
         (LEARN, "replay.view.build.build_view"),
-        (RECORD, "recorder.log.viewlog.ViewParts.write"),
-        (LIVE, "recorder.log.viewlog.ViewParts.finish"),
+        (RECORD, "recorder.log.viewlog.ViewLog.write"),
+        (LIVE, "recorder.log.viewlog.ViewLog.finish"),
     ],
     ids=["learn", "record", "live"],
 )

@@ -261,7 +261,7 @@ def test_what_went_before_has_a_picture_of_each_block(tmp_path, monkeypatch):
         writer.block(replace(block, t=t), moved, having(np.ones((1, 192))))
         begins.append(t)
     writer.finish()
-    monkeypatch.setattr("replay.view.columns.ImageColumn.send", keep)
+    monkeypatch.setattr("replay.view.columns.Column.send", keep)
     with LiveView(spec, MANIFEST, tau, 1) as view:
         view.earlier(tmp_path)
     assert sent == [t + t % 2 for t in begins]

@@ -12,8 +12,8 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
 from cdmisfa.core.errors import LogWriteError, UsageError
+from recorder.log.files import partial_path
 from recorder.log.logfile import LogFile
-from recorder.log.whole import partial_path
 from recorder.mcap.store import PARTIAL
 
 SECOND = 1_000_000_000
@@ -169,7 +169,7 @@ class FullDisk:
 @pytest.mark.parametrize("aside", [False, True])
 def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch, aside):
     disk = FullDisk(tmp_path / "a.mcap.partial", 40_000)
-    monkeypatch.setattr("recorder.log.appended.open", lambda *_: disk, raising=False)
+    monkeypatch.setattr("recorder.log.logfile.open", lambda *_: disk, raising=False)
     log, channel = open_log(tmp_path / "a.mcap", force=True, compression="none", aside=aside)
 
     def fill() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,9 +50,6 @@ SAMPLE = (
     ("the truth", "recording", "learn"),
     ("503 twice", "cameras", "convert"),
     ("half of it as all of it", "recording", "learn"),
-    ("half of it as all of it, in parts", "cameras", "convert"),
-    ("40 kB of it as all of it", "cameras", "learn"),
-    ("less than the whole that was said", "recording", "info"),
     ("replaced in silence", "recording", "learn"),
     ("replaced", "cameras", "verify"),
     ("10^18 bytes", "cameras", "verify"),
@@ -59,7 +57,6 @@ SAMPLE = (
     ("a reason for the terminal", "recording", "info"),
     ("to a file", "cameras", "info"),
     ("headers without end", "recording", "info"),
-    ("packed", "cameras", "learn"),
 )
 
 
@@ -72,21 +69,37 @@ def test_it_is_the_right_bits_or_one_clear_line(
 
 
 @pytest.mark.parametrize(
-    "lie",
+    ("lie", "code", "words"),
     [
-        "40 kB of it as all of it",
-        "half of it as all of it, in parts",
-        "less than the whole that was said",
-        "half of a part, then closed",
+        ("40 kB of it as all of it", 3, "sends less than the log"),
+        ("half of it as all of it, in parts", 3, "sends less than the log"),
+        ("less than the whole that was said", 3, "and went away"),
+        ("half of a part, then closed", 3, "and went away"),
+        ("another part", 3, "asked for the bytes 0 to"),
+        ("another tag each time", 3, "it changed while it was read; begin again"),
+        ("it grows", 3, "asked for the bytes"),
+        ("always all of it", 1, "no parts of a file"),
+        ("403", 1, "403 Forbidden"),
+        ("packed", 1, "packs it"),
+        ("410", 2, "410 Gone"),
     ],
 )
-def test_a_short_answer_is_damage_and_not_learned_from(
-    cdmisfa: Cdmisfa, given: Given, lie: str
+def test_what_a_server_has_against_us_is_one_line_and_nothing_is_learned(
+    cdmisfa: Cdmisfa, given: Given, lie: str, code: int, words: str
 ) -> None:
-    for log, words in (("recording", ()), ("cameras", ("--topic", "/left", "--size", "16x12"))):
+    for log, options in (("recording", ()), ("cameras", ("--topic", "/left", "--size", "16x12"))):
         with lying(given.logs[log][0], LIES[lie]) as server:
-            done = cdmisfa("learn", server.address, *words, "--max-iterations", 3)
-        assert (done.code, done.out, done.err.count("\n")) == (3, "", 1), done
+            done = cdmisfa("learn", server.address, *options, "--max-iterations", 3)
+            assert (done.code, done.out, done.err.count("\n")) == (code, "", 1), done
+            assert words in done.err
+            assert done.err.startswith(f"cdmisfa: {server.address}: ")
+
+
+def test_no_more_is_taken_than_was_asked_for() -> None:
+    tracemalloc.start()
+    read("a part without end", Limits())
+    assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("command", ["learn", "convert"])

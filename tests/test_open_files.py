@@ -18,17 +18,16 @@ import pytest
 
 from cdmisfa.core.blocks import Block, ClockedSource, SourceSpec, check_request, freeze
 from cdmisfa.core.errors import LogDamagedError, LogWriteError
-from recorder.log import appended, viewfacts
-from recorder.log.appended import AppendedFile
-from recorder.log.folder import held
-from recorder.log.logfile import LogFile
+from recorder.config import Split
+from recorder.log import logfile, manifest
+from recorder.log.files import held
+from recorder.log.logfile import AppendOnlyFile, LogFile
+from recorder.log.manifest import MOST_NAMED
 from recorder.log.messages import RECORDING_METADATA
-from recorder.log.split import Split
-from recorder.log.viewfacts import MOST_NAMED
 from recorder.mcap import store
 from recorder.mcap.mending import MendedStore
 from recorder.mcap.reader import LogReader
-from recorder.mcap.store import Excerpt, FileStore, OnePass
+from recorder.mcap.store import FileStore, OnePass
 from recorder.recording import RecordingStoppedError, record, record_scene, recorded
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
@@ -128,7 +127,6 @@ def test_a_file_that_was_replaced_is_not_read_on(files: list[Path], there: bool)
         lambda store: list(store.blocks(0, store.size)),
         lambda store: store.crc(0, store.size),
         lambda store: store.grow(),
-        lambda store: Excerpt(store, 1, 6),
         lambda store: OnePass(store).pass_to(6),
         lambda store: MendedStore(store).read(1, 5),
     ],
@@ -192,7 +190,7 @@ def test_the_bytes_are_the_same_however_few_files_are_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record(ManyViews(5), tmp_path / "open")
-    monkeypatch.setattr(appended, "OPEN_FILES", 2)
+    monkeypatch.setattr(logfile, "OPEN_FILES", 2)
     record(ManyViews(5), tmp_path / "closed")
     assert checksums(tmp_path / "closed") == checksums(tmp_path / "open")
     assert len(checksums(tmp_path / "open")) == 5
@@ -271,7 +269,7 @@ def test_a_recording_that_names_many_views_in_each_file_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As they were before, whatever their number."""
-    monkeypatch.setattr(viewfacts, "MOST_NAMED", 1000)
+    monkeypatch.setattr(manifest, "MOST_NAMED", 1000)
     record(ManyViews(MOST_NAMED + 3), tmp_path, frames=5)
     monkeypatch.undo()
     assert check_log(tmp_path).ok
@@ -282,10 +280,10 @@ def test_a_recording_that_names_many_views_in_each_file_is_read(
 
 
 @pytest.fixture
-def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[AppendedFile]:
-    """A file that was closed while another one is written."""
-    monkeypatch.setattr(appended, "OPEN_FILES", 1)
-    file, other = AppendedFile(tmp_path / "a"), AppendedFile(tmp_path / "b")
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[AppendOnlyFile]:
+    """A file that is not open between two writes, as another one is."""
+    monkeypatch.setattr(logfile, "OPEN_FILES", 1)
+    other, file = AppendOnlyFile(tmp_path / "b"), AppendOnlyFile(tmp_path / "a")
     file.write(b"first")
     other.write(b"other")
     assert (tmp_path / "a").read_bytes() == b"first"
@@ -294,7 +292,7 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Appende
     other.close()
 
 
-def test_a_closed_file_goes_on_where_it_was(tmp_path: Path, written: AppendedFile) -> None:
+def test_a_closed_file_goes_on_where_it_was(tmp_path: Path, written: AppendOnlyFile) -> None:
     assert written.tell() == 5
     written.write(b", second")
     assert written.tell() == 13
@@ -304,7 +302,7 @@ def test_a_closed_file_goes_on_where_it_was(tmp_path: Path, written: AppendedFil
 
 @pytest.mark.parametrize("change", ["longer", "another", "gone", "held"])
 def test_what_others_did_to_a_closed_file_is_an_error_once_and_for_all(
-    tmp_path: Path, written: AppendedFile, change: str
+    tmp_path: Path, written: AppendOnlyFile, change: str
 ) -> None:
     path = tmp_path / "a"
     with contextlib.ExitStack() as stack:

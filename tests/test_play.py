@@ -32,8 +32,8 @@ from replay.camera_logs.options import CameraOptions
 from replay.inputs import Logged
 from replay.playing.as_robot import play_as_robot
 from replay.playing.feed import (
+    DueMessage,
     Feed,
-    Message,
     Playback,
     Played,
     Topic,
@@ -46,16 +46,16 @@ FRAMES, FPS = 21, 8.0  # of so few a second that a busy machine is not late by a
 TOPIC = Topic("/x", "json", "", "", b"")
 
 
-def told(*seconds: float) -> list[Message]:
-    return [Message(10**18 + round(s * 1e9), TOPIC, str(s).encode()) for s in seconds]
+def told(*seconds: float) -> list[DueMessage]:
+    return [DueMessage(10**18 + round(s * 1e9), TOPIC, str(s).encode()) for s in seconds]
 
 
-def feed_of(items: list[Message]) -> Feed[Message]:
+def feed_of(items: list[DueMessage]) -> Feed[DueMessage]:
     return Feed(items[0].time_ns, items[-1].time_ns, lambda: items)
 
 
 def played_at(
-    items: list[Message], rate: float = 1.0, over: float = 0.0
+    items: list[DueMessage], rate: float = 1.0, over: float = 0.0
 ) -> tuple[list[float], Played]:
     clock, played = Clock(over), Played()
     pace = paced(feed_of(items), Playback(rate), played, now=clock.monotonic, sleep=clock.sleep)

@@ -12,7 +12,7 @@ from cdmisfa.core.blocks import Block, FrameSource, SourceSpec
 from cdmisfa.core.errors import LogDamagedError, LogExhaustedError, UsageError
 from cdmisfa.testing.sources import SourceContract, same
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.mcap.reader import LogReader
 from recorder.recording import record_scene
@@ -40,10 +40,10 @@ def write_pictures(folder: Path, **settings: object) -> list[Block]:
     blocks = picture_blocks(IMAGES, FRAMES)
     for block in blocks:
         name = IMAGES.streams[block.stream]
-        identity = Identity("icub", 3, IMAGES, {})
+        identity = RecordingSpec("icub", 3, IMAGES, {})
         log = ViewLog(folder, name, identity, RecordConfig(**settings))  # type: ignore[arg-type]
         log.write(block)
-        log.file.finish()
+        log.finish()
     return blocks
 
 

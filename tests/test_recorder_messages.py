@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
+from recorder.log.manifest import RecordingSpec, ViewMetadata
 from recorder.log.messages import (
     ImageEncoder,
     Payload,
@@ -21,7 +22,6 @@ from recorder.log.messages import (
     truth_tags,
     vector_payload,
 )
-from recorder.log.viewfacts import Identity, ViewFacts
 
 TIMES = st.integers(0, 2**62)
 DOUBLES = st.lists(st.floats(), min_size=1, max_size=20)
@@ -126,10 +126,10 @@ def test_what_a_file_states_is_read_as_it_was_written(
 ) -> None:
     dtype = "uint8" if len(shape) == 2 else "float64"
     spec = SourceSpec(("left", "right"), shape, dtype, tuple(truth), fps, 10**18)
-    facts = Identity("icub", 3, spec, {"scene": {}}, ("pillow",)).facts("right", first)
-    values = facts.as_metadata()
+    facts = RecordingSpec("icub", 3, spec, {"scene": {}}, ("pillow",)).metadata("right", first)
+    values = facts.record()
     assert list(values)[:4] == ["schema", "scene", "view", "stream_index"]
-    assert ViewFacts.from_metadata("x.mcap", values) == facts
+    assert ViewMetadata.parse("x.mcap", values) == facts
     for key in ("view", "stream_index", "frame_shape", "dtype", "fps", "start_ns"):
         with pytest.raises(LogDamagedError, match=rf"x\.mcap: its recording metadata .* {key}"):
-            ViewFacts.from_metadata("x.mcap", {k: v for k, v in values.items() if k != key})
+            ViewMetadata.parse("x.mcap", {k: v for k, v in values.items() if k != key})

@@ -1,6 +1,5 @@
 """Recordings: the same bytes however they are made, readable by others, safe from any end."""
 
-import errno
 import hashlib
 import json
 import os
@@ -18,18 +17,14 @@ from mcap.reader import make_reader
 from waiting import wait_for
 
 from cdmisfa.core.errors import UsageError
-from recorder.config import RecordConfig
-from recorder.log import resume
-from recorder.log.begun import RECORDING
-from recorder.log.folder import held
+from recorder.config import RecordConfig, Split
+from recorder.log.files import held, partial_path
+from recorder.log.manifest import RECORDING
 from recorder.log.messages import RECORDING_METADATA
 from recorder.log.resume import frames_held
-from recorder.log.split import Split
-from recorder.log.whole import partial_path
-from recorder.recording import RecordingStoppedError, record, record_scene
+from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.icub.config import IcubConfig
-from recorder.world.oscillatory import OscillatorySource
-from recorder.world.scenes import BLOCK, SCENES, open_scene, requests
+from recorder.world.scenes import SCENES, open_scene
 
 ROOT = Path(__file__).parent.parent
 STREAMS = ("x1", "x2", "x3")
@@ -40,7 +35,7 @@ def sha256(path: Path) -> str:
 
 
 def whole_frames(path: Path, view: str) -> int:
-    return frames_held(path, view).whole(0)
+    return frames_held(path, view).stop_from(0)
 
 
 @pytest.fixture(scope="module")
@@ -110,19 +105,6 @@ def test_a_file_says_what_it_is(icub):
     assert config["record"]["fps"] == 50.0
 
 
-def test_rerun_shows_the_frames_as_images(icub):
-    chunk = pytest.importorskip("rerun.chunk")
-    rows, names = 0, set()
-    for piece in chunk.McapReader(str(icub / "left.mcap")).stream():
-        if piece.entity_path == "/view/left":
-            columns = piece.to_record_batch().schema.names
-            names.update(columns)
-            if "Image:buffer" in columns:
-                rows += piece.num_rows
-    assert rows == 150
-    assert "Image:format" in names
-
-
 @pytest.mark.parametrize("kind", ["icub", "oscillatory"])
 def test_bytes_do_not_depend_on_jobs(kind, request, tmp_path):
     whole = request.getfixturevalue(kind)
@@ -137,29 +119,6 @@ def test_one_view_alone_is_the_same_file(icub, tmp_path):
     assert files[0].sha256 == sha256(icub / "right.mcap")
     assert files[0].bytes == (icub / "right.mcap").stat().st_size
     assert os.listdir(tmp_path / "b") == ["right.mcap"]
-
-
-def test_another_seed_gives_other_bytes(icub, tmp_path):
-    record_scene("icub", tmp_path / "b", IcubConfig(seed=4), frames=20, views=["center"])
-    record_scene("icub", tmp_path / "c", IcubConfig(seed=3), frames=20, views=["center"])
-    assert contents(tmp_path / "b") != contents(tmp_path / "c")
-
-
-def test_progress_ends_at_the_number_of_frames(tmp_path):
-    told = []
-    record_scene("oscillatory", tmp_path / "a", frames=150, progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 150
-
-
-def test_requests_cover_every_missing_frame_once_in_time_order():
-    starts = {0: 0, 1: 70, 2: 200}
-    wanted = list(requests(starts, 150))
-    for stream, start in starts.items():
-        mine = [(first, n) for s, first, n in wanted if s == stream]
-        frames = [t for first, n in mine for t in range(first, first + n)]
-        assert frames == list(range(start, 150))
-    assert [first // BLOCK for _, first, _ in wanted] == sorted(f // BLOCK for _, f, _ in wanted)
 
 
 def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
@@ -180,36 +139,15 @@ def test_an_existing_folder_is_kept_unless_forced(oscillatory, tmp_path):
     assert sha256(folder / "x2.mcap") == sha256(oscillatory / "x2.mcap")
 
 
-def test_going_on_shortens_nothing(tmp_path):
-    folder = tmp_path / "a"
-    record_scene("oscillatory", folder, frames=60)
-    before = contents(folder)
-    with pytest.raises(UsageError, match="holds 60 frames, more than --frames 20"):
-        record_scene("oscillatory", folder, frames=20, resume=True)
-    assert contents(folder) == before
-
-
 def test_a_folder_in_use_is_refused(tmp_path):
     folder = tmp_path / "a"
     folder.mkdir()
     with held(folder), pytest.raises(UsageError, match="in use by another process"):
         record_scene("oscillatory", folder, frames=20)
     assert contents(folder) == {}
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"frames": 0}, "--frames is 0"),
-        ({"jobs": 0}, "--jobs is 0"),
-        ({"views": ["left"]}, "no view 'left': the scene has x1, x2, x3"),
-        ({"force": True, "resume": True}, "one of them"),
-    ],
-)
-def test_wrong_arguments_are_named_and_nothing_is_made(tmp_path, options, words):
-    with pytest.raises(UsageError, match=words):
-        record_scene("oscillatory", tmp_path / "a", **({"frames": 10} | options))
-    assert not (tmp_path / "a").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="file is a file: name a folder"):
+        record_scene("oscillatory", tmp_path / "file" / "a", frames=10)
 
 
 RECORD = """
@@ -241,12 +179,16 @@ def interrupt(folder: Path, number: int) -> tuple[int, int]:
     return process.returncode, int(([line, *rest.splitlines()])[-1])
 
 
-def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_what_a_signal_leaves_is_resumed_to_the_same_bytes(oscillatory, tmp_path, number):
     folder = tmp_path / "a"
-    code, told = interrupt(folder, signal.SIGKILL)
-    assert code == -signal.SIGKILL
-    for view in STREAMS:
-        assert whole_frames(partial_path(folder / f"{view}.mcap"), view) >= told - 50
+    code, told = interrupt(folder, number)
+    killed = number == signal.SIGKILL
+    assert code == (-number if killed else 128 + number)
+    assert not list(folder.glob("*.mcap"))
+    for view in STREAMS:  # of a kill at most a second is lost
+        held = whole_frames(partial_path(folder / f"{view}.mcap"), view)
+        assert held >= told - (50 if killed else 0)
     noted = json.loads((folder / RECORDING).read_text())
     assert noted["frames"] == dict.fromkeys(STREAMS, 1000000)
     files = record_scene("oscillatory", folder, frames=3000, resume=True)
@@ -254,138 +196,95 @@ def test_kill_9_loses_at_most_a_second_and_can_be_resumed(oscillatory, tmp_path)
     assert contents(folder) == contents(oscillatory)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_everything_that_was_recorded(tmp_path, number):
-    code, told = interrupt(tmp_path / "a", number)
-    assert code == 128 + number
-    for view in STREAMS:
-        assert whole_frames(partial_path(tmp_path / "a" / f"{view}.mcap"), view) >= told
-    assert not list((tmp_path / "a").glob("*.mcap"))
-
-
-def test_signals_are_left_to_the_caller(tmp_path):
-    handlers = []
-
-    def note(_: float) -> None:
-        handlers.append([signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)])
-
-    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    record_scene("oscillatory", tmp_path / "a", frames=100, progress=note)
-    assert handlers
-    assert all(each == before for each in handlers)
-
-
-def test_stop_ends_a_recording_that_can_be_resumed(oscillatory, tmp_path):
+def test_a_stopped_recording_knows_how_long_it_was_to_be(oscillatory, tmp_path):
     folder, told = tmp_path / "a", []
-    with pytest.raises(RecordingStoppedError, match="a is not finished: go on with --resume"):
-        record_scene(
-            "oscillatory", folder, frames=3000, progress=told.append, stop=lambda: len(told) == 9
-        )
-    assert not list(folder.glob("*.mcap"))
-    assert [whole_frames(partial_path(folder / f"{view}.mcap"), view) for view in STREAMS] == [
-        192
-    ] * 3
-    record_scene("oscillatory", folder, resume=True)
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+
+    def stop() -> bool:
+        assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+        return len(told) in (9, 20)
+
+    why = "a is not finished: go on with --resume"
+    with pytest.raises(RecordingStoppedError, match=why):
+        record_scene("oscillatory", folder, frames=3000, progress=told.append, stop=stop)
+    left = [whole_frames(partial_path(folder / f"{view}.mcap"), view) for view in STREAMS]
+    assert left == [192] * 3
+    options = {"views": ["x2"], "progress": told.append, "stop": stop}
+    with pytest.raises(RecordingStoppedError, match=why):
+        record_scene("oscillatory", folder, resume=True, **options)
+    record_scene("oscillatory", folder, resume=True, progress=told.append)
+    assert told[-1] == 3000
     assert contents(folder) == contents(oscillatory)
 
 
-def test_resume_knows_how_long_it_was_to_be(tmp_path):
-    folder, whole = tmp_path / "a", tmp_path / "whole"
-    record_scene("oscillatory", whole, frames=1300)
-
-    def stop_at(frame: int):
-        def progress(done: float) -> None:
-            if done >= frame:
-                raise RuntimeError("stop")
-
-        return progress
-
-    with pytest.raises(RuntimeError, match="stop"):
-        record_scene("oscillatory", folder, frames=1300, progress=stop_at(200))
-    with pytest.raises(RuntimeError, match="stop"):
-        record_scene("oscillatory", folder, resume=True, views=["x2"], progress=stop_at(600))
-    files = record_scene("oscillatory", folder, resume=True)
-    assert [f.frames for f in files] == [1300] * 3
-    assert contents(folder) == contents(whole)
-
-
 @pytest.mark.parametrize("split", [None, Split(seconds=3), Split(size=10_000)])
-def test_a_complete_recording_is_left_as_it_is(tmp_path, monkeypatch, split):
+def test_a_complete_recording_is_left_as_it_is(tmp_path, split):
     folder, told = tmp_path / "a", []
     first = record_scene("oscillatory", folder, frames=400, split=split)
     before = {path.name: path.stat().st_ino for path in folder.iterdir()}
-    reads: list[Path] = []
-    read = resume.messages
-    monkeypatch.setattr(resume, "messages", lambda path: reads.append(path) or read(path))
-    again = record_scene(
-        "oscillatory", folder, frames=400, split=split, resume=True, progress=told.append
-    )
-    assert again == first == record_scene("oscillatory", folder, split=split, resume=True)
+    again = {"split": split, "resume": True, "progress": told.append}
+    assert record_scene("oscillatory", folder, frames=400, **again) == first
+    assert record_scene("oscillatory", folder, **again) == first
     assert told == []
-    assert sorted(reads) == sorted([f.file for f in first] * 2)  # once each time
     assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
-    (folder / first[-1].file.name).rename(folder / f"{first[-1].file.name}.partial")
-    assert record_scene("oscillatory", folder, frames=400, split=split, resume=True) == first
+    first[-1].file.rename(partial_path(first[-1].file))
+    assert record_scene("oscillatory", folder, frames=400, **again) == first
     assert first[0].file.stat().st_ino == before[first[0].file.name]
 
 
-def test_resume_goes_on_from_any_torn_byte(oscillatory, tmp_path):
-    sizes = [(oscillatory / f"{view}.mcap").stat().st_size for view in STREAMS]
-    for cut in (0.0, 0.001, 0.37, 0.999):
-        folder = tmp_path / f"{cut}"
-        folder.mkdir()
-        for view, size in zip(STREAMS[:2], sizes, strict=False):
-            data = (oscillatory / f"{view}.mcap").read_bytes()[: int(cut * size)]
-            partial_path(folder / f"{view}.mcap").write_bytes(data)
-        record_scene("oscillatory", folder, frames=3000, resume=True)
-        assert contents(folder) == contents(oscillatory)
+@pytest.mark.parametrize("cut", [0.0, 0.001, 0.37, 0.999, 1.0])
+def test_resume_goes_on_from_any_torn_byte(oscillatory, tmp_path, cut):
+    for view in STREAMS[:2]:
+        data = (oscillatory / f"{view}.mcap").read_bytes()
+        partial_path(tmp_path / f"{view}.mcap").write_bytes(data[: int(cut * len(data))])
+    record_scene("oscillatory", tmp_path, frames=3000, resume=True)
+    assert contents(tmp_path) == contents(oscillatory)
 
 
-def test_resume_of_a_finished_recording_can_make_it_longer(oscillatory, tmp_path):
+@pytest.mark.parametrize("zeros", [False, True])
+def test_resume_takes_what_stands_before_the_first_damage(oscillatory, tmp_path, zeros):
+    path = partial_path(tmp_path / "x1.mcap")
+    data = bytearray((oscillatory / "x1.mcap").read_bytes())
+    middle = len(data) // 2
+    data[middle:] = bytes(len(data) - middle) if zeros else b"\xff" * 2000 + data[middle + 2000 :]
+    path.write_bytes(data)
+    assert 1000 < whole_frames(path, "x1") < 2000
+    record_scene("oscillatory", tmp_path, frames=3000, resume=True)
+    assert contents(tmp_path) == contents(oscillatory)
+
+
+def test_a_finished_recording_is_made_longer_and_never_shorter(oscillatory, tmp_path):
     record_scene("oscillatory", tmp_path / "a", frames=130)
+    before = contents(tmp_path / "a")
+    with pytest.raises(UsageError, match="holds 130 frames, more than --frames 20"):
+        record_scene("oscillatory", tmp_path / "a", frames=20, resume=True)
+    assert contents(tmp_path / "a") == before
     record_scene("oscillatory", tmp_path / "a", frames=3000, resume=True)
     assert contents(tmp_path / "a") == contents(oscillatory)
 
 
-def test_resume_of_something_else_is_refused_and_changes_nothing(tmp_path):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"frames": 0}, "--frames is 0"),
+        ({"jobs": 0}, "--jobs is 0"),
+        ({"views": ["left"]}, "no view 'left': the scene has x1, x2, x3"),
+        ({"force": True, "resume": True}, "one of them"),
+        ({"settings": RecordConfig(fps=25)}, r"x3\.mcap cannot be continued: its fps is '50\.0'"),
+        ({}, r"x2\.mcap holds no frames of x2"),
+    ],
+)
+def test_what_cannot_be_resumed_is_named_and_nothing_changes(tmp_path, options, words):
     folder = tmp_path / "a"
     record_scene("oscillatory", folder, frames=130)
     (folder / "x1.mcap").unlink()
+    (folder / "x2.mcap").unlink()
+    if not options:
+        (folder / "x2.mcap").write_bytes(b"precious")
     before = contents(folder)
-    with pytest.raises(UsageError, match=r"x2\.mcap cannot be continued: its fps is '50\.0'"):
-        record_scene("oscillatory", folder, None, RecordConfig(fps=25), frames=200, resume=True)
+    with pytest.raises(UsageError, match=words):
+        record_scene("oscillatory", folder, **({"frames": 200, "resume": True} | options))
     assert contents(folder) == before
-
-
-def test_resume_never_removes_a_file_it_did_not_write(tmp_path):
-    folder = tmp_path / "a"
-    folder.mkdir()
-    (folder / "x2.mcap").write_bytes(b"precious")
-    with pytest.raises(UsageError, match=r"x2\.mcap holds no frames of x2"):
-        record_scene("oscillatory", folder, frames=10, resume=True)
-    assert (folder / "x2.mcap").read_bytes() == b"precious"
-
-
-class Breaking(OscillatorySource):
-    """A source that fails at frame 640."""
-
-    def take(self, stream, n):
-        if self.t >= 640:
-            raise OSError(errno.EIO, "the camera is gone")
-        return super().take(stream, n)
-
-
-def test_an_exception_leaves_readable_partials(tmp_path):
-    with pytest.raises(OSError, match="camera"):
-        record(Breaking(), tmp_path / "a", frames=1000)
-    for view in STREAMS:
-        assert whole_frames(tmp_path / "a" / f"{view}.mcap.partial", view) == 640
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="file is a file: name a folder"):
-        record_scene("oscillatory", tmp_path / "file" / "a", frames=10)
 
 
 @pytest.mark.parametrize("wait_for_frames", [False, True])
@@ -428,10 +327,9 @@ def recorder(tmp_path):
         process.kill()
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, tmp_path, which):
+def test_a_killed_rendering_process_ends_the_recording_with_one_line(recorder, tmp_path):
     process, workers = recorder
-    os.kill(workers[which], signal.SIGKILL)
+    os.kill(workers[1], signal.SIGKILL)
     _, complaint = process.communicate(timeout=10)
     assert process.returncode == 1
     (line,) = complaint.strip().splitlines()

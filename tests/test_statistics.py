@@ -78,7 +78,7 @@ def test_wilson_interval_has_the_textbook_values() -> None:
 
 
 def test_summary_leaves_out_what_is_not_a_number() -> None:
-    assert statistics.summary([2.0, 4.0, math.nan, math.inf]) == statistics.Summary(
+    assert statistics.summary([2.0, 4.0, math.nan, math.inf]) == statistics.MeanSd(
         3.0, math.sqrt(2), 2
     )
     assert statistics.summary([]).n == 0

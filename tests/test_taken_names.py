@@ -15,8 +15,8 @@ from test_cli import assert_one_line
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from cdmisfa.experiments.documents import write_json
+from recorder.log.files import atomic_write
 from recorder.log.logfile import LogFile
-from recorder.log.whole import whole
 from recorder.recording import record_scene
 from recorder.world.oscillatory import OscillatoryConfig
 
@@ -95,8 +95,8 @@ def test_force_replaces_files_only_in_folders(
 OVERLAP = """
 import sys
 from pathlib import Path
-from recorder.log.whole import whole
-with whole(Path(sys.argv[1])) as partial:
+from recorder.log.files import atomic_write
+with atomic_write(Path(sys.argv[1])) as partial:
     partial.write_text(sys.argv[2])
     print(flush=True)
     input()
@@ -135,9 +135,9 @@ def test_two_processes_write_one_folder(tmp_path: Path, monkeypatch: pytest.Monk
         if removed == path:
             (path / "other").mkdir(parents=True)
 
-    monkeypatch.setattr("recorder.log.whole._remove", appears)
+    monkeypatch.setattr("recorder.log.files._remove", appears)
     why = "a was written by another process meanwhile"
-    with pytest.raises(LogWriteError, match=why), whole(path) as partial:
+    with pytest.raises(LogWriteError, match=why), atomic_write(path) as partial:
         partial.mkdir()
     assert names(path) == {"other"}
 
@@ -154,7 +154,7 @@ def test_two_logs_of_one_name_are_not_mixed(tmp_path: Path, force: bool) -> None
 
 def test_on_an_error_nothing_is_left(tmp_path: Path) -> None:
     def write() -> None:
-        with whole(tmp_path / "a") as partial:
+        with atomic_write(tmp_path / "a") as partial:
             partial.mkdir()
             raise ZeroDivisionError
 

@@ -14,7 +14,7 @@ from test_view_layout import Built
 
 from cdmisfa.core.modules import Module
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from replay.recordings.source import RecordedSource
 from replay.runs.modules import save_modules
@@ -39,13 +39,13 @@ def shown(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gap")
     recording = folder / "recording"
     recording.mkdir()
-    identity = Identity("test", 0, IMAGE, {}, gaps=True)
+    identity = RecordingSpec("test", 0, IMAGE, {}, gaps=True)
     logs = [ViewLog(recording, name, identity, RecordConfig()) for name in IMAGE.streams]
     rng = np.random.default_rng(0)
     for s, log in enumerate(logs):
         for k in range(ITERATIONS):
             log.write(block_of(IMAGE, s, after_the_gap(k * TAU), TAU, rng))
-        log.file.finish()
+        log.finish()
     with contextlib.closing(RecordedSource(recording, loop=True)) as source:
         described = source.describe()
     learner = {"tau": TAU, "delta": 0.001}

@@ -18,9 +18,9 @@ from PIL import Image
 from run_data import IMAGE, VECTOR, read_signals, run_of, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.view import panels
 from replay.view.bindings import viewer_program
 from replay.view.build import build_view, view_of
-from replay.view.layouts import panels
 from replay.viewer import headless, program, window
 from replay.viewer.headless import frame_at
 from replay.viewer.program import (

@@ -1,18 +1,13 @@
-"""A web server on this machine that sends parts of files, counts bytes, and can misbehave."""
+"""A web server on this machine that sends parts of files, and counts bytes."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Literal
 from urllib.parse import unquote, urlsplit
-
-Fault = Literal[
-    "", "no ranges", "short", "other part", "403", "500 once", "endless", "packed", "no length"
-]
 
 
 class _Server(ThreadingHTTPServer):
@@ -28,15 +23,11 @@ class WebServer:
     Attributes:
         files: path, with its slash, to content; may be changed at any time.
         sent: bytes of content that were sent.
-        requests: (path, first byte asked for) of every request.
-        fault: how it misbehaves from now on.
     """
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
         self.sent = 0
-        self.requests: list[tuple[str, int]] = []
-        self.fault: Fault = ""
         self.server = _Server(("127.0.0.1", 0), _handler_of(self))
 
     def url(self, path: str) -> str:
@@ -45,10 +36,10 @@ class WebServer:
 
     def reset(self) -> None:
         """Begin to count anew."""
-        self.sent, self.requests = 0, []
+        self.sent = 0
 
 
-@contextmanager
+@contextlib.contextmanager
 def serving() -> Iterator[WebServer]:
     """A server for as long as it is wanted."""
     web = WebServer()
@@ -71,49 +62,24 @@ def _handler_of(web: WebServer) -> type[BaseHTTPRequestHandler]:
             pass
 
         def do_GET(self) -> None:
-            path = unquote(urlsplit(self.path).path)
+            body = web.files.get(unquote(urlsplit(self.path).path))
             found = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
-            start, stop = (int(found[1]), int(found[2]) + 1) if found else (0, 2**63)
-            web.requests.append((path, start))
-            body = web.files.get(path)
-            if web.fault == "500 once":
-                web.fault = ""
-                return self.answer(500)
-            if body is None or web.fault == "403":
-                return self.answer(404 if body is None else 403)
+            if body is None or found is None:
+                return self.answer(404 if body is None else 200, body or b"")
+            start, stop = int(found[1]), int(found[2]) + 1
             if start >= len(body):
                 return self.answer(416, **{"Content-Range": f"bytes */{len(body)}"})
-            if found is None or web.fault == "no ranges":
-                return self.answer(200, body)
             part = body[start:stop]
-            first = start + 1 if web.fault == "other part" else start
-            said = f"bytes {first}-{start + len(part) - 1}/{len(body)}"
-            tag = f'"{hash(body)}"'
-            headers = {"Content-Range": said, "ETag": tag}
-            if web.fault == "packed":
-                headers["Content-Encoding"] = "gzip"
-            length = len(part)
-            if web.fault == "short":
-                part = part[: len(part) // 2]
-            if web.fault == "endless":
-                part, length = bytes(50_000_000), 50_000_000
-            return self.answer(206, part, length, **headers)
+            said = f"bytes {start}-{start + len(part) - 1}/{len(body)}"
+            return self.answer(206, part, **{"Content-Range": said, "ETag": f'"{hash(body)}"'})
 
-        def answer(
-            self, status: int, body: bytes = b"", length: int | None = None, **headers: str
-        ) -> None:
+        def answer(self, status: int, body: bytes = b"", **headers: str) -> None:
             self.send_response(status)
-            for name, value in headers.items():
+            for name, value in {**headers, "Content-Length": str(len(body))}.items():
                 self.send_header(name, value)
-            self.send_header("Content-Length", str(len(body) if length is None else length))
             self.end_headers()
-            try:
-                for at in range(0, len(body), 1 << 16):
-                    self.wfile.write(body[at : at + (1 << 16)])
-                    web.sent += len(body[at : at + (1 << 16)])
-            except ConnectionError:
-                pass
-            if length not in (None, len(body)):
-                self.close_connection = True
+            with contextlib.suppress(ConnectionError):
+                self.wfile.write(body)
+                web.sent += len(body)
 
     return Handler

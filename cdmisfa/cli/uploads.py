@@ -34,7 +34,7 @@ class Destination(options.LocalPath):
         return super().convert(value, param, ctx)
 
 
-def out(
+def out_option(
     meaning: str, *, required: bool = False, goes_on: bool = False
 ) -> Callable[[Command], Command]:
     """`-o` and `--local` of a command whose result may be uploaded; it is given the path.

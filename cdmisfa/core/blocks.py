@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, frames_of, time_of, times_of
+from cdmisfa.core.clock import NANOSECONDS, SLOWEST, Times, nearest_frames, time_of, times_of
 from cdmisfa.core.errors import UsageError
 
 UINT8 = np.dtype(np.uint8)
@@ -95,7 +95,7 @@ class SourceSpec:
 
     def frames_at(self, times: NDArray[Any]) -> Times:
         """The frames nearest to log times, (n,) nanoseconds."""
-        return frames_of(times, self.fps, self.start_ns)
+        return nearest_frames(times, self.fps, self.start_ns)
 
 
 @runtime_checkable

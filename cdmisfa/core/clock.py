@@ -46,7 +46,7 @@ def times_of(frames: NDArray[Any], fps: float, start_ns: int) -> Times:
     return np.asarray(start_ns + offsets.astype(np.int64))
 
 
-def frames_of(times: NDArray[Any], fps: float, start_ns: int) -> Times:
+def nearest_frames(times: NDArray[Any], fps: float, start_ns: int) -> Times:
     """The frames nearest to log times: of `times_of`, at up to 1e8 frames a second, those it took.
 
     Args:

@@ -15,7 +15,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -101,16 +101,16 @@ class LearnerConfig:
         positive(self, "learner", "nu", "delta", "epsilon_start", "mean_window", "slowness_window")
         positive(self, "learner", "tau", "components", "outputs", "eta_dot_window", "gate_window")
         positive(self, "learner", "patience", "roc_centres", "roc_radius", "roc_memory")
-        within(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
-        within(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
-        within(self, "learner", 0.0, 1.0, "nu")
-        within(self, "learner", 1e-6, 1.0, "alpha")
-        within(self, "learner", 0.0, math.inf, "epsilon_knee")
-        within(self, "learner", 1, MAX_COMPONENTS, "components")
-        within(self, "learner", 3, MAX_TAU, "tau")
-        within(self, "learner", 0.0, 0.999999, "gamma")
+        in_range(self, "learner", 0.0, math.inf, "sigma", "warm_up", "min_variance", "roc_error")
+        in_range(self, "learner", 0.0, 1.0, "epsilon_decay", "epsilon_tail_decay", "novel_share")
+        in_range(self, "learner", 0.0, 1.0, "nu")
+        in_range(self, "learner", 1e-6, 1.0, "alpha")
+        in_range(self, "learner", 0.0, math.inf, "epsilon_knee")
+        in_range(self, "learner", 1, MAX_COMPONENTS, "components")
+        in_range(self, "learner", 3, MAX_TAU, "tau")
+        in_range(self, "learner", 0.0, 0.999999, "gamma")
         if self.beta is not None:
-            within(self, "learner", 0.0, math.inf, "beta")
+            in_range(self, "learner", 0.0, math.inf, "beta")
         outputs_within_components(self, "learner")
 
     def reward_beta(self, n_streams: int) -> float:
@@ -130,7 +130,7 @@ def convert_fields(section: Any, prefix: str) -> None:
         UsageError: a value does not fit; it names the key.
     """
     for name, hint in _hints(type(section)).items():
-        value = convert(getattr(section, name), hint, f"{prefix}.{name}")
+        value = convert_value(getattr(section, name), hint, f"{prefix}.{name}")
         object.__setattr__(section, name, value)
 
 
@@ -149,7 +149,7 @@ def positive(section: Any, prefix: str, *names: str) -> None:
             raise UsageError(f"{prefix}.{name} is {value}: it must be above 0 and finite")
 
 
-def within(section: Any, prefix: str, low: float, high: float, *names: str) -> None:
+def in_range(section: Any, prefix: str, low: float, high: float, *names: str) -> None:
     """Refuse values outside [low, high], naming the key.
 
     Raises:
@@ -277,7 +277,6 @@ def build(
     Raises:
         UsageError: an unknown key (with the nearest valid one) or a value of the wrong type.
     """
-    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     hints = _hints(cls)
     values: dict[str, Any] = {}
     nested: dict[str, list[Mapping[str, Any]]] = {}
@@ -286,8 +285,8 @@ def build(
             name, dot, rest = key.partition(".")
             if f"{prefix}.{name}" in FORMER:
                 continue
-            if name not in fields:
-                hint = did_you_mean(name, fields, f"{prefix}.")
+            if name not in hints:
+                hint = did_you_mean(name, hints, f"{prefix}.")
                 raise UsageError(f"unknown key {prefix}.{shown(key)}: {hint}")
             if dataclasses.is_dataclass(hints[name]):
                 if not dot and not isinstance(value, Mapping):
@@ -298,16 +297,15 @@ def build(
                     f"unknown key {prefix}.{shown(key)}: {prefix}.{name} has no keys of its own"
                 )
             else:
-                values[name] = convert(value, hints[name], f"{prefix}.{name}")
+                values[name] = convert_value(value, hints[name], f"{prefix}.{name}")
     for name, parts in nested.items():
-        start = getattr(base, name) if base is not None else _default(fields[name])
-        values[name] = build(hints[name], f"{prefix}.{name}", *parts, base=start)
-    if base is not None:
-        return dataclasses.replace(base, **values)  # type: ignore[type-var]
-    return cls(**values)
+        values[name] = build(
+            hints[name], f"{prefix}.{name}", *parts, base=getattr(base or cls(), name)
+        )
+    return dataclasses.replace(base, **values) if base else cls(**values)  # type: ignore[type-var]
 
 
-def convert(value: Any, hint: Any, key: str) -> Any:
+def convert_value(value: Any, hint: Any, key: str) -> Any:
     """A value, or its text, as the type of a field.
 
     Raises:
@@ -322,56 +320,68 @@ def convert(value: Any, hint: Any, key: str) -> Any:
     if origin is types.UnionType or origin is typing.Union:
         if value is None or value == "auto" or (value == "none" and str not in arguments):
             return None
-        return convert(value, next(a for a in arguments if a is not types.NoneType), key)
+        return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
     if origin is tuple:
-        parts = (
-            [p.strip() for p in value.strip("()[] ").split(",") if p.strip()]
-            if isinstance(value, str)
-            else value
-        )
+        parts = value.strip("()[] ").split(",") if isinstance(value, str) else value
         if not isinstance(parts, list | tuple):
             raise UsageError(f"{key} is {shown(value)}: it must be a list")
+        if isinstance(value, str):
+            parts = [part.strip() for part in parts if part.strip()]
         inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
         if len(inner) != len(parts):
             raise UsageError(f"{key} is {shown(value)}: it must have {len(inner)} values")
-        return tuple(convert(p, h, key) for p, h in zip(parts, inner, strict=True))
+        return tuple(convert_value(p, h, key) for p, h in zip(parts, inner, strict=True))
+    if hint not in _SCALARS:
+        raise TypeError(f"{key}: fields of type {hint} cannot be configured")
+    words, scalar = _SCALARS[hint]
     try:
-        if hint is bool:
-            if isinstance(value, str):
-                return {"true": True, "false": False}[value.lower()]
-            if not isinstance(value, bool):
-                raise ValueError
-            return value
-        if hint is int:
-            if isinstance(value, bool):
-                raise ValueError
-            whole = int(value) if isinstance(value, str) else index(value)
-            if abs(whole) > LARGEST:
-                raise ValueError
-            return whole
-        if hint is float:
-            if isinstance(value, bool):
-                raise ValueError
-            number = float(value)
-            if math.isnan(number):
-                raise ValueError
-            return number
-        if hint is str:
-            if not isinstance(value, str):
-                raise ValueError
-            return value
+        return scalar(value)
     except (ValueError, TypeError, KeyError, OverflowError):
-        raise UsageError(f"{key} is {_SHORT.repr(value)}: it must be {_WORDS[hint]}") from None
-    raise TypeError(f"{key}: fields of type {hint} cannot be configured")
+        raise UsageError(f"{key} is {_SHORT.repr(value)}: it must be {words}") from None
 
 
-def as_table(section: Any) -> dict[str, Any]:
+def _boolean(value: Any) -> bool:
+    if isinstance(value, bool):
+        return value
+    return {"true": True, "false": False}[value.lower() if isinstance(value, str) else ""]
+
+
+def _whole(value: Any) -> int:
+    number = int(value) if isinstance(value, str) else index(value)
+    if isinstance(value, bool) or abs(number) > LARGEST:
+        raise ValueError
+    return number
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if isinstance(value, bool) or math.isnan(number):
+        raise ValueError
+    return number
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+_SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {
+    bool: ("true or false", _boolean),
+    int: ("a whole number", _whole),
+    float: ("a number", _number),
+    str: ("a text", _text),
+}
+"""What a value of a type is in words, and how it is made of a value or text."""
+
+
+def section_table(section: Any) -> dict[str, Any]:
     """A section as plain JSON values, nested sections as tables, `None` as "auto"."""
     table: dict[str, Any] = {}
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)
         if dataclasses.is_dataclass(value):
-            table[field.name] = as_table(value)
+            table[field.name] = section_table(value)
         elif value is None:
             table[field.name] = "auto"
         else:
@@ -387,12 +397,3 @@ def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any
             yield from differences(before.get(name), now.get(name), where)
     elif before != now:
         yield key, before, now
-
-
-_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-
-
-def _default(field: Any) -> Any:
-    if field.default is not dataclasses.MISSING:
-        return field.default
-    return field.default_factory() if field.default_factory is not dataclasses.MISSING else None

@@ -13,9 +13,10 @@ import dataclasses
 import hashlib
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import accumulate
 from operator import attrgetter, itemgetter
 from typing import Any, Literal, NamedTuple
 
@@ -70,29 +71,29 @@ class Signal:
     since: int = 1
 
 
+_DTYPES: Mapping[str, str] = {
+    "int": "int64",
+    "float": "float64",
+    "bool": "bool",
+    "IntArray": "int64",
+    "FloatArray": "float64",
+}
+"""The element type of a field, by its annotation."""
+
+
 def _signal(
     symbol: str,
     about: str,
+    dims: str = "",
+    unit: str = "1",
     *,
     equation: str = "",
-    unit: str = "1",
-    dims: str = "",
-    dtype: str = "float64",
-    show: Show = "line",
+    show: Show | None = None,
     since: int = 1,
 ) -> Any:
-    return dataclasses.field(
-        metadata={
-            "symbol": symbol,
-            "equation": equation,
-            "unit": unit,
-            "dims": dims,
-            "dtype": dtype,
-            "show": show,
-            "about": about,
-            "since": since,
-        }
-    )
+    """A field; floats are shown as lines and others as lanes, where nothing else is said."""
+    told = {"symbol": symbol, "about": about, "dims": dims, "unit": unit, "equation": equation}
+    return dataclasses.field(metadata={**told, "show": show, "since": since})
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,80 +105,50 @@ class BlockSignals:
     there are more than `DENSE_STREAMS` streams.
     """
 
-    iteration: int = _signal("k", "Iteration, from 0.", dtype="int64", show="hidden")
+    iteration: int = _signal("k", "Iteration, from 0.", show="hidden")
     t: int = _signal(
-        "t",
-        "Global frame counter of the block's first frame.",
-        unit="frames",
-        dtype="int64",
-        show="hidden",
+        "t", "Global frame counter of the block's first frame.", "", "frames", show="hidden"
     )
-    log_time: int = _signal(
-        "", "Log time of the block's first frame.", unit="ns", dtype="int64", show="hidden"
-    )
-    stream: int = _signal("s", "Stream that was watched, from 0.", dtype="int64", show="lane")
-    module: int = _signal("i", "Abstraction being learned, from 1.", dtype="int64", show="lane")
-    novel: bool = _signal(
-        "", "The gate let the block through to the abstraction.", dtype="bool", show="lane"
-    )
+    log_time: int = _signal("", "Log time of the block's first frame.", "", "ns", show="hidden")
+    stream: int = _signal("s", "Stream that was watched, from 0.")
+    module: int = _signal("i", "Abstraction being learned, from 1.")
+    novel: bool = _signal("", "The gate let the block through to the abstraction.")
     known_by: int = _signal(
-        "",
-        "Frozen module that knows the block, from 1; 0 none, -1 the block is constant.",
-        dtype="int64",
-        show="lane",
+        "", "Frozen module that knows the block, from 1; 0 none, -1 the block is constant."
     )
-    saved: bool = _signal(
-        "", "The abstraction was saved at the end of the block.", dtype="bool", show="lane"
-    )
+    saved: bool = _signal("", "The abstraction was saved at the end of the block.")
     share: float = _signal(
         "", "Running share of blocks both novel and of the same stream as before."
     )
     novel_blocks: int = _signal(
-        "", "Novel blocks since the abstraction was created.", unit="blocks", dtype="int64"
+        "", "Novel blocks since the abstraction was created.", "", "blocks", show="line"
     )
     y: FloatArray = _signal(
-        "y", "Output of the adaptive abstraction on the block.", equation="1", dims="TJ"
+        "y", "Output of the adaptive abstraction on the block.", "TJ", equation="1"
     )
     y_frozen: FloatArray = _signal(
-        "y_i", "Output of each frozen module on the block.", equation="1", dims="MTJ"
+        "y_i", "Output of each frozen module on the block.", "MTJ", equation="1"
     )
-    eta: FloatArray = _signal(
-        "η", "Slowness of each output.", equation="2", unit="1/frame", dims="J"
-    )
+    eta: FloatArray = _signal("η", "Slowness of each output.", "J", "1/frame", equation="2")
     eta_dot: FloatArray = _signal(
-        "η̇",
-        "Running mean of the change of slowness; saved below δ.",
-        equation="3",
-        unit="1/frame",
-        dims="J",
+        "η̇", "Running mean of the change of slowness; saved below δ.", "J", "1/frame", equation="3"
     )
-    variance: FloatArray = _signal("v_r", "Recent variance of each output.", dims="J")
+    variance: FloatArray = _signal("v_r", "Recent variance of each output.", "J")
     eta_inst: FloatArray = _signal(
-        "η^inst",
-        "Slowness of each output within the block.",
-        equation="4",
-        unit="1/frame",
-        dims="J",
+        "η^inst", "Slowness of each output within the block.", "J", "1/frame", equation="4"
     )
-    gate_mean: FloatArray = _signal("m", "Running mean of η^inst.", unit="1/frame", dims="J")
-    gate_sd: FloatArray = _signal(
-        "SD", "Running standard deviation of η^inst.", unit="1/frame", dims="J"
-    )
+    gate_mean: FloatArray = _signal("m", "Running mean of η^inst.", "J", "1/frame")
+    gate_sd: FloatArray = _signal("SD", "Running standard deviation of η^inst.", "J", "1/frame")
     eta_inst_frozen: FloatArray = _signal(
         "η_i^inst",
         "Slowness of each frozen module's outputs within the block.",
+        "MJ",
+        "1/frame",
         equation="4",
-        unit="1/frame",
-        dims="MJ",
     )
-    band_mean: FloatArray = _signal(
-        "m_i", "Centre of each frozen module's band.", unit="1/frame", dims="MJ"
-    )
+    band_mean: FloatArray = _signal("m_i", "Centre of each frozen module's band.", "MJ", "1/frame")
     band_sd: FloatArray = _signal(
-        "SD_i",
-        "Standard deviation of each frozen module; known within 2 of them.",
-        unit="1/frame",
-        dims="MJ",
+        "SD_i", "Standard deviation of each frozen module; known within 2 of them.", "MJ", "1/frame"
     )
     roc_error_inst: float = _signal(
         "",
@@ -194,7 +165,7 @@ class BlockSignals:
     roc_error_frozen: FloatArray = _signal(
         "",
         "Clustering error of each frozen module; known below the threshold, CD-MISFA 1.0 only.",
-        dims="M",
+        "M",
         since=2,
     )
     xi: float = _signal(
@@ -204,17 +175,13 @@ class BlockSignals:
     curiosity: float = _signal("-⟨ξ̇⟩", "Curiosity reward.", equation="5")
     expert: float = _signal("βZ(⟨ξ⟩)", "Expert reward.", equation="5")
     reward: float = _signal("r", "Reward of the last transition.", equation="5")
-    R: FloatArray = _signal("R", "Running reward function.", equation="6", dims="SAS", show="heat")
-    Q: FloatArray = _signal("Q", "Action value function.", dims="SA", show="heat")
-    policy: IntArray = _signal(
-        "π", "Policy: 0 stay, 1 switch, for each stream.", dims="S", dtype="int64", show="lane"
-    )
+    R: FloatArray = _signal("R", "Running reward function.", "SAS", equation="6", show="heat")
+    Q: FloatArray = _signal("Q", "Action value function.", "SA", show="heat")
+    policy: IntArray = _signal("π", "Policy: 0 stay, 1 switch, for each stream.", "S")
     epsilon: float = _signal("ε", "Probability (above 1: certainty) of a random action.")
-    explored: bool = _signal("", "The action was drawn at random.", dtype="bool", show="lane")
-    action: int = _signal(
-        "a", "Action taken after the block: 0 stay, 1 switch.", dtype="int64", show="lane"
-    )
-    next_stream: int = _signal("s'", "Stream watched next.", dtype="int64", show="lane")
+    explored: bool = _signal("", "The action was drawn at random.")
+    action: int = _signal("a", "Action taken after the block: 0 stay, 1 switch.")
+    next_stream: int = _signal("s'", "Stream watched next.")
     change: float = _signal(
         "c",
         "Mean change of the candidate's outputs with a block, 0 to 1.41; progress learner only.",
@@ -223,13 +190,15 @@ class BlockSignals:
     tested: float = _signal(
         "η_test",
         "Slowness of the candidate on frames before it learned from them; progress learner only.",
-        unit="1/frame",
+        "",
+        "1/frame",
         since=3,
     )
     fitted: float = _signal(
         "η_fit",
         "Slowness of the candidate on what it learned from; progress learner only.",
-        unit="1/frame",
+        "",
+        "1/frame",
         since=3,
     )
     learning_error: float = _signal(
@@ -241,16 +210,14 @@ class BlockSignals:
         "",
         "What each stream promises: the recent progress of its learning error, 0 where nothing is "
         "being learned; progress learner only.",
-        dims="S",
+        "S",
         since=3,
     )
     state: IntArray = _signal(
         "",
         "What has become of each stream: 0 learning, 1 learned, 2 known, 3 given up; -1 of a "
         "learner that does not say.",
-        dims="S",
-        dtype="int64",
-        show="lane",
+        "S",
         since=3,
     )
 
@@ -261,7 +228,13 @@ DENSE_STREAMS = 64
 
 def signal_table() -> tuple[Signal, ...]:
     """The description of every signal, in the record's order."""
-    return tuple(Signal(name=f.name, **f.metadata) for f in dataclasses.fields(BlockSignals))
+    table = []
+    for field in dataclasses.fields(BlockSignals):
+        dtype = _DTYPES[str(field.type)]
+        show = field.metadata["show"] or ("line" if dtype == "float64" else "lane")
+        told = {**field.metadata, "show": show}
+        table.append(Signal(name=field.name, dtype=dtype, **told))
+    return tuple(table)
 
 
 SIGNALS: Mapping[str, Signal] = {s.name: s for s in signal_table()}
@@ -280,33 +253,6 @@ def values(
         if signal.since > version:
             continue
         yield signal, np.asarray(getattr(signals, signal.name), dtype=signal.dtype)
-
-
-CODES: Mapping[str, str] = {"float64": "d", "int64": "q", "bool": "?"}
-"""What `struct` calls the types of signals."""
-
-
-class Fields:
-    """Some signals, whose values in a record are all got at once, to be made bytes of.
-
-    Attributes:
-        scalars: those of them that are numbers.
-        arrays: the others.
-        numbers: values of `scalars` in a record, as they are.
-    """
-
-    def __init__(self, signals: Iterable[Signal]) -> None:
-        signals = tuple(signals)
-        self.scalars = [s for s in signals if not s.dims]
-        self.arrays = [s for s in signals if s.dims]
-        self.numbers: Callable[[BlockSignals], Any] = attrgetter(*(s.name for s in self.scalars))
-        self._arrays = attrgetter(*(s.name for s in self.arrays))
-        # By this name it is the very one of numpy's own arrays, so that nothing is compared.
-        self._types = [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in self.arrays]
-
-    def elements(self, record: BlockSignals) -> list[Any]:
-        """Values of `arrays`: contiguous, of the documented type, little-endian."""
-        return list(map(np.ascontiguousarray, self._arrays(record), self._types))
 
 
 class SignalsHash:
@@ -333,27 +279,42 @@ class SignalsHash:
 
 def canonical_bytes(signals: BlockSignals, version: int = SCHEMA_VERSION) -> bytes:
     """The bytes that stand for a record, as a version has it, wherever runs are compared."""
-    fields = _fields(version)
-    arrays = fields.elements(signals)
-    plan = _plan(version, tuple([array.shape for array in arrays]))
-    data = bytearray(b"".join([arrays[i] for i in plan.order]))
-    floats = np.frombuffer(data, "<f8", plan.floats)
+    known = _fields(version)
+    arrays: list[Any] = list(map(np.ascontiguousarray, known.arrays(signals), known.types))
+    layout = _layout(version, tuple([array.shape for array in arrays]))
+    data = bytearray(b"".join([arrays[i] for i in layout.order]))
+    floats = np.frombuffer(data, "<f8", layout.floats)
     floats[np.isnan(floats)] = math.nan
-    numbers = [x if x == x else math.nan for x in fields.numbers(signals)]
-    elements = [data[part] for part in plan.parts]
-    return plan.layout.pack(*plan.placed([*numbers, *plan.sizes, *elements]))
+    numbers = [x if x == x else math.nan for x in known.numbers(signals)]
+    parts = [data[part] for part in layout.parts]
+    return layout.struct.pack(*layout.placed([*numbers, *layout.sizes, *parts]))
+
+
+class _Fields(NamedTuple):
+    """How the fields of a version are got from a record: numbers, arrays, types of the latter."""
+
+    numbers: Callable[[BlockSignals], Any]
+    arrays: Callable[[BlockSignals], Any]
+    types: list[np.dtype[Any]]
 
 
 @cache
-def _fields(version: int) -> Fields:
-    return Fields(s for s in SIGNALS.values() if s.since <= version)
+def _fields(version: int) -> _Fields:
+    signals = [s for s in SIGNALS.values() if s.since <= version]
+    arrays = [s for s in signals if s.dims]
+    return _Fields(
+        attrgetter(*(s.name for s in signals if not s.dims)),
+        attrgetter(*(s.name for s in arrays)),
+        # By this name it is the very one of numpy's own arrays, so that nothing is compared.
+        [np.dtype("<" + np.dtype(s.dtype).str[1:]) for s in arrays],
+    )
 
 
-class _Plan(NamedTuple):
+class _Layout(NamedTuple):
     """How the bytes lie of records whose arrays have some shapes.
 
     Attributes:
-        layout: of all fields; an array is its shape and its elements.
+        struct: of all fields; an array is its shape and its elements.
         placed: brings scalars, shapes and elements of the arrays into its order.
         sizes: the shape of each array as bytes.
         order: the arrays, those of float64 first.
@@ -361,35 +322,34 @@ class _Plan(NamedTuple):
         parts: where the elements of each array lie, one after the other in that order.
     """
 
-    layout: struct.Struct
+    struct: struct.Struct
     placed: Callable[[list[Any]], tuple[Any, ...]]
-    sizes: tuple[bytes, ...]
-    order: tuple[int, ...]
+    sizes: list[bytes]
+    order: list[int]
     floats: int
-    parts: tuple[slice, ...]
+    parts: list[slice]
 
 
 @lru_cache
-def _plan(version: int, shapes: tuple[tuple[int, ...], ...]) -> _Plan:
-    fields = _fields(version)
-    sizes = tuple(struct.pack(f"<{len(shape)}q", *shape) for shape in shapes)
-    order = sorted(range(len(shapes)), key=lambda i: fields.arrays[i].dtype != "float64")
-    parts, stop, floats = dict[int, slice](), 0, 0
-    for i in order:
-        start, stop = stop, stop + 8 * math.prod(shapes[i])
-        parts[i] = slice(start, stop)
-        if fields.arrays[i].dtype == "float64":
-            floats = stop // 8
-    formats: list[str] = []
+def _layout(version: int, shapes: tuple[tuple[int, ...], ...]) -> _Layout:
+    signals = [s for s in SIGNALS.values() if s.since <= version]
+    arrays = [s for s in signals if s.dims]
+    scalars = [s for s in signals if not s.dims]
+    sizes = [struct.pack(f"<{len(shape)}q", *shape) for shape in shapes]
+    lengths = [8 * math.prod(shape) for shape in shapes]
+    order = sorted(range(len(arrays)), key=lambda i: arrays[i].dtype != "float64")
+    starts = dict(zip(order, accumulate((lengths[i] for i in order), initial=0), strict=False))
+    formats = ""
     places: list[int] = []
-    for signal in (s for s in SIGNALS.values() if s.since <= version):
+    for signal in signals:
         if signal.dims:
-            i = fields.arrays.index(signal)
-            formats += [f"{len(sizes[i])}s", f"{parts[i].stop - parts[i].start}s"]
-            places += [len(fields.scalars) + i, len(fields.scalars) + len(shapes) + i]
+            i = arrays.index(signal)
+            formats += f"{len(sizes[i])}s{lengths[i]}s"
+            places += [len(scalars) + i, len(scalars) + len(arrays) + i]
         else:
-            formats.append(CODES[signal.dtype])
-            places.append(fields.scalars.index(signal))
-    layout = struct.Struct("<" + "".join(formats))
-    lie = tuple(parts[i] for i in range(len(shapes)))
-    return _Plan(layout, itemgetter(*places), sizes, tuple(order), floats, lie)
+            formats += {"float64": "d", "int64": "q", "bool": "?"}[signal.dtype]
+            places.append(scalars.index(signal))
+    floats = sum(n for n, s in zip(lengths, arrays, strict=True) if s.dtype == "float64") // 8
+    parts = [slice(starts[i], starts[i] + n) for i, n in enumerate(lengths)]
+    pack = struct.Struct("<" + formats)
+    return _Layout(pack, itemgetter(*places), sizes, order, floats, parts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,7 @@ from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.sources import open_logs, open_source
 from recorder.cameras.words import is_live
-from recorder.log.begun import Begun, found_path, is_path, relative_path
-from recorder.log.whole import partial_path
+from recorder.log.files import found_path, partial_path, relative_path
 from recorder.world.scenes import SCENES
 from replay.camera_logs.options import CameraOptions
 from replay.recordings.source import RecordedSource
@@ -58,7 +58,8 @@ def command_of(source: Sequence[str], options: Mapping[str, Any], run: Path) -> 
     if preset is not None and preset.endswith(".toml"):
         kept["preset"] = relative_path(preset, run)
     names = [word for word in source if word in SCENES or is_live(word)]
-    return Begun(tuple(source), kept).as_json(run, names)
+    words = [word if word in names else relative_path(word, run) for word in source]
+    return {"source": words, **kept}
 
 
 def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -70,23 +71,38 @@ def read_command(run: Path) -> tuple[tuple[str, ...], dict[str, Any]]:
     """
     log = log_to_resume(run)
     kept = read_header(log).manifest.get(COMMAND)
-    begun = Begun.from_json(kept, run)
-    if begun is None:
+    if not isinstance(kept, Mapping) or not isinstance(kept.get("source"), list):
         raise UsageError(f"{run} does not say what it learns from: name its source")
-    for word in map(str, dict(kept or {})["source"]):
-        if not (is_path(word) or word in SCENES or is_live(word)):
+    source = [str(word) for word in kept["source"]]
+    for word in source:
+        path = word.startswith(os.curdir) or "://" in word
+        if not (path or word in SCENES or is_live(word)):
             raise UsageError(
                 f"{run} learns from {word}, which {_packages_gone(log)} brought: install it again"
             )
     options = {
         name: tuple(value) if isinstance(value, list) else value
-        for name, value in begun.options.items()
+        for name, value in kept.items()
         if name in OPTIONS
     }
     preset = options.get("preset")
     if preset is not None and str(preset).endswith(".toml"):
         options["preset"] = found_path(str(preset), run)
-    return begun.source, options
+    return tuple(found_path(word, run) for word in source), options
+
+
+def command_of_fork(
+    parent: Path, source: Sequence[str], sections: Mapping[str, Any], settings: Sequence[str]
+) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """The command of a fork: that of its parent, with the settings of both."""
+    try:
+        words, options = read_command(parent)
+    except UsageError:
+        words, options = (), {}
+    world = sections.get("scene", {}).get("seed")
+    kept = () if world is None else (f"scene.seed={world}",)  # only the learner's changes
+    options["settings"] = (*options.get("settings", ()), *kept, *settings)
+    return tuple(source) or words, options
 
 
 def _packages_gone(log: Path) -> str:

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 
 PACKAGES = ("cdmisfa", "numpy", "mcap", "protobuf", "rerun-sdk", "pybullet", "icub-models")
 
@@ -86,5 +86,5 @@ def write_json(path: Path, document: Mapping[str, Any] | str) -> None:
         LogWriteError: the file cannot be written.
     """
     text = document if isinstance(document, str) else as_text(document)
-    with whole(path) as partial:
+    with atomic_write(path) as partial:
         partial.write_text(text, encoding="utf-8")

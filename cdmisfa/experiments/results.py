@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.experiments.statistics import Summary, summary
+from cdmisfa.experiments.statistics import MeanSd, summary
 from cdmisfa.experiments.store import DONE, FAILED, ROWS, read_rows
 from replay.runs.folders import REQUEST, read_request
 
@@ -41,7 +41,7 @@ class PointResult:
     done: int
     failed: int
     missing: int
-    measures: Mapping[str, Summary]
+    measures: Mapping[str, MeanSd]
     orders: Mapping[str, int]
 
 
@@ -148,7 +148,7 @@ def as_latex(points: Sequence[PointResult]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _cell(found: Summary) -> str:
+def _cell(found: MeanSd) -> str:
     if not found.n:
         return ""
     return f"{found.mean:.4g}" if math.isnan(found.sd) else f"{found.mean:.4g} ± {found.sd:.2g}"

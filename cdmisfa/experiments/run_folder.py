@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+import os
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
-from cdmisfa.core.errors import LogExhaustedError, UsageError
+from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Learner, Sink
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, BlockSignals
 from cdmisfa.experiments.command import COMMAND, SET_ASIDE
 from cdmisfa.experiments.documents import machine, write_json
 from cdmisfa.experiments.resume import FORK
-from recorder.log.folder import held, logs_in, refuse_existing
-from recorder.log.whole import make_folder, partial_path, refuse_special
+from recorder.log.files import (
+    held,
+    logs_in,
+    make_folder,
+    partial_path,
+    refuse_existing,
+    refuse_special,
+)
 from replay.runs.folders import MODULES_FILE, RUN_FILE, RUN_JSON, VIEW_FILE
 from replay.runs.modules import save_modules
 from replay.runs.run import final_record
@@ -66,7 +73,11 @@ class RunResult:
 class RunExhaustedError(LogExhaustedError):
     """The recording of a run ended before the run did; `result` is what it came to."""
 
-    result: RunResult
+    def __init__(self, ended: LogExhaustedError, result: RunResult) -> None:
+        kept = f"{len(result.modules)} modules of {result.iterations} iterations"
+        saved = "" if result.run is None else f"; {kept} are in {result.run}"
+        super().__init__(f"{ended}{saved}")
+        self.result = result
 
 
 def module_table(module: Module) -> dict[str, Any]:
@@ -108,7 +119,8 @@ def opened_log(
     manifest: Mapping[str, Any],
     *,
     force: bool,
-    resume: Callable[[Path], None] | None,
+    resumed: bool,
+    aside: Path | None,
     fsync_every: float | None,
     view: bool,
 ) -> Iterator[RunWriter]:
@@ -121,8 +133,8 @@ def opened_log(
         source: what it learns from.
         manifest: see `RunWriter`.
         force: replace what is in the folder.
-        resume: of a run that is resumed, sets its log aside once it may be, before anything else
-            in the folder is changed.
+        resumed: whether the run is resumed.
+        aside: its log of before, where it holds anything; set aside under `SET_ASIDE`.
         fsync_every: see `RunWriter`.
         view: whether the run will have a view.
 
@@ -130,7 +142,7 @@ def opened_log(
         UsageError: the folder is not empty, in use or of no run.
         LogWriteError: the log cannot be written.
     """
-    if resume is None:
+    if not resumed:
         goes_on = FORK not in manifest and isinstance(source, SeekableSource)
         refuse_existing(folder, force=force, goes_on=goes_on)
         with _telling(folder):
@@ -142,16 +154,19 @@ def opened_log(
             raise UsageError(f"{others[0]} is of no run: choose another folder")
         stale = [folder / name for name in (RUN_JSON, MODULES_FILE, VIEW_FILE)]
         stale += folder.glob("checkpoint-*.npz")  # of runs from before keyframes
-        if resume is not None:
-            resume(folder)
-        else:  # the log first: of what is left by a kill nothing then looks like a run
+        if aside is not None:
+            try:
+                os.replace(aside, logs[0])
+            except OSError as error:
+                raise LogWriteError(f"{aside} cannot be set aside: {error.strerror}") from error
+        elif not resumed:  # the log first: of what is left by a kill nothing then looks like a run
             stale = [*logs, *stale]
         with _telling(folder):
             refuse_special(*stale)
             for path in stale:
                 path.unlink(missing_ok=True)
-        replace = force or resume is not None
-        log = RunWriter(finished, source.spec, manifest, force=replace, fsync_every=fsync_every)
+        force = force or resumed
+        log = RunWriter(finished, source.spec, manifest, force=force, fsync_every=fsync_every)
         try:
             yield log
         except BaseException as error:

@@ -1,7 +1,7 @@
 """A run: a source, a learner, and the folder that keeps what happened.
 
 RUN/run.mcap signals, RUN/modules.npz frozen modules, RUN/run.json manifest and result,
-RUN/run.rrd the view. The loop itself is in `loop`.
+RUN/run.rrd the view. The loop itself is in `loop`, the folder in `run_folder`.
 """
 
 from __future__ import annotations
@@ -10,36 +10,24 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from cdmisfa.agents.learners import open_learner
-from cdmisfa.core.blocks import (
-    FrameSource,
-    SeekableSource,
-    description,
-)
-from cdmisfa.core.config import as_table
+from cdmisfa.core.blocks import FrameSource, SeekableSource, description
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
-from cdmisfa.experiments.command import (
-    COMMAND,
-    SET_ASIDE,
-    command_of,
-    log_to_resume,
-    source_of,
-)
+from cdmisfa.experiments.command import COMMAND, SET_ASIDE, command_of, command_of_fork, source_of
 from cdmisfa.experiments.loop import Digest, Keyframes, learn
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
     FORK,
-    Fork,
-    copy_parent_log,
-    has_header,
-    plan_fork,
+    changes,
+    continued,
+    header_to_resume,
     refuse_difference,
-    replay_log,
+    restore,
     restore_from,
-    stated_before,
 )
 from cdmisfa.experiments.run_folder import (
     OpenLog,
@@ -49,23 +37,29 @@ from cdmisfa.experiments.run_folder import (
     write_results,
 )
 from cdmisfa.experiments.sources import versions_used
-from recorder.log.folder import folder_here
-from recorder.log.whole import partial_path
-from replay.runs.folders import RUN_FILE, run_log
-from replay.runs.run import states_whole
+from recorder.log.files import folder_here
+from replay.runs.folders import run_log
+from replay.runs.run import stated_source, states_whole
+from replay.runs.writer import RunWriter
 
-if TYPE_CHECKING:
-    from replay.viewer.live import LiveView
+Hashing = Callable[[int, int], None]
+"""Told of bytes of the source that were hashed and of how many, while that is waited for."""
+
+
+def _not_told(done: int, size: int) -> None:
+    """Tell nobody."""
 
 
 class Session:
     """A run that is begun, resumed or forked, and then goes on with `learn`.
 
     Attributes:
-        source: what it learns from.
-        learner: what learns; of a run that is resumed or forked, in its state from `learn` on.
+        source: what it learns from; left open.
+        learner: what learns.
         folder: of the run, or None where nothing is kept.
         manifest: what its log states at its beginning.
+        before: the log whose first iterations it keeps: its own of before, or its parent's.
+        keyframe: where in that log it goes on; None at the beginning.
     """
 
     def __init__(
@@ -85,7 +79,7 @@ class Session:
         """Prepare to begin a run; nothing is written before `learn`.
 
         Args:
-            source: live or recorded; left open.
+            source: live or recorded.
             config: of the learner, as its entry in `LEARNERS` says.
             folder: of the run, or None to keep nothing.
             seed: of the policy and of the abstractions' first weights.
@@ -99,21 +93,20 @@ class Session:
         self.source = source
         self.learner: Learner = open_learner(config, source.spec, seed)
         self.folder = None if folder is None else folder_here(folder)
+        self.before: Path | None = None
+        self.keyframe: Keyframe | None = None
         self._limits = {"max_iterations": max_iterations, "max_modules": max_modules}
-        self._force = force
+        self._force, self._resumed = force, False
         described = described or description(source, at_once=True)
         self._versions = versions_used(config, source, described)
         self.manifest: dict[str, Any] = {
-            "config": {**(sections or {}), "learner": as_table(config)},
+            "config": {**(sections or {}), "learner": section_table(config)},
             "seed": seed,
             "source": described,
             ARITHMETIC: arithmetic_of(self.learner),
         }
         if command is not None:
             self.manifest[COMMAND] = dict(command)
-        self._resumed = False
-        self._keyframe: Keyframe | None = None
-        self._fork: Fork | None = None
 
     @classmethod
     def resume(
@@ -122,37 +115,45 @@ class Session:
         config: Any,
         folder: str | Path | None,
         *,
-        hashing: Callable[[int, int], None] = lambda done, size: None,
+        hashing: Hashing = _not_told,
         **how: Any,
     ) -> Self:
         """Prepare to resume a run where it was stopped, in whatever way.
 
-        Its signals become those of a run that was never stopped. Whether it was begun with the
-        same source, configuration and seed is checked by `learn`.
+        Learner and source are put to the newest keyframe of its log. Its signals become those of a
+        run that was never stopped.
 
         Args:
             source: what it learned from.
             config: the learner's.
             folder: of the run.
-            hashing: told of bytes of the source that were hashed, and of how many.
+            hashing: see `learn`.
             how: further arguments, as of a new run.
 
         Raises:
-            UsageError: the source cannot go back, or no folder is named.
+            UsageError: the source cannot go back; there is no run, or one of another
+                configuration or source.
+            LogDamagedError: the log cannot be read, or the source shows something else now.
         """
         if folder is None:
             raise UsageError("which run to resume? name its folder")
-        stated, ancestry = stated_before(folder_here(folder))
-        described = description(source, at_once=not states_whole(stated), told=hashing)
         if not isinstance(source, SeekableSource):
             raise UsageError(
-                f"{described['kind']} cannot go back to where the run was "
+                f"{description(source, at_once=True)['kind']} cannot go back to where the run was "
                 "stopped: resume from its recording, or begin another run"
             )
+        log, header = header_to_resume(folder_here(folder))
+        whole = header is not None and states_whole(stated_source(log))
+        described = description(source, at_once=not whole, told=hashing)
         session = cls(source, config, folder, described=described, **how)
         session._resumed = True
-        if ancestry is not None:
-            session.manifest[FORK] = dict(ancestry)
+        if header is not None:
+            forked_at = header.forked_at
+            if forked_at is not None:
+                session.manifest[FORK] = header.manifest[FORK]
+            refuse_difference(log, header, source.spec, session.manifest)
+            session.before = log
+            session.keyframe = restore_from(log, session.learner, source, forked_at)
         return session
 
     @classmethod
@@ -189,8 +190,7 @@ class Session:
         Raises:
             UsageError: there is no such run, iteration or source, or a setting that cannot change.
         """
-        folder = folder_here(folder)
-        log = run_log(Path(parent))
+        log, folder = run_log(Path(parent)), folder_here(folder)
         if os.path.realpath(log.parent) == os.path.realpath(folder):
             raise UsageError(f"{folder} is the run itself: choose another folder")
         with Recomputation(log, 0, source) as beginning:
@@ -201,22 +201,32 @@ class Session:
                 "learn it anew, and fork that"
             )
         with cls.at(log, at, source) as stopped:
-            fork = plan_fork(stopped, folder, settings, seed, source)
-        options = {**fork.options, **(limits or {})}
+            manifest, t = stopped.header.manifest, stopped.t
+            span, state = continued(stopped, settings, seed)
+        sections = {name: part for name, part in manifest["config"].items() if name != "learner"}
+        words, options = command_of_fork(log.parent, source, sections, settings)
+        options |= {"seed": span.seed, **(limits or {})}
         with contextlib.closing(source_of(log.parent, source)) as frames:
             session = cls(
                 frames,
-                fork.config,
+                span.config,
                 folder,
-                seed=fork.seed,
+                seed=span.seed,
                 max_iterations=options.get("max_iterations"),
                 max_modules=options.get("max_modules"),
-                sections=fork.sections,
-                command=command_of(fork.words, options, folder) if fork.words else None,
+                sections=sections,
+                command=command_of(words, options, folder) if words else None,
                 force=force,
             )
-            session.manifest[FORK] = fork.ancestry
-            session._fork = fork
+            session.manifest[FORK] = {
+                "parent": os.path.relpath(log.parent, folder),
+                "at": at,
+                "changed": changes(manifest, span),
+                "before": {k: manifest[k] for k in ("config", "seed", FORK) if k in manifest},
+            }
+            session.before, session.keyframe = log, Keyframe(at, t, state, session._versions)
+            restore(session.learner, session.keyframe)
+            frames.seek(t)
             yield session
 
     at = staticmethod(Recomputation.after)
@@ -232,7 +242,7 @@ class Session:
         rerun: bool = True,
         live: bool = False,
         announce: Callable[[str], None] = lambda address: None,
-        hashing: Callable[[int, int], None] = lambda done, size: None,
+        hashing: Hashing = _not_told,
     ) -> RunResult:
         """Learn until nothing is left to learn, and log every signal.
 
@@ -245,16 +255,14 @@ class Session:
             rerun: also build the Rerun view.
             live: also show the run in Rerun while it learns, to viewers on this machine.
             announce: called with the address of the live view.
-            hashing: told of bytes of the source that were hashed, and of how many, while that is
-                waited for: at the end, for what the run states of its source.
+            hashing: told of bytes of the source that were hashed, and of how many, while the run
+                waits for what it states of its source at its end.
 
         Raises:
-            UsageError: the folder exists and is neither replaced nor resumed; or there is no run
-                to resume, or one of another configuration or source.
+            UsageError: the folder is not empty and is not to be replaced, or is in use.
             RunExhaustedError: a recording ended first; what was learned is saved.
         """
-        digest, log = Digest(), None
-        told: list[Sink] = [digest]
+        log, told = None, list[Sink]([digest := Digest()])
         with contextlib.ExitStack() as opened:
             if self.folder is not None:
                 log = opened.enter_context(
@@ -263,7 +271,8 @@ class Session:
                         self.source,
                         self.manifest,
                         force=self._force,
-                        resume=self._set_aside if self._resumed else None,
+                        resumed=self._resumed,
+                        aside=self.before if self._resumed else None,
                         fsync_every=fsync_every,
                         view=rerun,
                     )
@@ -271,72 +280,63 @@ class Session:
                 told.append(OpenLog(log, self.learner))
                 told.append(Keyframes(log, self.source, self.learner, self._versions, keyframes))
             if live:
-                shown = opened.enter_context(self._live_view())
-                told.append(shown)
-                announce(shown.address)
-            if log is not None and (self._resumed or self._fork is not None):
-                if self._fork is not None:
-                    copy_parent_log(
-                        log, self.learner, self.source, digest, self._fork, self._versions
-                    )
-                else:
-                    replay_log(log, self._keyframe, digest, self._versions)
-                self._keyframe = self._fork = None  # as large as what the learner holds
+                from replay.viewer.live import LiveView
+
+                tau, outputs = self.learner.tau, len(self.learner.phi)
+                view = LiveView(self.source.spec, self.manifest, tau, outputs, run=self.folder)
+                told.append(opened.enter_context(view))
+                announce(view.address)
+            if log is not None and self.before is not None:
+                if self._resumed:
+                    self.before = log.path.parent / SET_ASIDE
+                self._copy_log(log, self.before, digest)
+                if self._resumed:
+                    remove(self.before)
                 if live:
-                    shown.earlier(log.path.parent)
-            told += sinks
-            exhausted: LogExhaustedError | None = None
+                    view.earlier(log.path.parent)
+            ended, exhausted = "log_exhausted", None
             try:
-                ended = learn(self.source, self.learner, told, stop=stop, **self._limits)
+                ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
             except LogExhaustedError as error:
-                ended, exhausted = "log_exhausted", error
-            result = self._result(digest, ended, hashing)
+                exhausted = error
+            result = RunResult(
+                run=str(self.folder) if self.folder is not None else None,
+                source=description(self.source, told=hashing),
+                streams=self.source.spec.streams,
+                seed=self.manifest["seed"],
+                iterations=self.learner.iteration,
+                frames=self.learner.iteration * self.learner.tau,
+                signals_sha256=digest.hexdigest(),
+                modules=tuple(self.learner.modules),
+                summary=self.learner.summary(),
+                ended=ended,
+            )
             if log is not None:
-                versions = {"versions": self._versions}
-                write_results(log, result, {**self.manifest, **versions}, view=rerun)
+                stated = {**self.manifest, "versions": self._versions}
+                write_results(log, result, stated, view=rerun)
         if exhausted is not None:
-            kept = f"{len(result.modules)} modules of {result.iterations} iterations"
-            saved = "" if self.folder is None else f"; {kept} are in {self.folder}"
-            over = RunExhaustedError(f"{exhausted}{saved}")
-            over.result = result
-            raise over from exhausted
+            raise RunExhaustedError(exhausted, result) from exhausted
         return result
 
-    def _set_aside(self, folder: Path) -> None:
-        """Move the log of a run that is resumed out of the way, after checking that it may."""
-        found = log_to_resume(folder)
-        if found == partial_path(folder / RUN_FILE) and not has_header(found):
-            return  # it was killed before it had said anything
-        refuse_difference(folder, found, self.source.spec, self.manifest)
-        forked_at = self.manifest[FORK]["at"] if FORK in self.manifest else None
-        self._keyframe = restore_from(found, self.learner, self.source, forked_at)
-        try:
-            os.replace(found, folder / SET_ASIDE)
-        except OSError as error:
-            raise LogWriteError(f"{found} cannot be set aside: {error.strerror}") from error
-
-    def _live_view(self) -> LiveView:
-        from replay.viewer.live import LiveView
-
-        learner = self.learner
-        return LiveView(
-            self.source.spec, self.manifest, learner.tau, len(learner.phi), run=self.folder
-        )
-
-    def _result(self, digest: Digest, ended: str, hashing: Callable[[int, int], None]) -> RunResult:
-        learner = self.learner
-        return RunResult(
-            run=str(self.folder) if self.folder is not None else None,
-            source=description(self.source, told=hashing),
-            streams=self.source.spec.streams,
-            seed=self.manifest["seed"],
-            iterations=learner.iteration,
-            frames=learner.iteration * learner.tau,
-            signals_sha256=digest.hexdigest(),
-            modules=tuple(learner.modules),
-            summary=learner.summary(),
-            ended=ended,
-        )
+    def _copy_log(self, log: RunWriter, before: Path, digest: Digest) -> None:
+        """Write what is kept of another log of the run, or its parent's; hash its signals."""
+        keyframe, self.keyframe = self.keyframe, None  # as large as what the learner holds
+        if keyframe is not None:
+            at, t, fork = keyframe.iteration, keyframe.t, self.manifest.get(FORK, {})
+            for signals in log.take_over(before, at):
+                digest.add(signals)
+            if self._resumed:
+                then, now = keyframe.versions, self._versions
+                changed = {k: (then.get(k), v) for k, v in now.items() if then.get(k) != v}
+                log.event(t, max(at - 1, 0), f"resumed at iteration {at}")
+                if changed:
+                    log.event(t, max(at - 1, 0), in_words(changed), "WARNING")
+            else:
+                text = [f"fork of {fork['parent']} after {at} iterations"]
+                text += [in_words(fork["changed"])] if fork["changed"] else []
+                log.event(t, max(at - 1, 0), "; ".join(text))
+                log.keyframe(keyframe, again=True)
+        log.sync()
 
 
 def run(
@@ -353,13 +353,9 @@ def run(
     resume: bool = False,
     **how: Any,
 ) -> RunResult:
-    """Learn from a source: begin a run, or resume one, and learn to its end.
+    """Begin a run, or resume the one in `folder`, and learn to its end.
 
-    Arguments are those of `Session`, `Session.resume` and, as `how`, `Session.learn`.
-
-    Raises:
-        UsageError: as there.
-        RunExhaustedError: a recording ended first; what was learned is saved.
+    The arguments are those of `Session`, and as `how` those of `Session.learn`.
     """
     told: dict[str, Any] = {
         "seed": seed,
@@ -369,8 +365,25 @@ def run(
         "command": command,
     }
     if resume:
-        hashing = {key: how[key] for key in ("hashing",) if key in how}
-        session = Session.resume(source, config, folder, **told, **hashing)
+        hashing = how.get("hashing", _not_told)
+        session = Session.resume(source, config, folder, hashing=hashing, **told)
     else:
-        session = Session(source, config, folder, **told, force=force)
+        session = Session(source, config, folder, force=force, **told)
     return session.learn(**how)
+
+
+def remove(log: Path) -> None:
+    """Remove a log that is not needed any more.
+
+    Raises:
+        LogWriteError: the disk does not let it go.
+    """
+    try:
+        log.unlink()
+    except OSError as error:
+        raise LogWriteError(f"{log} cannot be removed: {error.strerror}") from error
+
+
+def in_words(changed: Mapping[str, Sequence[Any]]) -> str:
+    """Values before and now, by name."""
+    return "; ".join(f"{name} is {now}, was {before}" for name, (before, now) in changed.items())

@@ -10,7 +10,7 @@ from typing import Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
-from cdmisfa.core.config import LearnerConfig, as_table, build, load_preset, parse_settings
+from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.experiments.documents import versions
@@ -63,9 +63,9 @@ class Configuration:
 
     def tables(self) -> dict[str, Any]:
         """The world's part as plain tables, for a manifest."""
-        scene = {"kind": self.streams} if self.streams else as_table(self.scene)
+        scene = {"kind": self.streams} if self.streams else section_table(self.scene)
         clock = {} if self.clock is None else dict(zip(CLOCK, self.clock, strict=True))
-        return {"scene": scene, "record": as_table(self.record) | clock}
+        return {"scene": scene, "record": section_table(self.record) | clock}
 
 
 def configure(

@@ -32,7 +32,7 @@ FLATTEST = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class MeanSd:
     """Mean and standard deviation (n - 1) of n values; NaN where there is none."""
 
     mean: float
@@ -40,18 +40,18 @@ class Summary:
     n: int
 
 
-def summary(values: ArrayLike) -> Summary:
+def summary(values: ArrayLike) -> MeanSd:
     """Mean and standard deviation of the values that are numbers.
 
     Example:
         >>> summary([1.0, 3.0, float("nan")])
-        Summary(mean=2.0, sd=1.4142135623730951, n=2)
+        MeanSd(mean=2.0, sd=1.4142135623730951, n=2)
     """
     x = np.asarray(values, dtype=float).ravel()
     x = x[np.isfinite(x)]
     if not len(x):
-        return Summary(math.nan, math.nan, 0)
-    return Summary(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else math.nan, len(x))
+        return MeanSd(math.nan, math.nan, 0)
+    return MeanSd(float(x.mean()), float(x.std(ddof=1)) if len(x) > 1 else math.nan, len(x))
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa import kernels
-from cdmisfa.core.arrays import IntArray
+from cdmisfa.core.arrays import ByteArray, IntArray
 from cdmisfa.core.blocks import UINT8
 from cdmisfa.core.errors import UsageError
 from cdmisfa.kernels import INT64, Struct, pointer, readable
@@ -19,87 +18,82 @@ def _buffer(kind: str, data: Any) -> Any:
     return kernels.ffi.from_buffer(kind, data)
 
 
-def layouts(channels: Any, least: Any, places: Any, marks: Any) -> Struct:
-    """How the messages of some channels are laid out, for `scan`.
+MESSAGE = np.dtype(
+    {
+        "names": ["log_time", "publish_time", "at", "size", "sequence", "channel", "unused"],
+        "formats": ["u8", "u8", "i8", "i8", "u4", "u2", "u2"],
+    },
+    align=True,
+)
+"""A message of a chunk: times in nanoseconds, and where its payload stands."""
+
+MOST_RECORDS = 1 << 20
+"""Most messages of a chunk, and most other records, that are looked at."""
+
+
+def walk_records(data: ByteArray) -> tuple[NDArray[np.void], IntArray, int]:
+    """Walk over the records of a chunk as far as they are sound.
 
     Args:
-        channels: (C,) the channels.
-        least: (C,) fewest bytes of a payload.
-        places: (C, M) distance from the payload's end of bytes that are the same in every message;
-            0 none.
-        marks: (C, M) those bytes.
-    """
-    n, m = shape = np.shape(places)
-    arrays = {
-        "ids": readable("channels", np.array(channels, np.int64), (n,), INT64),
-        "least": readable("least", np.array(least, np.int64), (n,), INT64),
-        "places": readable("places", np.array(places, np.int64), shape, INT64),
-        "bytes": readable("marks", np.array(marks, np.uint8), shape, UINT8),
-    }
-    return Struct("layouts", {"channels": n, "marks": m}, arrays)
-
-
-def scan(
-    data: Any, index: Any, start: int, stop: int, wanted: Struct, counts: Sequence[int]
-) -> tuple[IntArray, NDArray[np.uint64]] | None:
-    """Check a chunk of messages and find those of some channels.
-
-    Args:
-        data: the decompressed records, bytes.
-        index: its message index records, bytes.
-        start: earliest log time, in nanoseconds.
-        stop: latest log time.
-        wanted: the layouts of the channels.
-        counts: (C,) how many messages of each there are.
+        data: (B,) the decompressed records.
 
     Returns:
-        (C, n) place after each message's payload and (C, n) its log time; None where the chunk is
-        not in order.
+        (n,) of `MESSAGE`, in their order; (m, 2) first byte and end of the other records; and the
+        place where the walk ends: B, or that of the first record that is none.
+
+    Raises:
+        UsageError: there are more than `MOST_RECORDS` of a kind.
     """
-    n, most = wanted.pointer.channels, max(counts)
-    ends, times = np.empty((n, most), np.int64), np.empty((n, most), np.uint64)
-    code = kernels.lib.scan(
-        _buffer("uint8_t[]", data),
-        len(data),
-        _buffer("uint8_t[]", index),
-        len(index),
-        start,
-        stop,
-        wanted.pointer,
-        readable("counts", counts, (n,), INT64),
-        _buffer("int64_t[]", np.zeros(n, np.int64)),
-        most,
-        _buffer("int64_t[]", ends),
-        _buffer("uint64_t[]", times),
-    )
-    return None if code else (ends, times)
+    found = np.empty(3, np.int64)
+    walked = _buffer("uint8_t[]", data), len(data)
+    counts = _buffer("int64_t[]", found)
+    kernels.lib.walk_records(*walked, kernels.ffi.NULL, kernels.ffi.NULL, counts)
+    n, others, place = found.tolist()
+    if max(n, others) > MOST_RECORDS:
+        raise UsageError(f"it holds more than {MOST_RECORDS} messages, the limit of a chunk")
+    messages, spans = np.empty(n, MESSAGE), np.empty((others, 2), np.int64)
+    rows = kernels.records("message", messages), _buffer("int64_t[]", spans)
+    kernels.lib.walk_records(*walked, *rows, counts)
+    return messages, spans, place
+
+
+def layout(least: int, places: Any, marks: Any, distances: Any, width: int) -> Struct:
+    """Where the payloads of a channel hold their values, for `gather`.
+
+    Args:
+        least: fewest bytes of a payload.
+        places: (M,) distances from a payload's end of bytes that are the same in every message.
+        marks: (M,) those bytes.
+        distances: (R,) of each value.
+        width: bytes of a value.
+    """
+    m, r = len(marks), len(distances)
+    arrays = {
+        "distances": readable("distances", np.array(distances, np.int64), (r,), INT64),
+        "places": readable("places", np.array(places, np.int64), (m,), INT64),
+        "bytes": readable("marks", np.array(marks, np.uint8), (m,), UINT8),
+    }
+    numbers = {"least": least, "values": r, "width": width, "marks": m}
+    return Struct("layout", numbers, arrays)
 
 
 def gather(
-    data: Any, ends: IntArray, distances: IntArray, width: int, out: NDArray[np.uint8]
-) -> None:
-    """Copy the values out of messages.
+    data: ByteArray, messages: NDArray[np.void], laid_out: Struct, out: ByteArray | None
+) -> bool:
+    """Check how messages are laid out, and copy their values.
 
     Args:
-        data: the decompressed records, bytes.
-        ends: (n,) place after each message's payload.
-        distances: (R,) distance of each value from there.
-        width: bytes of a value.
-        out: (n, R * width) written.
+        data: (B,) the decompressed records.
+        messages: (n,) of `MESSAGE`, one after the other.
+        laid_out: as `layout` says.
+        out: (n, R * width), written; None to check only.
 
-    Raises:
-        UsageError: a value does not lie within the data.
+    Returns:
+        Whether all are laid out so; if not, `out` holds anything.
     """
-    n, values = len(ends), len(distances)
-    code = kernels.lib.gather(
-        _buffer("uint8_t[]", data),
-        len(data),
-        readable("ends", ends, (n,), INT64),
-        n,
-        readable("distances", distances, (values,), INT64),
-        values,
-        width,
-        pointer("out", out, (n, values * width), UINT8),
-    )
-    if code:
-        raise UsageError("a value lies outside of the data that it is to be copied from")
+    held = laid_out.pointer
+    n, width = len(messages), held.values * held.width
+    into = kernels.ffi.NULL if out is None else pointer("out", out, (n, width), UINT8)
+    rows = _buffer("message[]", messages)
+    code = kernels.lib.gather(_buffer("uint8_t[]", data), len(data), rows, n, held, into)
+    return int(code) == 0

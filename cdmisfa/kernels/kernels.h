@@ -127,19 +127,29 @@ int64_t iterations(const agent *a, const frozen *f, const incsfa *feature, const
 void own_work(const agent *a, const frozen *f, int64_t blocks, int64_t phases, const double *y,
               const double *y_frozen, double *told);
 
-/* frames.c: C channels of a log, with M marks in each of their messages */
+/* frames.c: a message of a chunk, and where its payload stands there */
 typedef struct {
-  int64_t channels, marks;
-  const int64_t *ids, *least; /* (C,) channels, and the fewest bytes of a payload */
-  const int64_t *places;      /* (C, M) from the payload's end to bytes that are always the same */
-  const uint8_t *bytes;       /* (C, M) those bytes; a place 0 is none */
-} layouts;
-/* In counts (C,) messages of each, n at most, seen (C,) of zeros; out ends and times (C, n). */
-int scan(const uint8_t *data, int64_t size, const uint8_t *index, int64_t index_size,
-         uint64_t start, uint64_t stop, const layouts *wanted, const int64_t *counts,
-         int64_t *seen, int64_t n, int64_t *ends, uint64_t *times);
-int gather(const uint8_t *data, int64_t size, const int64_t *ends, int64_t n,
-           const int64_t *distances, int64_t values, int64_t width, uint8_t *out);
+  uint64_t log_time, publish_time; /* ns */
+  int64_t at, size;
+  uint32_t sequence;
+  uint16_t channel, unused;
+} message;
+/* Walk over the records of a chunk as far as they are sound. Out messages (found[0],), others
+ * (found[1], 2) first byte and end of other records, each unless NULL, and found[2] the place of
+ * the walk's end. */
+int walk_records(const uint8_t *data, int64_t size, message *messages, int64_t *others,
+                 int64_t *found);
+
+/* Where payloads of at least so many bytes hold R values of a width, and M bytes that are always
+ * the same: distances from a payload's end. */
+typedef struct {
+  int64_t least, values, width, marks;
+  const int64_t *distances, *places; /* (R,), (M,) */
+  const uint8_t *bytes;              /* (M,) */
+} layout;
+/* Check the layout of messages, and copy their values to out (n, R, width) unless that is NULL. */
+int gather(const uint8_t *data, int64_t size, const message *messages, int64_t n, const layout *l,
+           uint8_t *out);
 
 /* eigen.c: matrix and vectors (n, n), values (n,), spare (3 n,) */
 void eigen(int64_t n, double *matrix, double *values, double *vectors, double *spare);

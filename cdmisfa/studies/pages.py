@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import FloatArray
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,7 +57,7 @@ class Page:
 
     def write(self) -> None:
         """Write the page, whole or not at all."""
-        with whole(self._path) as partial:
+        with atomic_write(self._path) as partial:
             partial.write_text("\n".join(self._lines), encoding="utf-8")
 
 
@@ -80,7 +80,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     paths = [folder / f"{name}.png", folder / f"{name}.svg"]
     with matplotlib.rc_context({"svg.hashsalt": name}):
         for path, unstable in zip(paths, ("Software", "Date"), strict=True):
-            with whole(path) as partial:
+            with atomic_write(path) as partial:
                 kind = path.suffix[1:]
                 figure.savefig(partial, format=kind, dpi=150, metadata={unstable: None})
     return paths

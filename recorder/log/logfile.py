@@ -8,18 +8,18 @@ signal, kill -9, a full disk; after a power cut up to the last `sync`.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Self
+from typing import BinaryIO, Final, Self
+from weakref import WeakSet
 
 from cdmisfa.core.errors import LogWriteError, UsageError
 from recorder.config import Compression
-from recorder.log.appended import AppendedFile, write_error
-from recorder.log.folder import refuse_held
-from recorder.log.whole import partial_path, refuse_special, refuse_taken, to_disk
+from recorder.log.files import partial_path, refuse_held, refuse_special, refuse_taken, to_disk
 from recorder.mcap.writer import McapWriter
 
 FLUSH_NS = 1_000_000_000
@@ -27,6 +27,141 @@ FLUSH_NS = 1_000_000_000
 
 A run's log flushes by wall time (`replay/runs/writer.py`).
 """
+
+OPEN_FILES = 24
+"""Files that stay open while they are written; a recording has a file for each of its views."""
+
+
+class AppendOnlyFile:
+    """A binary file that is only appended to and, once a write failed, refuses every later one.
+
+    The MCAP writer would go on after a failed write, and the log would have a hole in it.
+
+    The first `OPEN_FILES` that are written at the same time stay open, which keeps them from other
+    processes; further ones are opened for each write. What became of these meanwhile is noticed,
+    and who writes many holds their folder, see `held`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Begin the file anew.
+
+        Raises:
+            UsageError: another process writes it.
+            LogWriteError: it cannot be opened.
+        """
+        self._path = path
+        self._error: LogWriteError | None = None
+        self._file: BinaryIO | None = None
+        self.closed = False
+        try:
+            file: BinaryIO = open(path, "ab")  # noqa: SIM115 - open until `close`
+            try:
+                self._hold(file)
+                file.seek(0)
+                if os.fstat(file.fileno()).st_size:
+                    file.truncate()
+                self._seen = os.fstat(file.fileno())
+            except BaseException:
+                file.close()
+                raise
+            if len(_STAY_OPEN) < OPEN_FILES:
+                self._file = file
+                _STAY_OPEN.add(self)
+            else:
+                file.close()
+        except OSError as error:
+            raise write_error(path, error) from error
+
+    def check(self) -> None:
+        """Refuse to go on where something was not written, or nothing more is to be."""
+        if self._error is not None:
+            raise LogWriteError(str(self._error)) from self._error
+        if self.closed:
+            raise LogWriteError(f"{self._path}: this log is closed, nothing more can be written")
+
+    def write(self, data: bytes) -> int:
+        """Append all of the bytes."""
+        with self._opened() as file:
+            return file.write(data)
+
+    def tell(self) -> int:
+        """Bytes that were appended."""
+        return self._seen.st_size if self._file is None else self._file.tell()
+
+    def flush(self) -> None:
+        """Hand everything to the operating system."""
+        with self._opened() as file:
+            file.flush()
+
+    def sync(self) -> None:
+        """Let the disk have everything."""
+        with self._opened() as file:
+            file.flush()
+            os.fsync(file.fileno())
+
+    def close(self) -> None:
+        """Write nothing more."""
+        self.closed = True
+        _STAY_OPEN.discard(self)
+        file, self._file = self._file, None
+        if file is None:
+            return
+        try:
+            with contextlib.closing(file):
+                file.flush()
+                self._seen = os.fstat(file.fileno())
+        except OSError as error:  # the first one counts: closing tries again what failed
+            self._error = self._error or write_error(self._path, error)
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[BinaryIO]:
+        """The file, open; after an error nothing more is written."""
+        self.check()
+        try:
+            if self._file is not None:
+                yield self._file
+                return
+            with open(os.open(self._path, os.O_WRONLY | os.O_APPEND), "ab") as file:
+                self._hold(file)
+                now = os.fstat(file.fileno())
+                if not os.path.samestat(now, self._seen) or now.st_size != self._seen.st_size:
+                    raise self._in_use()
+                yield file
+                file.flush()
+                self._seen = os.fstat(file.fileno())
+        except (OSError, UsageError) as error:
+            known = write_error(self._path, error) if isinstance(error, OSError) else error
+            self._error = LogWriteError(str(known))
+            self.close()
+            raise self._error from error
+
+    def _hold(self, file: BinaryIO) -> None:
+        """Keep other processes from writing the file while it is open."""
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if not isinstance(error, BlockingIOError):
+                return  # a file system without locks: nothing can be held there
+            raise self._in_use() from error
+        there = os.fstat(file.fileno())
+        if not (self._path.exists() and os.path.samestat(os.stat(self._path), there)):
+            raise self._in_use()
+
+    def _in_use(self) -> UsageError:
+        return UsageError(
+            f"{self._path} is being written by another process: wait for it, or choose another name"
+        )
+
+
+_STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()
+
+
+def write_error(path: Path, error: OSError) -> LogWriteError:
+    """That a disk does not take a file."""
+    return LogWriteError(
+        f"{path} cannot be written: {error.strerror or error}; "
+        "check the free space and rights there, what was flushed is readable"
+    )
 
 
 class LogFile:
@@ -91,7 +226,7 @@ class LogFile:
                     "recover or remove it, or overwrite with --force"
                 )
             refuse_held(self.partial.parent)
-        self._stream = AppendedFile(self.partial)
+        self._stream = AppendOnlyFile(self.partial)
         try:
             self._writer = McapWriter(
                 self._stream,

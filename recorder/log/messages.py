@@ -1,8 +1,8 @@
 """The messages of a recording, as protobuf: encoders, schemas and their byte layout.
 
-Images are `foxglove.RawImage`, so Foxglove and Rerun show them without us. What a
-vectorised reader takes out of a message stands at a fixed distance from its end,
-because only the timestamp in front of it varies in length.
+Images are `foxglove.RawImage`, and a scene's cameras, frames and objects Foxglove's messages, too,
+so that Foxglove and Rerun show them without us. What a vectorised reader takes out of a message
+stands at a fixed distance from its end, because only the timestamp in front of it varies in length.
 """
 
 from __future__ import annotations
@@ -14,11 +14,28 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf import PoseInFrame_pb2, RawImage_pb2
+from foxglove_schemas_protobuf import (
+    CameraCalibration_pb2,
+    FrameTransforms_pb2,
+    PoseInFrame_pb2,
+    RawImage_pb2,
+    SceneUpdate_pb2,
+)
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.errors import UsageError
+from recorder.log.scenery import (
+    Eye,
+    Gaze,
+    Place,
+    Quaternion,
+    Scenery,
+    Thing,
+    inverse,
+    times,
+    turned,
+)
 
 RECORDING_METADATA = "cdmisfa.recording"
 """Name of the metadata record that says what a recording is."""
@@ -28,13 +45,16 @@ SCHEMA_VERSION = 1
 
 TRUTH_TOPIC = "/truth"
 POSE_TOPIC = "/head_pose"
+TRANSFORMS_TOPIC = "/tf"
+OBJECTS_TOPIC = "/scene"
+
+SIDES = ("left_eye", "right_eye")
 
 ENCODING = "protobuf"
 """Message and schema encoding of every channel."""
 
 IMAGE_ENCODING = "mono8"
 """Pixel format of image views: one byte of grey."""
-
 IMAGE_SCHEMA = "foxglove.RawImage"
 VECTOR_SCHEMA = "cdmisfa.Vector"
 TRUTH_SCHEMA = "cdmisfa.GroundTruth"
@@ -50,6 +70,11 @@ _FIELD = descriptor_pb2.FieldDescriptorProto
 def view_topic(view: str) -> str:
     """Topic of a view's frames."""
     return f"/view/{view}"
+
+
+def calibration_topic(view: str, side: str) -> str:
+    """Topic of the calibration of an eye of a view."""
+    return f"/calibration/{view}/{side}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +122,10 @@ class _Encoder:
         """The FileDescriptorSet that describes the message."""
         return descriptor_set(self._message.DESCRIPTOR)
 
-    def _encoded(self, time_ns: int) -> bytes:
-        self._message.timestamp.FromNanoseconds(time_ns)
+    def _encoded(self, time_ns: int, *stamped: Any) -> bytes:
+        """The message at a time, which it holds itself or in its parts."""
+        for part in stamped or (self._message,):
+            part.timestamp.FromNanoseconds(time_ns)
         return bytes(self._message.SerializeToString())
 
 
@@ -125,7 +152,7 @@ class ImageEncoder(_Encoder):
         # All but its time and its pixels is the same in every message of the view.
         self._around = blank[: end - payload.size], blank[end:]
 
-    def __call__(self, time_ns: int, frame: NDArray[np.uint8]) -> bytes:
+    def __call__(self, time_ns: int, frame: ByteArray) -> bytes:
         """Encode one frame, (height, width) uint8.
 
         Raises:
@@ -146,7 +173,7 @@ class VectorEncoder(_Encoder):
         values = _FIELD(name="values", number=2, type=_FIELD.TYPE_DOUBLE, label=repeated)
         super().__init__(_message("Vector", [values]))
 
-    def __call__(self, time_ns: int, frame: NDArray[np.float64]) -> bytes:
+    def __call__(self, time_ns: int, frame: FloatArray) -> bytes:
         """Encode one frame, (I,) float64."""
         self._message.values[:] = frame.tolist()
         return self._encoded(time_ns)
@@ -185,7 +212,7 @@ class TruthEncoder(_Encoder):
         ]
         super().__init__(_message("GroundTruth", fields))
 
-    def __call__(self, time_ns: int, values: NDArray[np.float64]) -> bytes:
+    def __call__(self, time_ns: int, values: FloatArray) -> bytes:
         """Encode one row of ground truth, (D,) float64."""
         for name, value in zip(self._names, values.tolist(), strict=True):
             setattr(self._message, name, value)
@@ -202,10 +229,111 @@ class PoseEncoder(_Encoder):
         self, time_ns: int, position: Sequence[float], quaternion: Sequence[float]
     ) -> bytes:
         """Encode a position (x, y, z) in metres and an orientation (x, y, z, w)."""
-        place, turn = self._message.pose.position, self._message.pose.orientation
-        place.x, place.y, place.z = position
-        turn.x, turn.y, turn.z, turn.w = quaternion
+        _set(self._message.pose.position, position)
+        _set(self._message.pose.orientation, quaternion)
         return self._encoded(time_ns)
+
+
+class CalibrationEncoder(_Encoder):
+    """How an eye, with its coordinate frame, maps what it sees, as `foxglove.CameraCalibration`."""
+
+    def __init__(self, eye: Eye, frame_id: str) -> None:
+        f, x, y = eye.focal, eye.width / 2, eye.height / 2
+        super().__init__(
+            CameraCalibration_pb2.CameraCalibration(
+                frame_id=frame_id,
+                width=eye.width,
+                height=eye.height,
+                K=[f, 0, x, 0, f, y, 0, 0, 1],
+                R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
+                P=[f, 0, x, 0, 0, f, y, 0, 0, 0, 1, 0],
+            )
+        )
+
+    def __call__(self, time_ns: int) -> bytes:
+        """Encode it at a time."""
+        return self._encoded(time_ns)
+
+
+class TransformsEncoder(_Encoder):
+    """Where a view's head and eyes are, as `foxglove.FrameTransforms`.
+
+    From the root's frame to `VIEW/head`, turned by the yaw; from there to VIEW, between the eyes,
+    tilted, along whose z they look; and from there to each eye.
+
+    Args:
+        gaze: of the view.
+        root: name of the root's frame.
+    """
+
+    def __init__(self, gaze: Gaze, root: str) -> None:
+        super().__init__(FrameTransforms_pb2.FrameTransforms())
+        view, head, middle = gaze.name, f"{gaze.name}/head", gaze.middle
+        neck, turn = gaze.head.position, gaze.head.quaternion
+        self._add(root, head, neck, turn)
+        self._add(head, view, *_seen_from(neck, turn, middle))
+        for side, eye in zip(SIDES, gaze.eyes, strict=True):
+            self._add(view, f"{view}/{side}", *_seen_from(middle.place, middle.turn, eye))
+
+    def __call__(self, time_ns: int) -> bytes:
+        """Encode them at a time."""
+        return self._encoded(time_ns, *self._message.transforms)
+
+    def _add(self, parent: str, child: str, place: Place, turn: Quaternion) -> None:
+        added = self._message.transforms.add(parent_frame_id=parent, child_frame_id=child)
+        _set(added.translation, place)
+        _set(added.rotation, turn)
+
+
+class ObjectsEncoder(_Encoder):
+    """Where the objects are, and the table, as `foxglove.SceneUpdate`.
+
+    Args:
+        scenery: what they look like.
+        names: of the columns of truth.
+        root: name of the root's frame.
+    """
+
+    def __init__(self, scenery: Scenery, names: Sequence[str], root: str) -> None:
+        super().__init__(SceneUpdate_pb2.SceneUpdate())
+        self._moved = []
+        self._add(scenery.table, root)
+        for thing in scenery.objects:
+            column, row = (list(names).index(name) for name in thing.truth)
+            self._moved.append((self._add(thing, root), column, row))
+
+    def __call__(self, time_ns: int, truth: FloatArray) -> bytes:
+        """Encode where everything is at a time with this (D,) truth."""
+        values = truth.tolist()
+        for place, x, y in self._moved:
+            place.x, place.y = values[x], -values[y]
+        return self._encoded(time_ns, *self._message.entities)
+
+    def _add(self, thing: Thing, root: str) -> Any:
+        entity = self._message.entities.add(id=thing.name, frame_id=root)
+        shapes = {"box": entity.cubes, "cylinder": entity.cylinders, "sphere": entity.spheres}
+        shape = shapes[thing.shape].add()
+        if thing.shape == "cylinder":
+            shape.bottom_scale = shape.top_scale = 1.0
+        _set(shape.size, thing.size)
+        shape.color.r, shape.color.g, shape.color.b = thing.colour
+        shape.color.a = 1.0
+        _set(shape.pose.position, thing.place)
+        _set(shape.pose.orientation, (0.0, 0.0, 0.0, 1.0))
+        return shape.pose.position
+
+
+def _set(message: Any, values: Sequence[float]) -> None:
+    """Fill in a vector, or a quaternion, (x, y, z, w)."""
+    for name, value in zip("xyzw", values, strict=False):
+        setattr(message, name, value)
+
+
+def _seen_from(place: Place, turn: Quaternion, eye: Eye) -> tuple[Place, Quaternion]:
+    """Where an eye is, seen from a frame."""
+    back = inverse(turn)
+    x, y, z = turned(back, np.subtract(eye.place, place).tolist()).tolist()
+    return (x, y, z), times(back, eye.turn)
 
 
 def descriptor_set(descriptor: Any) -> bytes:

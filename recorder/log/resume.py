@@ -1,4 +1,4 @@
-"""What an earlier attempt at a view left, and where it is resumed.
+"""What an earlier attempt at a recording left, and where each view is resumed.
 
 The logs of an attempt are read in the order of the file, up to where they are damaged or torn. A
 log that is resumed is kept aside while its frames are copied into a new one, which so has the
@@ -7,34 +7,28 @@ bytes of a log that was never interrupted.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import os
-import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
-from mcap.records import Channel, Message
+from typing import NamedTuple
 
 from cdmisfa.core.errors import LogDamagedError, LogWriteError, UsageError
-from recorder.log.begun import Begun, read_recording
-from recorder.log.folder import RECORDING, logs_in, part_name, part_number, view_logs
-from recorder.log.messages import RECORDING_METADATA, view_topic
-from recorder.log.split import Split
-from recorder.log.viewfacts import Identity, ViewFacts
-from recorder.log.whole import partial_path
-
-_DAMAGE = (
-    *(McapError, ValueError, struct.error, OverflowError, MemoryError, KeyError, EOFError),
-    *(zstandard.ZstdError, RuntimeError),  # of data that lz4 cannot unpack, the latter
+from recorder.config import Split
+from recorder.log.files import (
+    RECORDING,
+    aside_path,
+    logs_in,
+    part_name,
+    part_number,
+    partial_path,
+    view_logs,
 )
-
+from recorder.log.manifest import RecordingSpec, RecordingStart, ViewMetadata, read_start
+from recorder.log.messages import RECORDING_METADATA, view_topic
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MAGIC, Metadata
 
 _LEAST = 64
 """Bytes that no log has less of once its header and metadata are written."""
@@ -57,37 +51,53 @@ class FramesHeld(NamedTuple):
     gaps: bool = False
     frames: int = 0
 
-    def whole(self, first: int) -> int:
+    def stop_from(self, first: int) -> int:
         """Up to before which frame all from a given one on are there."""
         follows = self.first == first or (self.gaps and self.first > first)
         return self.stop if self.end and follows else first
 
 
-Earlier = Mapping[str, Mapping[Path, FramesHeld]]
-"""What the files of each view hold that an earlier attempt left."""
-
-
 def frames_held(path: Path, view: str, *, gaps: bool = False) -> FramesHeld:
     """Read once through a log, damaged or not, for the frames of a view that it holds.
 
-    Args:
-        path: the log.
-        view: name of the view.
-        gaps: whether the source may lack frames.
+    With `gaps` the source may lack frames.
     """
     first = stop = end = count = 0
-    for channel, message in messages(path):
-        if channel.topic == view_topic(view):
-            if not end:
-                first = stop = message.sequence
-            if message.sequence == stop or (gaps and message.sequence > stop):
-                stop, count = message.sequence + 1, count + 1
-            end = max(end, message.sequence + 1)
+    for topic, frame, _, _ in messages(path):
+        if topic == view_topic(view):
+            first, stop = (first, stop) if end else (frame, frame)
+            if frame == stop or (gaps and frame > stop):
+                stop, count = frame + 1, count + 1
+            end = max(end, frame + 1)
     return FramesHeld(first, stop, end, gaps, count)
 
 
+def messages(path: Path) -> Iterator[tuple[str, int, int, bytes]]:
+    """Messages in the order of the file, up to where it is damaged or torn.
+
+    Yields:
+        The topic of each, its sequence number, log time in nanoseconds, and data.
+
+    Raises:
+        LogDamagedError: the disk does not give the file, which says nothing of the log.
+    """
+    log = _opened(path)
+    if log is None:
+        return
+    with log:
+        for segment in log.segments:
+            damage = log.first_damage
+            unproven = segment.cut or (damage is not None and segment.offset >= damage)
+            table = None if unproven else log.table(segment)
+            if table is None:
+                return
+            for number, sequence, log_time, _, data in table.rows():
+                channel = log.channels.get(number)
+                yield channel.topic if channel else "", sequence, log_time, data
+
+
 @dataclass(frozen=True, slots=True)
-class Resume:
+class ViewResume:
     """Where a view is begun or resumed.
 
     Attributes:
@@ -101,30 +111,111 @@ class Resume:
     """
 
     path: Path
-    parts: tuple[tuple[Path, int], ...]
-    first: int
+    parts: tuple[tuple[Path, int], ...] = ()
+    first: int = 0
     log: Path | None = None
     stop: int = 0
     stale: tuple[Path, ...] = ()
     complete: bool = False
 
 
-def resume_view(
+def begin_view(folder: Path, view: str, split: Split | None, first: int = 0) -> ViewResume:
+    """The place of a view of which nothing is there, and that begins with a frame."""
+    return ViewResume(folder / part_name(view, None if split is None else 0), first=first)
+
+
+def resume_views(
+    folder: Path,
+    recording: RecordingSpec,
+    views: Sequence[str],
+    split: Split | None,
+    frames: int | None,
+    default: int,
+) -> tuple[dict[str, ViewResume], Split | None, int]:
+    """Find where each view of a recording is resumed. Changes nothing.
+
+    Args:
+        folder: of the recording.
+        recording: what is recorded.
+        views: names of the views.
+        split: where parts end; None for where they did.
+        frames: how many each view shall have; None for as many as it was started with.
+        default: as many, where the recording does not say how it was started.
+
+    Returns:
+        The place of each view, where parts end, and the frames of each view.
+
+    Raises:
+        UsageError: it was started with another source, seed or split, has more frames, or there
+            are files of another recording.
+    """
+    start = read_start(folder)
+    split = _split_as_started(folder, start, recording, views, split)
+    earlier = {
+        view: {path: frames_held(path, view, gaps=recording.gaps) for path in logs}
+        for view, logs in view_logs(folder, views).items()
+    }
+    lengths = [start.frames[view] for view in views if view in start.frames]
+    finished = all(
+        files and all(path.suffix == ".mcap" for path in files) for files in earlier.values()
+    )
+    if not finished and not lengths:
+        lengths = [default]
+    for path, there in itertools.chain(*(files.items() for files in earlier.values())):
+        if frames is not None and there.end > frames:
+            raise UsageError(
+                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
+                f"nothing, give --frames {there.end} or more, or overwrite with --force"
+            )
+        lengths.append(there.end)
+    frames = frames or max(lengths)
+    places = {}
+    for view, files in earlier.items():
+        ended = recording.gaps and view not in start.frames
+        places[view] = _resume_view(folder, view, recording, split, files, frames, ended=ended)
+    if others := other_recordings(folder, recording):
+        raise UsageError(f"{others[0]} is of another recording: overwrite with --force")
+    return places, split, frames
+
+
+def _split_as_started(
+    folder: Path,
+    start: RecordingStart,
+    recording: RecordingSpec,
+    views: Sequence[str],
+    split: Split | None,
+) -> Split | None:
+    """Refuse to resume with another scene, seed or split; where the parts end."""
+    limit = min((start.split[view] for view in views if view in start.split), default=None)
+    for option, before, now in (
+        ("", start.scene or None, recording.kind),
+        ("--seed ", start.seed, recording.seed),
+        ("--split ", limit, limit if split is None else str(split)),
+    ):
+        if before not in (None, now):
+            raise UsageError(
+                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
+                "same, or overwrite with --force"
+            )
+    return Split.parse(limit) if split is None and limit is not None else split
+
+
+def _resume_view(
     folder: Path,
     view: str,
-    identity: Identity,
+    recording: RecordingSpec,
     split: Split | None,
     there: Mapping[Path, FramesHeld],
     frames: int,
     *,
-    ended: bool = False,
-) -> Resume:
-    """Pass over the parts that are finished, and find where to resume. Changes nothing.
+    ended: bool,
+) -> ViewResume:
+    """Pass over the parts of a view that are finished, and find where to resume.
 
     Args:
         folder: of the recording.
         view: name of the view.
-        identity: what is recorded.
+        recording: what is recorded.
         split: where parts end.
         there: all of the view's files, and what they hold.
         frames: how many the view shall have; no file has more.
@@ -133,7 +224,6 @@ def resume_view(
     Raises:
         UsageError: what is there is something else, or split in another way.
     """
-    length = split.frames(identity.spec.fps) if split else None
     numbers = {path: part_number(path, view) for path in there}
     other = next((p for p, number in numbers.items() if (number is None) != (split is None)), None)
     if other is not None:
@@ -142,141 +232,72 @@ def resume_view(
             "use the same, or overwrite with --force"
         )
     parts: list[tuple[Path, int]] = []
-    copied: list[Path] = []
+    stale: list[Path] = []
     first = 0
     while True:
         path = folder / part_name(view, None if split is None else len(parts))
-        attempts = (path, partial_path(path), aside_path(path))
-        found = {p: there[p].whole(first) for p in attempts if p in there}
+        kept = aside_path(path)
+        attempts = [p for p in (path, partial_path(path), kept) if p in there]
         later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
-        best = max(found, key=lambda p: found[p], default=path)
-        stop = found.get(best, first)
-        if stop == first:
-            if path in found:
-                raise UsageError(
-                    f"{path} holds no frames of {view} from {first} on: overwrite with --force"
-                )
-            place = Resume(path, tuple(parts), first, stale=(*copied, *found, *later))
-            break
-        _refuse_other(best, identity.facts(view, first))
-        follows = best == path and bool(later)
-        wrong = length is not None and (
-            stop - first > length or (follows and stop - first != length)
-        )
-        if wrong and not identity.gaps:
+        log = max(attempts, key=lambda p: there[p].stop_from(first), default=path)
+        stop = there[log].stop_from(first) if attempts else first
+        follows = log == path and bool(later)
+        if stop == first and path in attempts:
             raise UsageError(
-                f"{best} has {stop - first} frames, with this --split it would have {length}: "
-                "use the same, or overwrite with --force"
+                f"{path} holds no frames of {view} from {first} on: overwrite with --force"
             )
-        if best == path and (stop == frames or ended) and not follows:
-            copied += [p for p in found if p == aside_path(path)]
-            parts.append((path, there[path].frames))
-            return Resume(path, tuple(parts), stop, stale=tuple(copied), complete=True)
-        if not follows:
-            place = Resume(path, tuple(parts), first, best, stop, (*copied, *later))
-            break
-        if stop >= frames:
+        if stop > first:
+            _refuse_other(log, recording.metadata(view, first))
+            if split is not None and not recording.gaps:
+                _refuse_other_length(log, split.frames(recording.spec.fps), stop - first, follows)
+        complete = log == path and (stop == frames or ended) and not follows
+        if stop == first or not (follows or complete):
+            _refuse_finished(path, later)
+            if stop == first:
+                stale += [*attempts, *later]
+                return ViewResume(path, tuple(parts), first, stale=tuple(stale))
+            return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
+        if follows and stop >= frames:
             raise UsageError(
                 f"{path} ends at frame {stop}, and more follow: ask for more frames, "
                 "or overwrite with --force"
             )
-        copied += [p for p in found if p == aside_path(path)]
+        stale += [kept] if kept in attempts else []
         parts.append((path, there[path].frames))
         first = stop
-    finished = next((p for p in later if p.suffix == ".mcap"), None)
-    if finished is not None:
+        if complete:
+            return ViewResume(path, tuple(parts), first, stale=tuple(stale), complete=True)
+
+
+def _refuse_other_length(path: Path, length: int | None, frames: int, follows: bool) -> None:
+    """Refuse a part of more frames than --split says, or of fewer where another follows."""
+    if length is not None and (frames > length or (follows and frames != length)):
+        raise UsageError(
+            f"{path} has {frames} frames, with this --split it would have {length}: "
+            "use the same, or overwrite with --force"
+        )
+
+
+def _refuse_finished(path: Path, later: Sequence[Path]) -> None:
+    """Refuse to write a part where later ones are finished."""
+    if finished := next((p for p in later if p.suffix == ".mcap"), None):
         raise UsageError(
             f"{finished} is there, {path.name} before it is not whole: recover that "
             "part first, or overwrite with --force"
         )
-    return place
 
 
-def resume_views(
-    folder: Path,
-    identity: Identity,
-    views: Sequence[str],
-    split: Split | None,
-    frames: int | None,
-    default: int,
-) -> tuple[dict[str, Resume], Split | None, int]:
-    """Find where each view of a recording is resumed. Changes nothing.
-
-    Args:
-        folder: of the recording.
-        identity: what is recorded.
-        views: names of the views.
-        split: where parts end; None for where they did.
-        frames: how many each view shall have; None for as many as it was begun with.
-        default: as many, where the recording does not say how it was begun.
-
-    Returns:
-        The place of each view, where parts end, and the frames of each view.
-
-    Raises:
-        UsageError: it was begun with another source, seed or split, has more frames, or there are
-            files of another recording.
-    """
-    begun = read_recording(folder)
-    earlier, split, frames = _as_begun(folder, begun, identity, views, split, frames, default)
-    places = {}
-    for view, there in earlier.items():
-        ended = identity.gaps and view not in begun.options["frames"]
-        places[view] = resume_view(folder, view, identity, split, there, frames, ended=ended)
-    if others := other_recordings(folder, identity):
-        raise UsageError(f"{others[0]} is of another recording: overwrite with --force")
-    return places, split, frames
-
-
-def _as_begun(
-    folder: Path,
-    begun: Begun,
-    identity: Identity,
-    views: Sequence[str],
-    split: Split | None,
-    frames: int | None,
-    default: int,
-) -> tuple[Earlier, Split | None, int]:
-    """What there is of a recording that is resumed, where its parts end, and its frames.
-
-    Raises:
-        UsageError: it was begun with another scene, seed or split, or has more frames.
-    """
-    limits, lengths = (
-        [begun.options[name][view] for view in views if view in begun.options[name]]
-        for name in ("split", "frames")
-    )
-    limit = min(limits, default=None)
-    kind, seed = identity.kind, identity.seed
-    for option, before, now in (
-        ("", "".join(begun.source) or kind, kind),
-        ("--seed ", begun.options.get("seed", seed), seed),
-        ("--split ", limit, limit if split is None else str(split)),
-    ):
-        if before not in (None, now):
+def _refuse_other(path: Path, stated: ViewMetadata) -> None:
+    """Refuse to resume a log that states something else."""
+    record = _metadata(path)
+    if record is None or record.name != RECORDING_METADATA:
+        raise UsageError(f"{path} does not say what it is a recording of: overwrite with --force")
+    for key, value in stated.record().items():
+        if record.values.get(key) != value:
             raise UsageError(
-                f"{folder} was begun with {option}{before}, not {option}{now}: go on with the "
-                "same, or overwrite with --force"
+                f"{path} cannot be continued: its {key} is {record.values.get(key)!r}, now it is "
+                f"{value!r}; use the same command and versions, or overwrite with --force"
             )
-    if split is None and limit is not None:
-        split = Split.parse(limit)
-    earlier = {
-        view: {path: frames_held(path, view, gaps=identity.gaps) for path in logs}
-        for view, logs in view_logs(folder, views).items()
-    }
-    unfinished = not all(
-        files and all(p.suffix == ".mcap" for p in files) for files in earlier.values()
-    )
-    if unfinished and not lengths:
-        lengths = [default]
-    for path, there in (item for files in earlier.values() for item in files.items()):
-        if frames is not None and there.end > frames:
-            raise UsageError(
-                f"{path} holds {there.end} frames, more than --frames {frames}: --resume shortens "
-                f"nothing, give --frames {there.end} or more, or overwrite with --force"
-            )
-        lengths.append(there.end)
-    return earlier, split, frames or max(lengths)
 
 
 def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
@@ -291,50 +312,48 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
     count, gaps = "", False
     stops: dict[str, int] = {}
     for path in sorted(logs, key=lambda path: (len(path.name), path.name)):
-        record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
+        record = _metadata(path)
         if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
             return []
-        streams.update(filter(None, record.metadata.get("streams", "").split(",")))
-        count = record.metadata.get("stream_count", "")
-        gaps = record.metadata.get("gaps") == str(True)
-        held = frames_held(path, view := record.metadata.get("view", ""), gaps=gaps)
-        if held.whole(stops.get(view, 0)) != held.end or not held.end:
+        streams.update(filter(None, record.values.get("streams", "").split(",")))
+        count = record.values.get("stream_count", "")
+        gaps = record.values.get("gaps") == str(True)
+        there = frames_held(path, view := record.values.get("view", ""), gaps=gaps)
+        if there.stop_from(stops.get(view, 0)) != there.end or not there.end:
             return []
-        stops[view] = held.stop
-        found.append((view, path, held.frames))
+        stops[view] = there.stop
+        found.append((view, path, there.frames))
     every = stops.keys() == streams if streams else str(len(stops)) == count
     return found if every and (gaps or len(set(stops.values())) == 1) else []
 
 
-def other_recordings(folder: Path, identity: Identity) -> list[Path]:
+def other_recordings(folder: Path, recording: RecordingSpec) -> list[Path]:
     """Logs in a folder that are of another recording.
 
     Raises:
         UsageError: one is readably of something else.
     """
-    others = []
     if not folder.is_dir():
         return []
-    own = set(itertools.chain(*view_logs(folder, identity.spec.streams).values()))
+    others = []
+    own = set(itertools.chain(*view_logs(folder, recording.spec.streams).values()))
     for path in logs_in(folder):
-        record = next(_undamaged(path, NonSeekingReader.iter_metadata), None)
+        record = _metadata(path)
         if record is None:
             if path not in own and path.stat().st_size < _LEAST:
                 others.append(path)  # begun, and killed before it said of what it is
             continue
         if record.name != RECORDING_METADATA:
             raise UsageError(f"{path} is of no recording: choose another folder")
-        view = record.metadata.get("view", "")
-        facts = identity.facts(view) if view in identity.spec.streams else None
-        mine = {} if facts is None else replace(facts, first_frame=0, versions={}).as_metadata()
-        if not mine or any(
-            record.metadata.get(k) != v for k, v in mine.items() if k != "first_frame"
-        ):
+        view = record.values.get("view", "")
+        stated = recording.metadata(view).record() if view in recording.spec.streams else {}
+        mine = {k: v for k, v in stated.items() if k != "first_frame" and "version_" not in k}
+        if not mine or any(record.values.get(key) != value for key, value in mine.items()):
             others.append(path)
     return others
 
 
-def set_log_aside(place: Resume) -> Path | None:
+def set_log_aside(place: ViewResume) -> Path | None:
     """Remove what is stale, and move the log to be resumed aside.
 
     Returns:
@@ -358,40 +377,24 @@ def set_log_aside(place: Resume) -> Path | None:
     return kept
 
 
-def aside_path(path: Path) -> Path:
-    """Where a partial is kept while its frames are copied into the new one."""
-    return path.with_name(path.name + ".partial.kept")
-
-
-def messages(path: Path) -> Iterator[tuple[Channel, Message]]:
-    """Messages in the order of the file, up to where it is damaged or torn."""
-    read = partial(NonSeekingReader.iter_messages, log_time_order=False)
-    for _, channel, message in _undamaged(path, read):
-        yield channel, message
-
-
-def _undamaged(path: Path, read: Callable[[NonSeekingReader], Iterator[Any]]) -> Iterator[Any]:
-    """What a reader of a log gives, up to where the log is damaged or torn.
+def _opened(path: Path) -> LogReader | None:
+    """A log, damaged or not; None of a file that does not begin as one.
 
     Raises:
-        LogDamagedError: the disk does not give it, which says nothing of the log.
+        LogDamagedError: the disk does not give it.
     """
     try:
-        with contextlib.suppress(*_DAMAGE), path.open("rb") as file:
-            yield from read(NonSeekingReader(file, validate_crcs=True, record_size_limit=2**30))
+        with path.open("rb") as file:
+            start = file.read(len(MAGIC))
     except OSError as error:
         raise LogDamagedError(f"{path} cannot be read: {error.strerror}") from error
+    return LogReader(path, salvage=True, check="chunks") if start == MAGIC else None
 
 
-def _refuse_other(path: Path, facts: ViewFacts) -> None:
-    """Refuse to resume a log that states other facts."""
-    records = _undamaged(path, NonSeekingReader.iter_metadata)
-    record = next((m for m in records if m.name == RECORDING_METADATA), None)
-    if record is None:
-        raise UsageError(f"{path} does not say what it is a recording of: overwrite with --force")
-    for key, value in facts.as_metadata().items():
-        if record.metadata.get(key) != value:
-            raise UsageError(
-                f"{path} cannot be continued: its {key} is {record.metadata.get(key)!r}, now it is "
-                f"{value!r}; use the same command and versions, or overwrite with --force"
-            )
+def _metadata(path: Path) -> Metadata | None:
+    """What a log says of what it is, its first metadata record; None where it does not say it."""
+    log = _opened(path)
+    if log is None:
+        return None
+    with log:
+        return log.metadata[0] if log.metadata else None

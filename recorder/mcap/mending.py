@@ -6,30 +6,26 @@ The checksum over all data says whether that is all that was wrong.
 
 from __future__ import annotations
 
-import struct
 from bisect import bisect_right
 from typing import Final
 
 import numpy as np
 from mcap.opcode import Opcode
 
-from cdmisfa.core.arrays import ByteArray
-from recorder.mcap.compression import Decompressor, check_size
+from recorder.mcap.chunks import check_size, decompressed
 from recorder.mcap.records import (
+    CHUNK_HEADER,
+    INDEX_HEADER,
     MESSAGE_HEADER,
-    RECORD_HEADER,
     MalformedRecord,
     Problem,
     Segment,
     crc32,
 )
 from recorder.mcap.store import Store
-from recorder.mcap.summary import stated_chunks
 from recorder.mcap.tables import MessageTable, walked_table
 from recorder.mcap.walk import LogStructure
 
-_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
-_INDEX: Final = struct.Struct("<BQHI")
 _MOST_CHANNELS: Final = 64
 """Message indexes of a chunk that are compared with one another."""
 _ALIKE: Final = 0.5
@@ -82,14 +78,13 @@ def mended(file: Store) -> MendedStore:
     """A damaged log with its chunks' heads and message indexes as they must have been."""
     store = MendedStore(file)
     structure = LogStructure(file, lambda *_: None, resync=True)
-    stated = stated_chunks(structure.summary) if structure.summary else []
+    stated = structure.summary.sound_chunks() if structure.summary else []
     chunks = stated or [segment for segment in structure.segments if segment.chunked]
     ends = [chunk.offset for chunk in chunks[1:]] + [structure.data_end or file.size]
-    decompressor = Decompressor()
     for chunk, end in zip(chunks, ends, strict=False):
         try:
             crc = _mend_head(store, chunk) if chunk.stated else chunk.crc
-            table = _checked_table(store, chunk, crc, decompressor)
+            table = _checked_table(store, chunk, crc)
         except MalformedRecord:
             continue
         at = chunk.data_offset + chunk.stored
@@ -100,26 +95,17 @@ def mended(file: Store) -> MendedStore:
 
 def _mend_head(store: MendedStore, chunk: Segment) -> int:
     """Have the head of a chunk as the summary states it; its CRC, which stands there alone."""
-    times = _TIMES_AND_SIZE.pack(chunk.start, chunk.end, chunk.size)
-    at = chunk.offset + RECORD_HEADER.size + len(times)
-    crc = store.read(at, 4)
-    name = chunk.compression.encode()
-    end = struct.pack("<I", len(name)) + name + struct.pack("<Q", chunk.stored)
-    length = len(times) + len(crc) + len(end) + chunk.stored
-    head = RECORD_HEADER.pack(Opcode.CHUNK, length) + times + crc + end
+    crc = int.from_bytes(store.read(chunk.offset + CHUNK_HEADER.size - 4, 4), "little")
     put = "its first bytes were damaged, and are made again from the summary"
-    store.put(chunk.offset, head, chunk.name, put)
-    return int.from_bytes(crc, "little")
+    store.put(chunk.offset, chunk.head(crc), chunk.name, put)
+    return crc
 
 
-def _checked_table(
-    store: Store, chunk: Segment, crc: int, decompressor: Decompressor
-) -> MessageTable:
+def _checked_table(store: Store, chunk: Segment, crc: int) -> MessageTable:
     """The messages of a chunk whose CRC matches."""
     check_size(chunk.compression, chunk.size)
-    raw: ByteArray = np.empty(chunk.size, np.uint8)
-    stored = memoryview(store.read(chunk.data_offset, chunk.stored))
-    decompressor.decompress(stored, chunk.compression, raw)
+    stored = np.frombuffer(store.read(chunk.data_offset, chunk.stored), np.uint8)
+    raw = decompressed(stored, chunk.compression, chunk.size)
     if not crc or crc32(raw.data) != crc:
         raise MalformedRecord("no CRC that matches")
     return walked_table(raw)[0]
@@ -145,9 +131,9 @@ def _index(table: MessageTable, number: int) -> bytes:
     own = table.channel == number
     pairs = np.empty((int(own.sum()), 2), "<u8")
     pairs[:, 0] = table.log_time[own]
-    pairs[:, 1] = table.at[own] - MESSAGE_HEADER.itemsize
+    pairs[:, 1] = table.at[own] - MESSAGE_HEADER.size
     size = pairs.nbytes
-    return _INDEX.pack(Opcode.MESSAGE_INDEX, size + 6, number, size) + pairs.tobytes()
+    return INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, size + 6, number, size) + pairs.tobytes()
 
 
 def _alike(store: Store, at: int, index: bytes) -> float:

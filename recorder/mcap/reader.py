@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.chunks import CACHE_BYTES, Chunks
+from recorder.mcap.chunks import Chunks
 from recorder.mcap.data_section import DataSection
 from recorder.mcap.records import (
     MAX_CHUNK,
@@ -28,7 +26,7 @@ from recorder.mcap.records import (
     Segment,
 )
 from recorder.mcap.store import FileStore, Store
-from recorder.mcap.tables import MessageTable, in_order, within
+from recorder.mcap.tables import MessageTable, Pairs, in_order
 from recorder.mcap.walk import LogStructure
 
 Check = Literal["chunks", "data", "pass"]
@@ -56,6 +54,7 @@ class LogReader:
         profile: the writer's profile, as "ros2".
         library: what wrote the file.
         complete: the file has its end.
+        first_damage: place of the first damaged record that stands outside chunks, or None.
         data_complete: every message is there, if not the summary behind them.
         metadata: the metadata records.
         statistics: what the summary says the file holds, or None.
@@ -67,7 +66,6 @@ class LogReader:
         log: str | Path | Store,
         *,
         salvage: bool = False,
-        cache_bytes: int = CACHE_BYTES,
         check: Check | None = None,
     ) -> None:
         """Open a log.
@@ -75,7 +73,6 @@ class LogReader:
         Args:
             log: path of a file, or what has its bytes, which is closed with the reader.
             salvage: leave out what is damaged.
-            cache_bytes: of decoded chunks that are kept.
             check: "chunks" believes a summary that accounts for every message; "data" looks at
                 every record of a file and at the checksum over its data, "pass" leaves the latter
                 to `one_pass`. By default "chunks", with `salvage` "data"; of a URL "chunks".
@@ -98,7 +95,8 @@ class LogReader:
             self._structure = found
             self.data = DataSection(self._file, found, self._refuse_data)
             known, unproven = found.definitions, self.data.check_unproven
-            self._chunks = Chunks(self._file, known, self._note, cache_bytes, unproven)
+            note = None if check == "chunks" else self._note
+            self._chunks = Chunks(self._file, known, note, unproven)
             self._settle()
             if not self.by_index and check != "pass":
                 self.data.check()
@@ -161,10 +159,7 @@ class LogReader:
         return self._structure.definitions.schemas
 
     def attachment_data(self, attachment: Attachment) -> bytes:
-        """Read an attachment's bytes.
-
-        Raises LogDamagedError where it is larger than is read at once.
-        """
+        """Read an attachment's bytes; a LogDamagedError where that is too much at once."""
         if attachment.size > MAX_CHUNK:
             raise LogDamagedError(
                 f"{self.path}: attachment {attachment.name[:80]!r} has {attachment.size} bytes, "
@@ -232,14 +227,14 @@ class LogReader:
             LogDamagedError: at the first damage, without `salvage`.
         """
         low, high = start or 0, 2**64 if stop is None else stop
-        chosen = [(i, s) for i, s in enumerate(self.segments) if s.end >= low and s.start < high]
+        chosen = [s for s in self.segments if s.end >= low and s.start < high]
         if self.by_index:
             numbers = {c for c, k in self.channels.items() if topics is None or k.topic in topics}
-            chosen = [(i, s) for i, s in chosen if numbers & (s.channel_counts() or {}).keys()]
-        self.expect([s for _, s in chosen])
-        in_file = ((s, t) for _, s in chosen if (t := self.table(s)) is not None)
+            chosen = [s for s in chosen if numbers & (s.channel_counts() or {}).keys()]
+        self.expect(chosen)
+        in_file = ((s, t) for s in chosen if (t := self.table(s)) is not None)
         for segment, table in in_order(chosen, self.table) if ordered else in_file:
-            yield segment, within(table, low, high)
+            yield segment, table.within(low, high)
 
     def one_pass(self) -> Iterator[tuple[Segment, MessageTable | None]]:
         """Give every chunk in file order, None for one that is damaged and left out.
@@ -251,15 +246,13 @@ class LogReader:
         """
         with self._chunks.passing() as store:
             for segment in self.segments:
-                store.pass_to(segment.offset)
                 yield segment, self.table(segment)
-            store.pass_to(self._structure.data_end)
-        self.data.check(store.crc(0, self._structure.data_end))
+            crc = store.pass_to(self._structure.data_end)
+        self.data.check(crc)
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""
-        self._chunks.expect(() if indexes else segments)
-        spans = ((s.data_offset + s.stored if indexes else s.offset, s.stop) for s in segments)
+        spans = ((s.data_end if indexes else s.offset, s.stop) for s in segments)
         self._file.expect(list(spans))
 
     def table(self, segment: Segment) -> MessageTable | None:
@@ -280,13 +273,9 @@ class LogReader:
             self._refuse(segment.name, str(error))
             return None
 
-    def index(self, segment: Segment) -> list[tuple[int, NDArray[np.uint64]]]:
+    def index(self, segment: Segment) -> Pairs:
         """Read a chunk's message indexes; see `Chunks.index`."""
         return self._chunks.index(segment)
-
-    def unpack(self, segment: Segment, out: ByteArray) -> memoryview:
-        """Decompress the records of a chunk with message indexes; see `Chunks.unpack`."""
-        return self._chunks.unpack(segment, out)
 
     def is_at(self, path: Path) -> bool:
         """Whether a path leads to the very file that was opened."""
@@ -321,7 +310,7 @@ class LogReader:
 
     def close(self) -> None:
         """Let go of the file; harmless when called twice."""
-        self._chunks.close()
+        self._chunks.forget()
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -348,6 +337,7 @@ class LogReader:
         """Take over what the walk found, with the times of a chunk whose header states none yet."""
         structure = self._structure
         self.by_index, self.complete = structure.by_index, structure.complete
+        self.first_damage = structure.first_damage
         self.profile, self.library = structure.profile, structure.library
         self.data_complete, self.metadata = structure.data_crc is not None, structure.metadata
         self.statistics = structure.summary.statistics if structure.summary else None

@@ -7,11 +7,10 @@ Nothing here trusts a length, count or text of the file. Whoever reads a file tu
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
-import numpy as np
 from mcap.opcode import Opcode
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
@@ -29,19 +28,12 @@ MAX_CHUNK: Final = 144 * 1024 * 1024
 MAX_DEFINITION: Final = 64 * 1024 * 1024
 """Largest schema, channel or metadata record, in bytes, that is read."""
 
-MESSAGE_HEADER: Final = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
-INDEX_HEADER: Final = RECORD_HEADER.size + 6
-"""Bytes before the pairs of a message index."""
-MESSAGE_FIELDS: Final = MESSAGE_HEADER.itemsize - RECORD_HEADER.size
+MESSAGE_HEADER: Final = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence, log time, publish time; the payload follows."""
+INDEX_HEADER: Final = struct.Struct("<BQHI")
+"""Opcode, length, channel, bytes of the pairs, which follow: log time and place in the chunk."""
+CHUNK_HEADER: Final = struct.Struct("<BQQQQI")
+"""Opcode, length, first and last log time, size and CRC; compression and records follow."""
 
 
 class Place(Protocol):
@@ -125,10 +117,6 @@ class Fields:
         """Take an unsigned little-endian number of `width` bytes."""
         return int.from_bytes(self.take(width), "little")
 
-    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """Take what a layout describes."""
-        return layout.unpack(self.take(layout.size))
-
     def text(self) -> str:
         """Take a text with its length in front.
 
@@ -184,29 +172,8 @@ def statistics(content: bytes | memoryview) -> Statistics:
     raw = fields.take(fields.integer(4))
     if len(raw) % 10:
         raise MalformedRecord("the statistics hold a broken count per channel")
-    counts = np.frombuffer(raw, np.dtype([("channel", "<u2"), ("messages", "<u8")]))
-    per_channel = {int(row["channel"]): int(row["messages"]) for row in counts}
+    per_channel = dict(struct.iter_unpack("<HQ", raw))
     return Statistics(messages, attachments, metadata, chunks, per_channel)
-
-
-def walk(data: memoryview, at: int, stop: int) -> Iterator[tuple[int, int, int]]:
-    """Each record within a chunk as (opcode, place of its first byte, place after its last).
-
-    Raises:
-        MalformedRecord: bytes are left over, a record runs over the end, or is none.
-    """
-    unpack = RECORD_HEADER.unpack_from
-    while at < stop:
-        if stop - at < RECORD_HEADER.size:
-            raise MalformedRecord(f"{stop - at} bytes at its end are no record")
-        opcode, length = unpack(data, at)
-        end = at + RECORD_HEADER.size + length
-        if end > stop:
-            raise MalformedRecord(f"a record at {at} runs {end - stop} bytes over its end")
-        if opcode == 0:
-            raise MalformedRecord(f"no record at {at} (opcode 0)")
-        yield opcode, at, end
-        at = end
 
 
 def crc32(data: bytes | memoryview, value: int = 0) -> int:
@@ -267,6 +234,15 @@ class Segment:
         crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
         data = offset + RECORD_HEADER.size + fields.at
         return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
+
+    def head(self, crc: int) -> bytes:
+        """What stands before a chunk's records if their CRC is this."""
+        name = self.compression.encode()
+        length = self.data_end - self.offset - RECORD_HEADER.size
+        fixed = (Opcode.CHUNK, length, self.start, self.end, self.size, crc)
+        return CHUNK_HEADER.pack(*fixed) + struct.pack(
+            f"<I{len(name)}sQ", len(name), name, self.stored
+        )
 
     @property
     def data_end(self) -> int:

@@ -8,7 +8,7 @@ import stat
 import sys
 import threading
 from abc import ABC, abstractmethod
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -16,8 +16,6 @@ from typing import Final
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.mcap.records import Place, crc32
 
-MAX_HELD: Final = 512 * 1024 * 1024
-"""Most bytes that a pass holds; what lies farther ahead is read without it."""
 PARTIAL: Final = ".partial"
 """Ending of what is being written, or whose writing was cut short."""
 OPEN_FILES = 24
@@ -290,29 +288,10 @@ _LOCK: Final = threading.RLock()
 _OPEN: Final[OrderedDict[FileStore, _Descriptor]] = OrderedDict()
 
 
-class Excerpt(Store):
-    """A store of which the bytes [start, stop) are in memory."""
-
-    def __init__(self, store: Store, start: int, stop: int) -> None:
-        super().__init__(store.path)
-        self.size, self.remote = store.size, store.remote
-        self._store, self._start = store, start
-        self._data = store.read(start, stop - start)
-
-    def read_at(self, offset: int, count: int) -> bytes:
-        at = offset - self._start
-        if 0 <= at < len(self._data):
-            return self._data[at : at + count]
-        return self._store.read_at(offset, count)
-
-    def close(self) -> None:
-        """Nothing: the store stays open."""
-
-
 class OnePass(Store):
-    """A store that is read from its beginning on, with the checksum of every byte passed.
+    """A store that is read forwards, with the checksum of every byte up to where that got.
 
-    What was read is held until it is passed; what lies between is read for the checksum.
+    What was read before is read again from the store, if it is asked for once more.
     """
 
     def __init__(self, store: Store) -> None:
@@ -321,40 +300,28 @@ class OnePass(Store):
         self._store = store
         self._at = 0
         self._crc = 0
-        self._held: deque[bytes] = deque()
-        self._end = 0
 
     def read_at(self, offset: int, count: int) -> bytes:
-        if offset < self._at or offset + count - self._at > MAX_HELD:
-            return self._store.read_at(offset, count)
-        for place in (offset, offset + count):
-            if place > self._end and (part := self._store.read(self._end, place - self._end)):
-                self._held.append(part)
-                self._end += len(part)
-        at = self._at
-        for part in self._held:
-            if offset < at + len(part):
-                return part[offset - at : offset - at + count]
-            at += len(part)
-        return b""
+        self.pass_to(offset)
+        data = self._store.read(offset, count)
+        self._take(offset, data)
+        return data
 
-    def pass_to(self, place: int) -> None:
-        """Go on to a place: nothing before it is asked for any more."""
-        while self._held and self._at < place:
-            part = self._held.popleft()
-            if self._at + len(part) > place:
-                self._held.appendleft(part[place - self._at :])
-                part = part[: place - self._at]
-            self._crc = crc32(part, self._crc)
-            self._at += len(part)
-        for block in self._store.blocks(self._at, place if not self._held else self._at):
-            self._crc = crc32(block, self._crc)
-            self._at += len(block)
-        self._end = max(self._end, self._at)
+    def read_into(self, offset: int, out: memoryview) -> int:
+        self.pass_to(offset)
+        count = self._store.read_into(offset, out)
+        self._take(offset, out[:count])
+        return count
 
-    def crc(self, offset: int, stop: int) -> int:
-        """CRC-32 of the bytes [offset, stop); from 0 up to where the pass is, it is known."""
-        return self._crc if (offset, stop) == (0, self._at) else super().crc(offset, stop)
+    def pass_to(self, place: int) -> int:
+        """Go on to a place, if that is farther; the checksum up to there, if it is no farther."""
+        for block in self._store.blocks(self._at, place):
+            self._take(self._at, block)
+        return self._crc
 
     def close(self) -> None:
         """Nothing: the store stays open."""
+
+    def _take(self, offset: int, data: bytes | memoryview) -> None:
+        self._crc = crc32(memoryview(data)[max(self._at - offset, 0) :], self._crc)
+        self._at = max(self._at, offset + len(data))

@@ -13,7 +13,7 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from cdmisfa.core.errors import LogDamagedError
-from recorder.mcap.compression import check_size
+from recorder.mcap.chunks import check_size
 from recorder.mcap.records import (
     MAGIC,
     MAX_CHUNK,
@@ -31,14 +31,7 @@ from recorder.mcap.records import (
 )
 from recorder.mcap.resync import fitting, leave_chunks, next_chunk, own_end, stands
 from recorder.mcap.store import Store
-from recorder.mcap.summary import (
-    Summary,
-    definition,
-    header_at,
-    read_summary,
-    stated_segments,
-    stated_spans,
-)
+from recorder.mcap.summary import Summary, read_summary
 
 LOOSE_BYTES: Final = 1024 * 1024
 """Messages outside chunks are read about this many bytes at once."""
@@ -69,32 +62,30 @@ class LogStructure:
         missing: what a file that was cut lacks, in words; "" for a whole one.
         data_crc: CRC of the data section, 0 for none, None where the file ends before it.
         data_end: place where the data section ends.
+        first_damage: place of the first record that is damaged, None where none is.
     """
 
     def __init__(
         self, file: Store, refuse: Refuse, *, by_index: bool = False, resync: bool = False
     ) -> None:
-        self._file = file
-        self._resync = resync
+        self._file, self._resync = file, resync
         self._sure = len(MAGIC)
         self.by_index = False
-        self._refuse = refuse
+        self._tell = refuse
+        self.first_damage: int | None = None
         self.definitions = Definitions(refuse)
         self.segments: list[Segment] = []
         self.tail: Segment | None = None
         self.metadata: list[Metadata] = []
         self.attachments: list[Attachment] = []
-        self.profile = ""
-        self.library = ""
+        self.profile = self.library = ""
         self.summary: Summary | None = None
-        self.complete = False
-        self.missing = ""
+        self.complete, self.missing = False, ""
         self.data_crc: int | None = None
         self.data_end = 0
         self._limit: int | None = None
-        self._attachment_spans: list[tuple[int, int]] = []
-        self._metadata_bytes = 0
-        self._inside = 0
+        self._attachment_ranges: list[tuple[int, int]] = []
+        self._metadata_bytes = self._inside = 0
         self._loose: Segment | None = None
         self._last_chunk: Segment | None = None
         self._at = len(MAGIC)
@@ -120,9 +111,14 @@ class LogStructure:
         self._walk_data()
         return kept
 
+    def _refuse(self, where: str, what: str) -> None:
+        if self.first_damage is None:
+            self.first_damage = self._at
+        self._tell(where, what)
+
     def load_attachments(self) -> None:
         """Read the attachments that the summary names, and check them."""
-        spans, self._attachment_spans = self._attachment_spans, []
+        spans, self._attachment_ranges = self._attachment_ranges, []
         for start, stop in spans:
             self._record_at(start, stop, Opcode.ATTACHMENT)
 
@@ -132,13 +128,13 @@ class LogStructure:
         if summary is None:
             return False
         try:
-            segments = stated_segments(summary, set(self.definitions.channels))
+            segments = summary.chunks(set(self.definitions.channels))
             if segments is None:
                 return False
-            attachments = stated_spans(summary, Opcode.ATTACHMENT_INDEX)
+            attachments = summary.ranges(Opcode.ATTACHMENT_INDEX)
             self._record_at(len(MAGIC), None, Opcode.HEADER)
             self._record_at(summary.begin - DATA_END_BYTES, summary.begin, Opcode.DATA_END)
-            for start, stop in stated_spans(summary, Opcode.METADATA_INDEX):
+            for start, stop in summary.ranges(Opcode.METADATA_INDEX):
                 self._record_at(start, stop, Opcode.METADATA)
         except MalformedRecord as error:
             if self._file.remote:
@@ -146,13 +142,14 @@ class LogStructure:
             self._at, self.data_crc = len(MAGIC), None
             self.metadata, self._metadata_bytes = [], 0
             return False
-        self.segments, self._attachment_spans = segments, attachments
+        self.segments, self._attachment_ranges = segments, attachments
         self.by_index = self.complete = True
         return True
 
     def _record_at(self, start: int, stop: int | None, opcode: Opcode) -> None:
         """Take in a record that the summary names."""
-        found, length = header_at(self._file, start)
+        head = self._file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
+        found, length = RECORD_HEADER.unpack(head)
         if found != opcode or stop not in (None, start + RECORD_HEADER.size + length):
             raise MalformedRecord(f"at byte {start} is no {opcode.name} record")
         self._at = start
@@ -206,7 +203,7 @@ class LogStructure:
         if self._at == len(MAGIC) and opcode != Opcode.HEADER:
             raise MalformedRecord("the file does not begin with a header record")
         if self._resync and self.summary:
-            leave_chunks(self.summary.chunks, opcode, self._at, end)
+            leave_chunks(self.summary.named, opcode, self._at, end)
         self._take(opcode, content, length)
         if end in (own, self._inside):
             self._sure = end
@@ -222,7 +219,7 @@ class LogStructure:
             return
         self._last_chunk = None
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = definition(self._file, content, length)
+            record = self._definition(content, length)
             self.definitions.add(opcode, record, f"byte {self._at}")
             return
         self._close_loose()
@@ -230,13 +227,13 @@ class LogStructure:
             self._last_chunk = self._chunk(content, length)
             self.segments.append(self._last_chunk)
         elif opcode == Opcode.METADATA:
-            self._take_metadata(definition(self._file, content, length))
+            self._take_metadata(self._definition(content, length))
         elif opcode == Opcode.ATTACHMENT:
             self._attachment(content, length)
         elif opcode == Opcode.HEADER:
             if self._at != len(MAGIC):
                 raise MalformedRecord("a second header, as of two files in one")
-            fields = Fields(definition(self._file, content, length), "the header")
+            fields = Fields(self._definition(content, length), "the header")
             self.profile, self.library = fields.text(), fields.text()
         elif opcode == Opcode.DATA_END:
             self.data_end = self._at
@@ -250,6 +247,12 @@ class LogStructure:
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the data")
         elif self._resync and opcode < _PRIVATE:
             raise MalformedRecord(f"no record of the format (opcode {opcode})")
+
+    def _definition(self, content: int, length: int) -> bytes:
+        """Read a record that is kept in memory."""
+        if length > MAX_DEFINITION:
+            raise MalformedRecord(f"a record of {length} bytes, above the limit {MAX_DEFINITION}")
+        return self._file.read(content, length)
 
     def _chunk(self, content: int, length: int) -> Segment:
         head = self._file.peek(content, min(length, _CHUNK_HEADER))
@@ -347,8 +350,8 @@ class LogStructure:
         self._close_loose()
         self._last_chunk = None
         found = None
-        if self.summary and self.summary.chunks:
-            found = next((c for c in self.summary.chunks if c > self._at), None)
+        if self.summary and self.summary.named:
+            found = next((c for c in self.summary.named if c > self._at), None)
         elif self._resync:
             stop = self._file.size if self._limit is None else self._limit
             found = next_chunk(self._file, self._sure + (self._sure == self._at), stop)
@@ -370,14 +373,14 @@ class LogStructure:
         return True
 
     def _read_end(self) -> None:
-        self.summary = read_summary(self._file, self.definitions, self._refuse)
+        self.summary = read_summary(self._file, self.definitions, self._tell)
         # What is wrong in a footer may be the place that it says the data to end at.
         lies = self._resync and self.summary is not None and self.summary.broken
         self._limit = self.summary.begin if self.summary and not lies else None
 
     def _compare_with_summary(self) -> None:
         assert self.summary is not None
-        stated, named = self.summary.statistics, self.summary.chunks
+        stated, named = self.summary.statistics, self.summary.named
         chunks = [s for s in self.segments if s.chunked]
         if named and [c.offset for c in chunks] != named:
             self._refuse("summary", "its chunk index does not name the chunks that are there")

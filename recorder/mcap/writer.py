@@ -33,17 +33,11 @@ from mcap.records import (
 )
 
 from recorder.config import Compression
-from recorder.mcap.records import MAGIC, crc32
+from recorder.mcap.records import CHUNK_HEADER, INDEX_HEADER, MAGIC, MESSAGE_HEADER, crc32
 
-_MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length, channel, sequence, log time, publish time; the data follow."""
 _OF_MESSAGE: Final = int(Opcode.MESSAGE)
-_MESSAGE_SIZE: Final = _MESSAGE.size
+_MESSAGE_SIZE: Final = MESSAGE_HEADER.size
 _MESSAGE_FIELDS: Final = _MESSAGE_SIZE - 9
-_INDEX: Final = struct.Struct("<BQHI")
-"""Opcode, length, channel, bytes of the pairs, which follow: log time and place in the chunk."""
-_CHUNK: Final = struct.Struct("<BQQQQI")
-"""Opcode, length, first and last log time, size and checksum of what it holds."""
 _FOOTER: Final = struct.Struct("<BQQQ")
 """What a summary's checksum counts of the footer."""
 
@@ -145,7 +139,7 @@ class McapWriter:
             if stop > len(self._records):
                 self._grow(stop)
             records, fields = self._records, _MESSAGE_FIELDS + length
-            _MESSAGE.pack_into(
+            MESSAGE_HEADER.pack_into(
                 records, at, _OF_MESSAGE, fields, channel, sequence, log_time, publish_time
             )
             records[start:stop] = data
@@ -246,8 +240,8 @@ class McapWriter:
         with buffer[:size] as records:
             stored, crc = self._compress(records), crc32(records)
         name = self._compression.encode()
-        length = _CHUNK.size - 9 + 4 + len(name) + 8 + len(stored)
-        head = _CHUNK.pack(Opcode.CHUNK, length, first, last, size, crc)
+        length = CHUNK_HEADER.size - 9 + 4 + len(name) + 8 + len(stored)
+        head = CHUNK_HEADER.pack(Opcode.CHUNK, length, first, last, size, crc)
         head += len(name).to_bytes(4, "little") + name + len(stored).to_bytes(8, "little")
         chunk = len(head) + len(stored)
         offset = self._out.tell()
@@ -258,10 +252,10 @@ class McapWriter:
             offsets[channel] = at
             length = 8 * len(pairs)
             parts += [
-                _INDEX.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length),
+                INDEX_HEADER.pack(Opcode.MESSAGE_INDEX, length + 6, channel, length),
                 struct.pack(f"<{len(pairs)}Q", *pairs),
             ]
-            at += _INDEX.size + length
+            at += INDEX_HEADER.size + length
             self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
         self._append(b"".join(parts))
         self._chunks.append(

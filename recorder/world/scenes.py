@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 from cdmisfa.core.blocks import Block, FrameSource, SeekableSource
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.processes import Workers
 from cdmisfa.core.registry import Registry
@@ -99,8 +99,10 @@ class OpenScene:
         Those of the first two scenes state the keys of both, so that they stay the same bytes.
         """
         first = (IcubConfig, OscillatoryConfig)
-        tables = [as_table(config()) for config in first] if type(self.config) in first else []
-        return {key: v for table in (*tables, as_table(self.config)) for key, v in table.items()}
+        tables = [section_table(config()) for config in first] if type(self.config) in first else []
+        return {
+            key: v for table in (*tables, section_table(self.config)) for key, v in table.items()
+        }
 
 
 _OPEN: MutableMapping[FrameSource, OpenScene] = WeakKeyDictionary()

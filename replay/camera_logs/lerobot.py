@@ -14,7 +14,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted.regular import check_regular, read_json
+from cdmisfa.core.untrusted import check_regular, read_json
 from recorder.images.options import Size
 from recorder.images.pixels import compressed_image
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord
@@ -39,6 +39,8 @@ class LeRobotImages(ImageStream):
         UsageError: no such camera, another version of the layout, or PyAV is missing.
         LogDamagedError: its tables cannot be read, or contradict each other.
     """
+
+    path: Path
 
     def __init__(self, path: Path, topic: str | None, *, color: bool = False) -> None:
         self.path, self._color = path, color
@@ -67,7 +69,8 @@ class LeRobotImages(ImageStream):
             self.times = np.round(ticks * (NANOSECONDS / self._fps)).astype(np.uint64)
         if not len(self.times):
             raise UsageError(f"{path}: there is no frame in it")
-        self._open: tuple[Path, Any] | None = None
+        self._file: Path | None = None
+        self._images: Any = None
         if len(rows) > 1:
             self.warnings = [f"{path}: {topic} is of {len(rows)} episodes, with pauses between"]
         if self._video:
@@ -81,13 +84,15 @@ class LeRobotImages(ImageStream):
         with explained(self.path, "LeRobot's layout"):
             name = template.format(video_key=self.topic, chunk_index=chunk, file_index=number)
             file = self.path / name
-        if self._open is None or self._open[0] != file:
+        if self._file != file:
             self.close()
             if not file.is_file():
                 raise LogDamagedError(f"{file}: there is no such file, its dataset names it")
-            images = self._opened(file)
-            self._open = (file, images)
-        images = self._open[1]
+            opened = (
+                VideoImages(file, None, color=self._color) if self._video else self._table(file)
+            )
+            self._file, self._images = file, opened
+        images = self._images
         if not self._video:
             return self._picture(images, place)
         if not (
@@ -105,12 +110,9 @@ class LeRobotImages(ImageStream):
         return (shape[1], shape[2]) if shape[0] in (1, 3) else (shape[0], shape[1])
 
     def close(self) -> None:
-        opened, self._open = self._open, None
-        if opened is not None and self._video:
-            opened[1].close()
-
-    def _opened(self, file: Path) -> Any:
-        return VideoImages(file, None, color=self._color) if self._video else self._table(file)
+        if self._video and self._images is not None:
+            self._images.close()
+        self._file = self._images = None
 
     def _table(self, file: Path) -> Any:
         import pyarrow.parquet as pq
@@ -145,18 +147,12 @@ def dataset_cameras(path: Path) -> list[str]:
 def dataset_channels(path: Path) -> list[ChannelFacts]:
     """What a dataset states of each of its features, one value a frame."""
     info = _info(path)
-    return [
-        ChannelFacts(
-            name,
-            str(feature.get("dtype")),
-            "x".join(map(str, feature.get("shape", ()))),
-            int(info["total_frames"]),
-            None,
-            None,
-            feature.get("dtype") in _IMAGES,
-        )
-        for name, feature in info["features"].items()
-    ]
+    found = []
+    for name, feature in info["features"].items():
+        kind, shape = feature.get("dtype"), "x".join(map(str, feature.get("shape", ())))
+        frames = int(info["total_frames"])
+        found.append(ChannelFacts(name, str(kind), shape, frames, images=kind in _IMAGES))
+    return found
 
 
 _IMAGES: Final = ("video", "image")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -26,9 +26,6 @@ from replay.storage.location import Location
 from replay.storage.opening import open_store
 
 Found = TypeVar("Found")
-
-_Messages = tuple[list[Segment], Sequence[int], NDArray[np.uint64], NDArray[np.int64]]
-"""Chunks with messages of a topic, how many each has, their log times, and the row of each."""
 
 
 class McapImages(MessageImages):
@@ -56,9 +53,19 @@ class McapImages(MessageImages):
             _refuse_nothing(self.reader)
             channels = [(c.topic, _kind(self.reader, c), c) for c in self.reader.channels.values()]
             own, self.decode = choose_images(path, topic, channels, reading)
-            self._channels = {channel.id for channel in own}
+            self._channels = [channel.id for channel in own]
             self.topic, self.kind = own[0].topic, _kind(self.reader, own[0])
-            self._index()
+            found = list(self._by_index() if self.reader.by_index else self._by_pass())
+            if not any(len(own) for _, own in found):
+                raise UsageError(f"{path}: there is no message on {self.topic}")
+            self._segments = [segment for segment, _ in found]
+            log_times = np.concatenate([own for _, own in found])
+            order = np.argsort(log_times, kind="stable")
+            self.times = sorted_times(f"{path}: {self.topic}", log_times[order])
+            counts = [len(own) for _, own in found]
+            self._segment_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)[order]
+            self._row_in = np.concatenate([np.arange(count) for count in counts])[order]
+            self.reader.expect(self._segments)
         except BaseException:
             self.reader.close()
             raise
@@ -68,71 +75,42 @@ class McapImages(MessageImages):
         table = self.reader.table(self._segments[int(self._segment_of[row])])
         if table is None:
             raise MalformedRecord("it is damaged")
-        place = int(self._row_in[row])
-        if self.reader.by_index:
-            if self._own[0] is not table:
-                self._own = table, self._rows_of(table)
-            own = self._own[1]
-            if place >= len(own) or table.log_time[own[place]] != self.times[row]:
-                raise MalformedRecord("its chunk holds other messages than the summary names")
-            place = int(own[place])
+        if self._own[0] is not table:
+            self._own = table, self._rows_of(table)
+        own, place = self._own[1], int(self._row_in[row])
+        if place >= len(own) or table.log_time[own[place]] != self.times[row]:
+            raise MalformedRecord("its chunk holds other messages than the summary names")
         with explained(self.path, "its decoder", held=table.data.nbytes):
-            return take(table.view(place))
+            return take(table.view(int(own[place])))
 
     def close(self) -> None:
         self._own = None, self._own[1]
         self.reader.close()
 
-    def _index(self) -> None:
-        """Find every message of the topic.
+    def _rows_of(self, table: MessageTable) -> NDArray[np.intp]:
+        """The rows of a chunk's table that are of the topic."""
+        return np.flatnonzero(np.isin(table.channel, self._channels))
 
-        One pass over a log checks all of it; of a URL only its message indexes are read, and
-        each chunk is checked when its images are.
-        """
-        found = self._by_index() if self.reader.by_index else self._by_pass()
-        self._segments, counts, log_times, places = found
-        if not len(log_times):
-            raise UsageError(f"{self.path}: there is no message on {self.topic}")
-        members = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        order = np.argsort(log_times, kind="stable")
-        self.times = sorted_times(f"{self.path}: {self.topic}", log_times[order])
-        self._segment_of, self._row_in = members[order], places[order]
-        self.reader.expect(self._segments)
-
-    def _by_pass(self) -> _Messages:
-        """The topic's messages by their rows in the table of each chunk."""
-        segments, times, places = [], [np.empty(0, np.uint64)], [np.empty(0, np.int64)]
+    def _by_pass(self) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
+        """The chunks with messages of the topic, and their log times, read and checked."""
         for segment, table in self.reader.tables(ordered=False):
             own = self._rows_of(table)
             if len(own):
-                segments.append(segment)
-                times.append(table.log_time[own])
-                places.append(own)
-        counts = [len(own) for own in times[1:]]
-        return segments, counts, np.concatenate(times), np.concatenate(places)
+                yield segment, table.log_time[own]
 
-    def _rows_of(self, table: MessageTable) -> NDArray[np.intp]:
-        """The rows of a chunk's table that are of the topic."""
-        return np.flatnonzero(np.isin(table.channel, list(self._channels)))
-
-    def _by_index(self) -> _Messages:
-        """The topic's messages by their rows among its own in each chunk."""
-        own_ids = self._channels
+    def _by_index(self) -> Iterator[tuple[Segment, NDArray[np.uint64]]]:
+        """As `_by_pass`, by the message indexes: a chunk is checked when its images are read."""
         segments = [
             segment
             for segment in self.reader.segments
-            if any(n for c, n in (segment.channel_counts() or {}).items() if c in own_ids)
+            if any((segment.channel_counts() or {}).get(channel) for channel in self._channels)
         ]
         self.reader.expect(segments, indexes=True)
-        found, counts = [np.empty((0, 2), np.uint64)], []
         for segment in segments:
-            own = [pairs for channel, pairs in self.reader.index(segment) if channel in own_ids]
-            found += own
-            counts.append(sum(map(len, own)))
-        pairs, first = np.concatenate(found), np.cumsum(counts) - counts
-        # In each chunk they stand by their offsets.
-        order = np.lexsort((pairs[:, 1], np.repeat(np.arange(len(counts)), counts)))
-        return segments, counts, pairs[order, 0], np.arange(len(pairs)) - np.repeat(first, counts)
+            index = self.reader.index(segment)
+            own = (pairs for channel, pairs in index if channel in self._channels)
+            pairs = np.concatenate([np.empty((0, 2), np.uint64), *own])
+            yield segment, pairs[np.argsort(pairs[:, 1], kind="stable"), 0]
 
 
 def mcap_topics(path: Location, reading: Reading = IMAGES) -> list[str]:

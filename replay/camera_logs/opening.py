@@ -27,7 +27,7 @@ from replay.storage.identity import FilesIdentity, Identity, log_identity
 from replay.storage.location import Location, Url, location
 from replay.storage.opening import log_files
 
-Kind = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table"]
+Format = Literal["mcap", "split", "bag", "dataset", "pictures", "video", "table"]
 
 WHOLE_FILES: Final = frozenset((*VIDEOS, *BAGS, *TABLES, *PICTURES))
 """Endings of files that are read whole, and so by their paths alone."""
@@ -36,8 +36,8 @@ ALL: Final = ("*",)
 """Topics that mean every one with images."""
 
 
-def kind_of(path: Location) -> Kind:
-    """Of what kind a log is; a folder of MCAP files that are parts of one log is "split"."""
+def log_format(path: Location) -> Format:
+    """The format of a log; a folder of MCAP files that are parts of one log is "split"."""
     if isinstance(path, Url):
         return "mcap"
     if path.is_dir():
@@ -59,14 +59,14 @@ def kind_of(path: Location) -> Kind:
 
 def only_foreign(path: Location) -> bool:
     """Whether a path can be no recording of ours, by its kind."""
-    return kind_of(path) not in ("mcap", "split")
+    return log_format(path) not in ("mcap", "split")
 
 
 def image_logs(paths: Sequence[str | Location]) -> list[Location]:
     """The logs that paths mean, one at least: a folder of MCAP files is each, a rosbag2 one log."""
     found: list[Location] = []
     for path in map(location, paths):
-        found += log_files(path) if kind_of(path) == "mcap" else [path]
+        found += log_files(path) if log_format(path) == "mcap" else [path]
     return found
 
 
@@ -97,7 +97,7 @@ def open_images(
 
 def _open(path: Location, topic: str | None, *, salvage: bool, reading: Reading) -> ImageStream:
     """Open a log with the reader of its format, which raises as `open_images` does."""
-    kind = kind_of(path)
+    kind = log_format(path)
     if isinstance(path, Url) or kind == "mcap":
         return McapImages(path, topic, salvage=salvage, reading=reading)
     if kind == "split":
@@ -168,7 +168,7 @@ def image_topics(path: Location, reading: Reading = IMAGES) -> list[str]:
         LogDamagedError: it cannot be read.
         CdmisfaError: a package that reads it is missing.
     """
-    kind = kind_of(path)
+    kind = log_format(path)
     if isinstance(path, Url) or kind == "mcap":
         return mcap_topics(path, reading)
     if kind == "dataset":
@@ -195,7 +195,7 @@ def channels_of(path: Path, *, whole: bool = False) -> list[ChannelFacts]:
         LogDamagedError: it cannot be read.
         CdmisfaError: a package that reads it is missing.
     """
-    kind = kind_of(path)
+    kind = log_format(path)
     if kind == "dataset":
         return dataset_channels(path)
     if kind == "bag":

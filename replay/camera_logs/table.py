@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted.regular import check_regular
 from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
 from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
-from replay.camera_logs.csv_table import Words, line_of, read_csv
+from replay.camera_logs.csv_table import Table, called, read_table
 from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,
@@ -26,12 +25,6 @@ from replay.camera_logs.stream import (
 )
 
 TABLES: Final = (".csv", ".parquet")
-
-MAX_BYTES: Final = 1024**3
-"""Largest file that is read as a table, which is held in memory."""
-
-MAX_ROWS: Final = 4 * 1024**2
-"""Most rows of a file with fewer bytes than rows: each has a place on the clock, too."""
 
 UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 """What a column of times may count, in nanoseconds."""
@@ -56,64 +49,61 @@ class TableNumbers(ImageStream):
         LogDamagedError: it is no table.
     """
 
+    path: Path
     recipe = NUMBERS_RECIPE
     told_rounded = True
 
     def __init__(self, path: Path, topic: str | None, reading: Reading = IMAGES) -> None:
-        self.path = self._file = path
-        self.topic = path.stem
-        self.encoding = path.suffix[1:]
+        self.path, self.topic, self.encoding = path, path.stem, path.suffix[1:]
         if topic not in (None, self.topic):
             raise UsageError(f"{path}: a table has no topics, leave {topic} out; see --field")
-        table, words, notes = _table(path)
-        if not table.num_rows:
+        table = read_table(path)
+        if not table.columns.num_rows:
             raise UsageError(f"{path}: it has names of columns, and no rows")
-        times, of_times = _times(path, table, reading.time)
-        empty = [n for n in table.column_names if table[n].null_count == table.num_rows]
-        numeric = [n for n in table.column_names if _is_numeric(table[n])]
-        names = reading.fields or [n for n in numeric if n not in (of_times, *empty)]
-        if not names:
-            raise UsageError(f"{path}: it has no column of numbers{_said_instead(table)}")
+        times, of_times = _times(table, reading.time)
+        names = self.fields = reading.fields or _numeric(table, of_times)
         with arrow_explained(path, remedy="take fewer columns, with --field"):
-            columns = [_column(path, table, name) for name in names]
-        numbers = np.concatenate(columns, axis=1)
+            columns = {name: _column(table, name) for name in names}
+        numbers = np.concatenate(list(columns.values()), axis=1)
         # A missing number is not out of bounds: --range keeps no row without one.
-        known = ~np.any([np.isnan(own).all(axis=1) for own in columns], axis=0)
+        known = ~np.any([np.isnan(own).all(axis=1) for own in columns.values()], axis=0)
         whole = known & (np.isfinite(numbers).all(axis=1) | (reading.depth is not None))
-        lacks = partial(_lacking, table, words, names, columns)
         if times is not None:
             whole &= times >= 0
         elif not whole.all():
             row = int(np.argmin(whole))
+            in_range = ", or keep numbers in a range, with --range" if known[row] else ""
             raise UsageError(
-                f"{path}: {_called(path, row)} lacks a number ({lacks(row)}): name the column "
-                "of its times with --time, so that it can be left out"
-                f"{', or keep numbers in a range, with --range' if known[row] else ''}"
+                f"{path}: {called(path, row)} lacks a number ({_lacking(table, columns, row)}): "
+                "name the column of its times with --time, so that it can be left out" + in_range
             )
-        self._places = np.flatnonzero(whole)
-        self.fields = tuple(names)
-        if not len(self._places):
+        if not whole.any():
             raise UsageError(f"{path}: there is no row with all of {', '.join(names)}")
-        self.times, late = np.empty(0, np.uint64), self._places[:0]
+        self._rows, late = np.flatnonzero(whole), np.empty(0, np.intp)
+        self.times = np.empty(0, np.uint64)
         if times is not None:
             stamps = times[whole]
-            late = self._places[stamps < np.maximum.accumulate(stamps)]
+            late = self._rows[stamps < np.maximum.accumulate(stamps)]
             order = np.argsort(stamps, kind="stable")
-            self._places = self._places[order]
+            self._rows = self._rows[order]
             self.times = sorted_times(str(path), stamps[order])
         numbers = bounded(numbers, reading.depth)
-        self._numbers = numbers if whole.all() and not len(late) else numbers[self._places]
-        used = {of_times, *names} if reading.fields else set(table.column_names)
-        self.warnings = [*notes]
-        self.warnings += [f"{path}: {said}" for name, said in words.items() if name in used]
-        if not reading.fields:
-            self.warnings += [f"{path}: {n} is empty in every row, and is left out" for n in empty]
-        self.warnings += [
-            f"{path}: {name} holds whole numbers beyond 2^53, which are rounded to float64"
-            for name, own in zip(names, columns, strict=True)
-            if _has_digits(path, table, name) and _beyond(bounded(own[whole], reading.depth))
-        ]
-        self.warnings += _said_of_rows(path, whole, late, of_times, lacks)
+        self._numbers = numbers if whole.all() and not len(late) else numbers[self._rows]
+        used = {of_times, *names} if reading.fields else set(table.columns.column_names)
+        said = [*_said_of_columns(table, used, columns, whole, reading)]
+        if left := int((~whole).sum()):
+            row = int(np.argmin(whole))
+            which = f"{called(path, row)} is left out"
+            if left > 1:
+                which = f"{left} of {len(whole)} rows lack a number or their time and are left out"
+                which += f", the first is {called(path, row)}"
+            said.append(f"{which}: {_lacking(table, columns, row)}")
+        if len(late):
+            said.append(
+                f"rows that stand after later ones: {len(late)} of {self.count}, the first is "
+                f"{called(path, late[0])}; they are taken in the order of {of_times}"
+            )
+        self.warnings = [*table.notes, *(f"{path}: {line}" for line in said)]
 
     @property
     def count(self) -> int:
@@ -124,127 +114,80 @@ class TableNumbers(ImageStream):
         return shown
 
     def where(self, row: int) -> str:
-        return f"{self.path}: {_called(self._file, int(self._places[row]))}"
-
-    def close(self) -> None:
-        """Do nothing: no file stays open."""
-
-
-def is_table(path: Path) -> bool:
-    """Whether a file is a table, by its name."""
-    return path.suffix.lower() in TABLES and path.is_file()
+        return f"{self.path}: {called(self.path, int(self._rows[row]))}"
 
 
 def table_channels(path: Path) -> list[ChannelFacts]:
     """What is in each column of a table; raises as `TableNumbers`."""
-    (table, _, _), kind = _table(path), path.suffix[1:]
+    columns, kind = read_table(path).columns, path.suffix[1:]
     return [
-        ChannelFacts(n, kind, str(c.type), len(c) - c.null_count, None, None, images=False)
-        for n, c in zip(table.column_names, table.columns, strict=True)
+        ChannelFacts(name, kind, str(own.type), len(own) - own.null_count, images=False)
+        for name, own in zip(columns.column_names, columns.columns, strict=True)
     ]
 
 
 def table_notes(path: Path) -> list[str]:
     """What the user should know of a table; raises as `TableNumbers`, and where it was cut."""
-    table, words, notes = _table(path)
-    if notes:
-        raise LogDamagedError(notes[0])
+    table = read_table(path)
+    if table.notes:
+        raise LogDamagedError(table.notes[0])
     return [
-        *(f"{path}: {said}" for said in words.values()),
-        f"{path}: {table.num_rows} rows of {table.num_columns} columns can be read; a table has "
-        "no checksums, changed numbers would go unnoticed",
+        *(f"{path}: {words.said}" for words in table.words.values()),
+        f"{path}: {table.columns.num_rows} rows of {table.columns.num_columns} columns can be "
+        "read; a table has no checksums, changed numbers would go unnoticed",
     ]
 
 
-def _called(path: Path, row: int) -> str:
-    """What a row is called: the line of a CSV file, from 1; of others the row, from 0."""
-    return f"line {line_of(path, row)}" if path.suffix.lower() == ".csv" else f"row {row}"
+def _numeric(table: Table, of_times: str) -> tuple[str, ...]:
+    """The columns of numbers but that of the times; refuses a table without."""
+    columns = table.columns
+    found = [name for name in columns.column_names if _is_numeric(columns[name])]
+    found = [name for name in found if name != of_times and not _is_empty(columns[name])]
+    if not found:
+        kinds = ", ".join(f"{name} of {columns[name].type}" for name in columns.column_names[:20])
+        raise UsageError(f"{table.path}: it has no column of numbers, but {kinds}")
+    return tuple(found)
 
 
-def _has_digits(path: Path, table: Any, name: str) -> bool:
+def _said_of_columns(
+    table: Table,
+    used: Collection[str],
+    columns: Mapping[str, FloatArray],
+    whole: NDArray[np.bool_],
+    reading: Reading,
+) -> Iterator[str]:
+    """What the user should know of the columns that are used, of their rows that are whole."""
+    yield from (words.said for name, words in table.words.items() if name in used)
+    if not reading.fields:
+        for name in table.columns.column_names:
+            if _is_empty(table.columns[name]):
+                yield f"{name} is empty in every row, and is left out"
+    for name, own in columns.items():
+        taken = np.abs(bounded(own[whole], reading.depth))
+        if (taken > EXACT).any() and _has_digits(table, name):
+            yield f"{name} holds whole numbers beyond 2^53, which are rounded to float64"
+
+
+def _has_digits(table: Table, name: str) -> bool:
     """Whether the file may hold a field more exactly than float64 does."""
     import pyarrow.types as kinds
 
-    if path.suffix.lower() == ".csv":
+    if table.path.suffix.lower() == ".csv":
         return True
-    kind = table[name if name in table.column_names else Field(name).first].type
+    columns = table.columns
+    kind = columns[name if name in columns.column_names else Field(name).first].type
     while kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind):
         kind = kind.value_type
     return not kinds.is_floating(kind)
 
 
-def _beyond(numbers: NDArray[np.float64]) -> bool:
-    """Whether a whole number may be rounded among some, all of which are finite."""
-    return bool((np.abs(numbers) > EXACT).any())
-
-
-def _table(path: Path) -> tuple[Any, dict[str, Words], list[str]]:
-    """A table, of its columns of numbers those with words, and what else is to be known."""
-    check_regular(path, MAX_BYTES)
-    with arrow_explained(path, remedy="write fewer columns or rows into a file"):
-        if path.suffix.lower() == ".csv":
-            table, words, notes = read_csv(path)
-        else:
-            import pyarrow.parquet
-
-            table, words, notes = pyarrow.parquet.ParquetFile(path).read(), {}, []
-        if table.num_rows > max(MAX_ROWS, path.stat().st_size):
-            raise LogDamagedError(f"{path}: {table.num_rows} rows are too many for its few bytes")
-        twice = [n for n in table.column_names if table.column_names.count(n) > 1]
-        if twice:
-            raise UsageError(f"{path}: two columns are called {twice[0]!r}: rename one of them")
-        return table, words, notes
-
-
-def _said_of_rows(
-    path: Path,
-    whole: NDArray[np.bool_],
-    late: NDArray[np.intp],
-    of_times: str,
-    lacks: Callable[[int], str],
-) -> Iterator[str]:
-    """What the user should know of rows.
-
-    Args:
-        path: of the table.
-        whole: (n,) which of them are taken.
-        late: those of these that stand after later ones.
-        of_times: the column of their times.
-        lacks: what a row that is left out lacks, in words.
-    """
-    left, taken = int((~whole).sum()), int(whole.sum())
-    if left:
-        row = int(np.argmin(whole))
-        rows = f"{_called(path, row)} is left out"
-        if left > 1:
-            rows = f"{left} of {len(whole)} rows lack a number or their time and are left out"
-            rows += f", the first is {_called(path, row)}"
-        yield f"{path}: {rows}: {lacks(row)}"
-    if len(late):
-        yield (
-            f"{path}: rows that stand after later ones: {len(late)} of {taken}, the first is "
-            f"{_called(path, late[0])}; they are taken in the order of {of_times}"
-        )
-
-
-def _said_instead(table: Any) -> str:
-    """Of what kinds the columns of a table are, in words."""
-    kinds = [f"{name} of {table[name].type}" for name in table.column_names[:20]]
-    return f", but {', '.join(kinds)}"
-
-
-def _lacking(
-    table: Any,
-    words: Mapping[str, Words],
-    names: Sequence[str],
-    columns: Sequence[NDArray[np.float64]],
-    row: int,
-) -> str:
+def _lacking(table: Table, columns: Mapping[str, FloatArray], row: int) -> str:
     """What a row lacks, in words."""
-    for name, numbers in zip(names, columns, strict=True):
+    for name, numbers in columns.items():
+        words = table.words.get(name)
+        if words is not None and words.row == row:
+            return f"{name} holds {words.text!r}"
         wrong = numbers[row][~np.isfinite(numbers[row])]
-        if name in words and words[name].row == row:
-            return f"{name} holds {words[name].text!r}"
         if len(wrong):
             held = "no number" if np.isnan(wrong[0]) else f"{wrong[0]}, which is not finite"
             return f"{name} holds {held}"
@@ -258,70 +201,67 @@ def _is_numeric(column: Any) -> bool:
     return bool(kinds.is_integer(kind) or kinds.is_floating(kind) or kinds.is_boolean(kind))
 
 
-def _column(path: Path, table: Any, name: str) -> NDArray[np.float64]:
+def _is_empty(column: Any) -> bool:
+    return bool(column.null_count == len(column))
+
+
+def _column(table: Table, name: str) -> FloatArray:
     """The numbers of a field in each row, (n, I) float64; NaN where there is none.
 
     Raises:
         UsageError: there is none in the table, or no number in it.
     """
-    field = Field(name, plain=name in table.column_names)
+    path, columns = table.path, table.columns
+    field = Field(name, plain=name in columns.column_names)
     first = field.first
-    if first not in table.column_names:
-        there = ", ".join(table.column_names[:20])
+    if first not in columns.column_names:
+        there = ", ".join(columns.column_names[:20])
         raise UsageError(f"{path}: there is no column {name}; it has {there}")
-    if table[first].null_count == len(table[first]):
+    if _is_empty(columns[first]):
         raise UsageError(f"{path}: {first} is empty in every row: leave it out")
-    if first == name and _is_numeric(table[name]):
-        return _floats(table[name])[:, None]
+    if first == name and _is_numeric(columns[name]):
+        return _floats(columns[name])[:, None]
     found: list[list[float] | None] = []
-    for place, value in enumerate(table[first].to_pylist()):
+    size = None
+    for row, value in enumerate(columns[first].to_pylist()):
         try:
-            found.append(None if value is None else field.numbers({first: value}))
+            own = None if value is None else field.numbers({first: value})
         except UsageError as error:
-            raise UsageError(f"{path}: {_called(path, place)}: {error}") from None
-    size = next((len(own) for own in found if own is not None), 1)
-    for place, own in enumerate(found):
+            raise UsageError(f"{path}: {called(path, row)}: {error}") from None
+        size = len(own) if size is None and own is not None else size
         if own is not None and len(own) != size:
             raise UsageError(
-                f"{path}: {name} holds {size} numbers, and {len(own)} in {_called(path, place)}: "
-                f"choose a part of it, as --field {field.first}[0:{min(len(own), size)}]"
+                f"{path}: {name} holds {size} numbers, and {len(own)} in {called(path, row)}: "
+                f"choose a part of it, as --field {first}[0:{min(len(own), size or 0)}]"
             )
-    return np.array([[np.nan] * size if own is None else own for own in found], np.float64)
+        found.append(own)
+    return np.array([[np.nan] * (size or 1) if own is None else own for own in found], np.float64)
 
 
-def _floats(column: Any) -> NDArray[np.float64]:
+def _floats(column: Any) -> FloatArray:
     import pyarrow
 
-    found: NDArray[np.float64] = column.cast(pyarrow.float64(), safe=False).to_numpy()
+    found: FloatArray = column.cast(pyarrow.float64(), safe=False).to_numpy()
     return found
 
 
-def _unit_of(counted: NDArray[np.float64]) -> str:
-    """The unit in which times, (n,), are of 1971 to 2100; "ns" where none is."""
-    for unit, scale in UNITS.items():
-        seconds = counted * (scale / NANOSECONDS)
-        if seconds.min() >= _YEAR and seconds.max() < 130 * _YEAR:
-            return unit
-    return "ns"
-
-
-def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64] | None, str]:
-    """When each row was, nanoseconds, -1 where nobody knows; and the name of the column."""
+def _times(table: Table, named: str | None) -> tuple[IntArray | None, str]:
+    """When each row was, nanoseconds, -1 where that is missing; and the name of the column."""
     if named is None:
         return None, ""
+    path, names = table.path, table.columns.column_names
     name, unit = named, "s"
-    if name not in table.column_names:
+    if name not in names:
         name, _, unit = named.rpartition(":")
-    if name not in table.column_names or unit not in UNITS:
-        there = ", ".join(table.column_names[:20])
+    if name not in names or unit not in UNITS:
         raise UsageError(
-            f"{path}: there is no column {named}; it has {there}. A unit is one of "
+            f"{path}: there is no column {named}; it has {', '.join(names[:20])}. A unit is one of "
             f"{', '.join(UNITS)}, as --time COLUMN:ns"
         )
     import pyarrow
     import pyarrow.types as kinds
 
-    column = table[name]
+    column = table.columns[name]
     if kinds.is_timestamp(column.type):
         with arrow_explained(path):
             whole = column.cast(pyarrow.timestamp("ns", column.type.tz)).cast(pyarrow.int64())
@@ -348,3 +288,12 @@ def _times(path: Path, table: Any, named: str | None) -> tuple[NDArray[np.int64]
     else:
         exact = whole.cast(pyarrow.int64(), safe=False).fill_null(-1).to_numpy() * np.int64(scale)
     return np.where(known, exact, -1), name
+
+
+def _unit_of(counted: FloatArray) -> str:
+    """The unit in which times, (n,), are of 1971 to 2100; "ns" where none is."""
+    for unit, scale in UNITS.items():
+        seconds = counted * (scale / NANOSECONDS)
+        if seconds.min() >= _YEAR and seconds.max() < 130 * _YEAR:
+            return unit
+    return "ns"

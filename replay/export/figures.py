@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from cdmisfa.core.signals import STATES
-from recorder.log.whole import refuse_taken, whole
+from recorder.log.files import atomic_write, refuse_taken
 from replay.export.history import History, read_history
 from replay.palette import CYCLE, GREY, VERMILLION, Rgb, colour
 from replay.palette import STATES as STATE_COLOURS
@@ -303,7 +303,7 @@ def _write(figure: Figure, target: Path) -> None:
     """Write one file, the same bytes every time."""
     is_svg = target.suffix == ".svg"
     canvas: Any = FigureCanvasSVG(figure) if is_svg else FigureCanvasAgg(figure)
-    with whole(target) as partial:
+    with atomic_write(target) as partial:
         if is_svg:
             canvas.print_svg(partial, metadata={"Date": None})
         else:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from recorder.log.whole import refuse_special, whole
+from recorder.log.files import atomic_write, refuse_special
 from replay.camera_logs.options import CameraOptions
 from replay.export.frames import write_film, write_films, write_images
 from replay.export.lerobot import write_lerobot
@@ -114,7 +114,7 @@ def export(
         raise UsageError(f"signals are of one run, {len(paths)} were named")
     if form in TABLES:  # one of them is two files
         return described.write(paths[0], out, force=force)
-    with whole(out) as place:
+    with atomic_write(out) as place:
         return described.write(paths[0], place)
 
 
@@ -136,7 +136,7 @@ def _export_recording(
             if len(source.spec.streams) > 1:
                 raise UsageError(f"{path} has several views: name a folder, not {out.name}")
             about(source)
-            with whole(out) as film:
+            with atomic_write(out) as film:
                 write_film(source, 0, film, lossless=lossless)
             return source.frames
         _refuse_others(out)
@@ -144,7 +144,7 @@ def _export_recording(
         options: dict[str, Any] = {"lossless": lossless} if FORMS[form].lossy else {}
         if form == "lerobot":
             options["name"] = out.name
-        with whole(out) as place:
+        with atomic_write(out) as place:
             return FORMS[form].write(source, place, **options)
 
 

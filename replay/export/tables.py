@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cdmisfa.core.signals import SIGNALS, Signal
-from recorder.log.whole import refuse_taken, whole
+from recorder.log.files import atomic_write, refuse_taken
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
 
@@ -47,10 +47,10 @@ def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> i
     header, notes = read_header(run), out.with_name(f"{out.name}-metadata.json")
     if form == "csv":
         refuse_taken(notes, force=force)
-    with whole(out) as partial:
+    with atomic_write(out) as partial:
         if form != "csv":
             return _WRITERS[form](run, header, partial)
-        with whole(notes) as about:
+        with atomic_write(notes) as about:
             columns, rows = _write_csv(run, header, partial)
             about.write_text(json.dumps(_notes(out, header, columns), indent=1), "utf-8")
         return rows

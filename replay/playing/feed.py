@@ -98,8 +98,8 @@ class Topic:
     schema: bytes
 
 
-class Message(NamedTuple):
-    """A message with its log time, in nanoseconds."""
+class DueMessage(NamedTuple):
+    """A message with its log time, in nanoseconds, at which it is due."""
 
     time_ns: int
     topic: Topic
@@ -201,7 +201,7 @@ def opened_source(paths: Sequence[Path], how: Playback) -> Iterator[Logged]:
 
 
 @contextlib.contextmanager
-def opened_messages(paths: Sequence[Path], how: Playback) -> Iterator[Feed[Message]]:
+def opened_messages(paths: Sequence[Path], how: Playback) -> Iterator[Feed[DueMessage]]:
     """The messages of a recording, or of camera logs of others; raises as `opened_source`."""
     for path in paths:
         refuse_what_is_no_log(path)
@@ -219,7 +219,7 @@ def _is_mcap(path: Path) -> bool:
     return any(path.glob("*.mcap*")) if path.is_dir() else starts_as_log(path)
 
 
-def _logged_messages(readers: Sequence[LogReader], wanted: Sequence[str]) -> Feed[Message]:
+def _logged_messages(readers: Sequence[LogReader], wanted: Sequence[str]) -> Feed[DueMessage]:
     """The messages of MCAP files, bytes and times as they are; what two files tell is told once.
 
     Args:
@@ -241,8 +241,8 @@ def _logged_messages(readers: Sequence[LogReader], wanted: Sequence[str]) -> Fee
     if not segments:
         raise UsageError(f"{path} has no messages: there is nothing to play")
 
-    def messages() -> Iterator[Message]:
-        now, told = -1, set[Message]()
+    def messages() -> Iterator[DueMessage]:
+        now, told = -1, set[DueMessage]()
         each = [_of_topics(reader, one) for reader, one in zip(readers, known, strict=True)]
         for message in heapq.merge(*each, key=lambda message: message.time_ns):
             if message.time_ns != now:
@@ -268,13 +268,13 @@ def _topics(reader: LogReader) -> dict[int, Topic]:
     return topics
 
 
-def _of_topics(reader: LogReader, known: dict[int, Topic]) -> Iterator[Message]:
+def _of_topics(reader: LogReader, known: dict[int, Topic]) -> Iterator[DueMessage]:
     for message in reader.messages():
         if message.channel.id in known:
-            yield Message(message.log_time, known[message.channel.id], message.data)
+            yield DueMessage(message.log_time, known[message.channel.id], message.data)
 
 
-def _encoded_frames(source: Logged) -> Feed[Message]:
+def _encoded_frames(source: Logged) -> Feed[DueMessage]:
     """The frames of a source as messages, as a recording of them would hold."""
     spec, frames = source.spec, frames_feed(source)
     encoders: list[Any] = [VectorEncoder() for _ in spec.streams]
@@ -290,12 +290,12 @@ def _encoded_frames(source: Logged) -> Feed[Message]:
         for name, encoder in zip(names, encoders, strict=True)
     ]
 
-    def messages() -> Iterator[Message]:
+    def messages() -> Iterator[DueMessage]:
         for frame in frames.items():
             values = (*frame.shown, frame.truth)
             for topic, encode, value in zip(topics, encoders, values, strict=False):
                 if value is not None:
-                    yield Message(frame.time_ns, topic, encode(frame.time_ns, value))
+                    yield DueMessage(frame.time_ns, topic, encode(frame.time_ns, value))
 
     return Feed(frames.start, frames.stop, messages, tuple(topics))
 

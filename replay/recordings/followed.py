@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from cdmisfa.core.blocks import Block, ClockedSource, check_request
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogExhaustedError, UsageError
-from recorder.log.begun import read_recording
+from recorder.log.manifest import read_start
 from recorder.mcap.store import PARTIAL
 from replay.recordings.source import RecordedSource
 from replay.storage.opening import log_files
@@ -251,7 +251,7 @@ class FollowedSource(ClockedSource):
             LogDamagedError: more may come, or a chunk is damaged.
             ReplacedError: they are of another recording.
         """
-        absent = read_recording(self._path).options["frames"].keys() - set(found.spec.streams)
+        absent = read_start(self._path).frames.keys() - set(found.spec.streams)
         if absent or not found.refresh():
             raise UsageError(f"{self._path}: its files are not all there yet")
         if self._source is not None and _identity(found) != self._identity:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import operator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import LogDamagedError
+from recorder.log.manifest import ViewMetadata
 from recorder.log.messages import (
     IMAGE_ENCODING,
     IMAGE_SCHEMA,
@@ -26,11 +26,9 @@ from recorder.log.messages import (
     vector_payload,
     view_topic,
 )
-from recorder.log.viewfacts import ViewFacts
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Segment
-from replay.recordings.channel_rows import ChannelRows
-from replay.recordings.scanner import ChunkScanner, RowLayout
+from replay.recordings.rows import ChannelRows, RowLayout
 from replay.storage.location import Location
 from replay.storage.opening import open_store
 
@@ -67,7 +65,6 @@ class ViewFile:
             LogDamagedError: it is damaged, or no view of a recording.
         """
         self.path = path
-        self._scanner: ChunkScanner | None = None
         self._passing = passing is not None
         self.reader = passing or LogReader(open_store(path), salvage=salvage)
         try:
@@ -85,29 +82,32 @@ class ViewFile:
                 f"({len(records)} {RECORDING_METADATA} records); "
                 "cdmisfa learn and convert take logs of others, by their --topic"
             )
-        self.facts = facts = ViewFacts.from_metadata(self.path, records[0].values)
+        self.facts = facts = ViewMetadata.parse(self.path, records[0].values)
         self.reader.expect(self.reader.segments)
         schema = IMAGE_SCHEMA if facts.spec.images else VECTOR_SCHEMA
         self._channels = [self._channel(view_topic(facts.view), schema)]
         if facts.truth:
             self._channels.append(self._channel(TRUTH_TOPIC, TRUTH_SCHEMA))
-        self._layouts: list[RowLayout] = []
-        self._find_ranges()
-
-    def _find_ranges(self) -> None:
-        self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))
-        if self.ranges and not self._passing:
-            self._layouts = self._find_layouts(self._channels[0].payload(self.ranges[0][0]))
+        self.ranges: list[tuple[int, int]] = []
+        if not self._passing:
+            self._number()
 
     def refresh(self, path: Path) -> None:
         """Take in the frames that a recorder wrote since; it may have renamed the file."""
         self.path = path
         self.reader.moved(path)
         if self.reader.refresh():
-            self._scanner = None
-            for rows in self._channels:
-                rows.extend()
-            self._find_ranges()
+            self._number()
+
+    def _number(self) -> None:
+        for rows in self._channels:
+            rows.extend()
+        self._find_ranges()
+        if self.ranges:
+            self._find_layouts()
+
+    def _find_ranges(self) -> None:
+        self.ranges = functools.reduce(intersection, (rows.ranges for rows in self._channels))
 
     @property
     def count(self) -> int:
@@ -125,18 +125,15 @@ class ViewFile:
         Raises:
             LogDamagedError: a chunk or a message in it is damaged.
         """
-        if self._scanner is None:
-            self._scanner = ChunkScanner(self.reader, self._layouts)
         outs = [frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8)]
-        numbered = enumerate(self._channels)
-        pieces = [p for which, rows in numbered for p in rows.pieces(start, len(frames), which)]
-        # In the order of the file, so that each chunk is decoded once.
-        pieces.sort(key=operator.attrgetter("segment.offset"))
-        for piece in pieces:
-            chunk = self._scanner.chunk(piece.segment)
-            self._channels[piece.which].confirm(piece.number, chunk.times[piece.which])
-            out = outs[piece.which][piece.at : piece.at + piece.n]
-            self._scanner.copy(chunk, piece.which, piece.low, out)
+        pieces = []
+        for which, rows in enumerate(self._channels):
+            at = 0
+            for number, low, n in rows.pieces(start, len(frames)):
+                pieces.append((rows.place(number), which, number, low, at, at + n))
+                at += n
+        for _, which, number, low, at, stop in sorted(pieces):  # each chunk is decoded once
+            self._channels[which].read(number, low, outs[which][at:stop])
 
     def pass_over(self, segment: Segment) -> None:
         """Look at every frame of the next chunk of the file, and copy none.
@@ -144,12 +141,11 @@ class ViewFile:
         Raises:
             LogDamagedError: a time is no frame's, or a message is laid out unlike the others.
         """
-        found = [rows.pass_over(segment) for rows in self._channels]
-        if not self._layouts and found[0] is not None:
-            self._layouts = self._find_layouts(found[0].payload(0))
-        for layout, table in zip(self._layouts, found, strict=False):
-            if table is not None:
-                layout.checked_ends(self.path, segment, table)
+        for rows in self._channels:
+            rows.add(segment)
+        self._find_layouts()
+        for rows in self._channels:
+            rows.check_last(segment)
 
     def passed(self) -> None:
         """Hear that there is no further chunk: `ranges` are known."""
@@ -159,24 +155,23 @@ class ViewFile:
         """Let go of the file."""
         self.reader.close()
 
-    def _find_layouts(self, first: bytes) -> list[RowLayout]:
-        payload = self._find_payload(first)
+    def _find_layouts(self) -> None:
+        """Find where messages hold their values, once there is a frame to look at."""
+        frames = self._channels[0]
+        if frames.layout is not None or not frames.runs:
+            return
+        payload = self._find_payload(frames.payload(frames.runs[0].start))
         place = payload.tail + payload.size
-        marks = np.frombuffer(payload.before, np.uint8)
-        least = place + len(marks)
-        places, values = least - np.arange(len(marks)), np.array([place])
-        size, channels = payload.size, [rows.channel for rows in self._channels]
-        found = [RowLayout(channels[0], "a frame", least, places, marks, values, size)]
+        marks = {place + len(payload.before) - i: b for i, b in enumerate(payload.before)}
+        least = place + len(payload.before)
+        self._channels[0].layout = RowLayout("a frame", least, marks, [place], payload.size)
         if self.facts.truth:
-            tags = truth_tags(self.facts.truth)
-            marks = np.frombuffer(b"".join(tags), np.uint8)
-            # Each value of 8 bytes stands behind its tag.
-            sizes = np.array([len(tag) for tag in tags])
-            after = np.cumsum((sizes + 8)[::-1])[::-1]
-            places = np.concatenate([at - np.arange(n) for at, n in zip(after, sizes, strict=True)])
-            least, values = int(after[0]), after - sizes
-            found.append(RowLayout(channels[1], "ground truth", least, places, marks, values, 8))
-        return found
+            marks, values, at = {}, [], 0
+            for tag in reversed(truth_tags(self.facts.truth)):  # a value of 8 bytes behind each
+                values.append(at + 8)
+                at += 8 + len(tag)
+                marks |= {at - i: byte for i, byte in enumerate(tag)}
+            self._channels[1].layout = RowLayout("ground truth", at, marks, values[::-1], 8)
 
     def _channel(self, topic: str, schema: str) -> ChannelRows:
         channels = [c for c in self.reader.channels.values() if c.topic == topic]
@@ -187,7 +182,7 @@ class ViewFile:
         known = self.reader.schemas.get(channels[0].schema_id)
         if known is None or known.name != schema or channels[0].encoding != "protobuf":
             raise LogDamagedError(f"{self.path}: {topic} does not hold {schema} in protobuf")
-        return ChannelRows(self.reader, channels[0], self.facts, passing=self._passing)
+        return ChannelRows(self.reader, channels[0], self.facts)
 
     def _find_payload(self, first: bytes) -> Payload:
         shape = self.facts.frame_shape

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import LogDamagedError, UsageError, one_line
 from cdmisfa.core.modules import Module
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.runs.folders import MODULES_FILE
 from replay.storage.arrays import read_arrays
 
@@ -45,7 +45,7 @@ def save_modules(path: Path, modules: Iterable[Module]) -> None:
     for module in modules:
         for name in _FIELDS:
             arrays[_key(module.index, name)] = getattr(module, name)
-    with whole(Path(path)) as partial, open(partial, "wb") as file:
+    with atomic_write(Path(path)) as partial, open(partial, "wb") as file:
         np.savez(file, **arrays)
 
 

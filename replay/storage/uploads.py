@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.storage.location import Url
 from replay.storage.opening import copied, open_store
 from replay.storage.servers import ask_s3
@@ -110,7 +110,7 @@ def fetch(url: Url, local: Path, there: Mapping[str, Stored], progress: Progress
         CdmisfaError: there is no room for it.
     """
     done, total = 0, sum(stored.size for stored in there.values())
-    with whole(local) as folder:
+    with atomic_write(local) as folder:
         for rest, stored in sorted(there.items()):
             parts = rest.split("/")
             if parts[0] or {"", ".", ".."} & {*parts[1:]}:

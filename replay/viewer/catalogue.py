@@ -12,7 +12,6 @@ import contextlib
 import re
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from replay.viewer.program import (
     open_privately,
     private_host,
     running,
+    until,
 )
 from replay.viewer.web import page_of, page_server, served
 
@@ -49,9 +49,6 @@ REGISTER_SECONDS = 300
 
 START_SECONDS = 60.0
 """Longest wait for the server to listen."""
-
-LAST_SECONDS = 5.0
-"""Longest wait, at the end, for the view that is being built."""
 
 Progress = Callable[[int, int], None]
 
@@ -155,7 +152,6 @@ def serve_catalogue(
         LogDamagedError: a run without a run.json cannot be read.
         CdmisfaError: the server ended with an error.
     """
-    ended = threading.Event()
     with contextlib.ExitStack() as opened:
         table = opened.enter_context(served_table(folder, None if web else port))
         if table is None:
@@ -167,13 +163,16 @@ def serve_catalogue(
         print(shown, file=sys.stderr, flush=True)
         if has_display() and not web:
             open_privately(table.address)
-        follow = threading.Thread(target=_follow, args=(table, tab, progress, ended), daemon=True)
-        follow.start()
         try:
-            table.server.wait()
-        finally:
-            ended.set()
-            follow.join(LAST_SECONDS)
+            set_layout(table.runs, table.dataset, table.place, tab)
+        except (CdmisfaError, *REFUSALS) as error:
+            print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
+        try:
+            add_views(table.runs, table.dataset, table.place, progress)
+        except REFUSALS as error:
+            time.sleep(1.0)  # when interrupted the server may die before us; that is no error
+            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+        table.server.wait()
 
 
 @contextlib.contextmanager
@@ -193,31 +192,11 @@ def _created(address: str, name: str, server: Program) -> Any:
     Raises:
         CdmisfaError: it does not listen in time.
     """
-    end, refusal = time.monotonic() + START_SECONDS, ""
-    while time.monotonic() < end:
-        if server.poll() is not None:
-            return None
-        try:
-            return CatalogueClient(address).create_dataset(name)
-        except REFUSALS as error:
-            refusal = str(error).splitlines()[0]
-        time.sleep(0.01)
-    raise CdmisfaError(f"the server did not start within {START_SECONDS:.0f} s: {refusal}")
 
+    def create() -> Any:
+        return CatalogueClient(address).create_dataset(name)
 
-def _follow(
-    table: Table, tab: str | None, progress: Progress | None, ended: threading.Event
-) -> None:
-    """Lay the runs of a table out, and add their views."""
-    try:
-        set_layout(table.runs, table.dataset, table.place, tab)
-    except (CdmisfaError, *REFUSALS) as error:
-        print(f"runs are shown without their layout: {error}", file=sys.stderr, flush=True)
-    try:
-        add_views(table.runs, table.dataset, table.place, progress, ended)
-    except REFUSALS as error:
-        if not ended.wait(1.0):  # when interrupted the server may die before us; that is no error
-            print(f"views are not served: {error}", file=sys.stderr, flush=True)
+    return until(create, START_SECONDS, "the server did not start", server)
 
 
 def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None = None) -> None:
@@ -234,12 +213,11 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         LogDamagedError: that run cannot be read.
     """
     from replay.runs.run import read_outline
+    from replay.view.columns import MOST_STREAMS
 
     # These take half a second: only once the table is there.
-    from replay.view.layouts.of_run import run_layout
-    from replay.view.layouts.panels import MOST_STREAMS
-    from replay.view.world.first import first_of
-    from replay.view.world.known import world_of_run
+    from replay.view.panels import run_layout
+    from replay.view.world import world_of_run, world_tab
 
     results = [read_properties(run)["result"] for run in runs]
     most = max(range(len(runs)), key=lambda i: int(results[i]["modules"]))
@@ -251,7 +229,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         lines={name: values[:0] for name, values in outline.lines.items()},
     )
     streams, file = outline.streams(MOST_STREAMS), place / "layout.rbl"
-    shown = first_of(outline.header, world_of_run(outline.header, runs[most])[0], streams)
+    shown = world_tab(outline.header, world_of_run(outline.header, runs[most])[0], streams)
     run_layout(outline, shown, tab=tab).save(APPLICATION, str(file))
     layouts = dataset.blueprint_dataset()
     (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
@@ -263,7 +241,6 @@ def add_views(
     dataset: Any,
     place: Path,
     progress: Progress | None = None,
-    ended: threading.Event | None = None,
 ) -> None:
     """Add the views of runs to the rows that a server has, building what is missing or old.
 
@@ -274,13 +251,10 @@ def add_views(
         dataset: the server's.
         place: folder for copies of views.
         progress: called with the runs that are done, and all.
-        ended: set once the server has ended.
     """
     for start in range(0, len(runs), TOGETHER):
         views: list[Path] = []
         for i, run in enumerate(runs[start : start + TOGETHER], start + 1):
-            if ended is not None and ended.is_set():
-                return
             try:
                 views.append(ready_view(run))
             except (CdmisfaError, OSError) as error:
@@ -308,8 +282,10 @@ def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str
 
 def _as_layer(view: Path, out: Path) -> Path:
     """A copy of a view that leaves a run's properties to its row, and the robot's body out."""
-    from replay.view.world.body import BODY  # imports the package, as the layout did
-    from replay.view.world.scene import SCENE
+    from replay.view.scene import (
+        BODY,  # imports the package, as the layout did
+        SCENE,
+    )
 
     reader = RrdReader(str(view))
     (store,) = (s for s in reader.store_entries() if s.kind == "recording")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
-from recorder.log.whole import refuse_taken, refuse_unless_png, whole
+from recorder.log.files import atomic_write, refuse_taken, refuse_unless_png
 from replay.camera_logs.source import ForeignSource
 from replay.inputs import holds_run, open_to_look
 from replay.runs.log import EVENT_TOPIC, read_batches, read_columns, read_header
@@ -19,13 +19,13 @@ from replay.view.build import view_of
 from replay.view.columns import FRAME
 from replay.viewer.catalogue import served_table
 from replay.viewer.program import (
-    REFUSALS,
     Program,
     check_window,
     free_port,
     missing_driver,
     private_host,
     running,
+    until,
 )
 
 ITERATION = re.compile(r"(?:iteration|iter|i)\s*(\d+)", re.IGNORECASE)
@@ -152,18 +152,11 @@ class HeadlessViewer:
         Raises:
             CdmisfaError: it did not answer in time, or the viewer has ended.
         """
-        end, refusal = time.monotonic() + seconds, ""
-        while time.monotonic() < end:
-            try:
-                answer = question(self._client)
-                if answer:
-                    return answer
-            except REFUSALS as error:
-                refusal = f": {error}".splitlines()[0]
-            if self._process.poll() is not None:
-                raise CdmisfaError(f"the viewer ended: {self._process.last_words()}")
-            time.sleep(0.1)
-        raise CdmisfaError(f"the viewer did not {what} within {seconds:.0f} s{refusal}")
+        what = f"the viewer did not {what}"
+        answer = until(lambda: question(self._client), seconds, what, self._process)
+        if answer is None:
+            raise CdmisfaError(f"the viewer ended: {self._process.last_words()}")
+        return answer
 
     def go_to(self, frame: int) -> None:
         """Put the time cursor on a frame."""
@@ -177,7 +170,7 @@ class HeadlessViewer:
     def draw(self, out: Path) -> None:
         """Write the window as a PNG, whole or not at all."""
         png = bytes(self.ask(lambda client: client.take_screenshot()))
-        with whole(out) as partial:
+        with atomic_write(out) as partial:
             partial.write_bytes(png)
 
 

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from replay.view.bindings import viewer_client, viewer_program
@@ -169,16 +169,46 @@ def open_privately(address: str, memory_limit: str = "2GB") -> None:
         start_new_session=True,
     )
 
+    def open_it() -> bool:
+        viewer_client().connect(f"rerun+http://{host}:{port}/proxy").open(address)
+        return True
+
     def tell() -> None:
-        end = time.monotonic() + TOLD_SECONDS
-        while viewer.poll() is None and time.monotonic() < end:
-            with contextlib.suppress(*REFUSALS):  # it is starting
-                viewer_client().connect(f"rerun+http://{host}:{port}/proxy").open(address)
-                break
-            time.sleep(0.1)
+        with contextlib.suppress(CdmisfaError):
+            until(open_it, TOLD_SECONDS, "the viewer did not start", viewer)
         viewer.wait()
 
     threading.Thread(target=tell, daemon=True).start()
+
+
+def until(
+    question: Callable[[], Any], seconds: float, what: str, process: subprocess.Popen[bytes]
+) -> Any:
+    """Ask until there is an answer: what is starting, or not painted yet, raises or has none.
+
+    Args:
+        question: gives the answer.
+        seconds: longest wait.
+        what: did not happen, where there is none in time.
+        process: that is asked.
+
+    Returns:
+        The answer; None where the process has ended.
+
+    Raises:
+        CdmisfaError: there was none in time.
+    """
+    end, refusal = time.monotonic() + seconds, ""
+    while time.monotonic() < end:
+        if process.poll() is not None:
+            return None
+        try:
+            if answer := question():
+                return answer
+        except REFUSALS as error:
+            refusal = f": {error}".splitlines()[0]
+        time.sleep(0.02)
+    raise CdmisfaError(f"{what} within {seconds:.0f} s{refusal}")
 
 
 def private_host() -> str:

@@ -37,8 +37,8 @@ from cdmisfa.experiments.store import DONE, ROWS
 from recorder.images.decoding import MessageKind
 from recorder.images.messages import image_decoder
 from recorder.images.videos import VideoPackets
-from recorder.log.begun import read_recording
-from recorder.log.folder import RECORDING
+from recorder.log.files import RECORDING
+from recorder.log.manifest import read_start
 from recorder.mcap.records import MalformedRecord
 from replay.camera_logs.opening import open_images
 from replay.export.lerobot import write_lerobot
@@ -380,7 +380,7 @@ DECODERS: Mapping[str, Decoder] = {
         _run_json, lambda: [b'{"seed": 1, "result": {"signals_sha256": "0"}}'], RUN_JSON, text=True
     ),
     "recording.json": Decoder(
-        lambda p: read_recording(p.parent),
+        lambda p: read_start(p.parent),
         lambda: [b'{"frames": {"a": 9}, "split": {"a": "5s"}, "scene": "icub", "seed": 1}'],
         RECORDING,
         text=True,

@@ -24,7 +24,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
-from recorder.log.viewfacts import Identity
+from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 
 FRAMES = 20
@@ -115,11 +115,11 @@ def frames_of(t: int) -> bytes:
 def _recording(folder: Path, compression: str) -> bytes:
     spec = SourceSpec(("left",), SHAPE, "uint8", TRUTH, 50.0, 10**9)
     settings = RecordConfig(compression=compression, chunk_size=1024)  # type: ignore[arg-type]
-    log = ViewLog(folder, "left", Identity("fuzz", 0, spec, {}), settings)
+    log = ViewLog(folder, "left", RecordingSpec("fuzz", 0, spec, {}), settings)
     pixels = np.frombuffer(b"".join(map(frames_of, range(FRAMES))), np.uint8)
     truth = np.arange(FRAMES * 2, dtype=np.float64).reshape(FRAMES, 2)
     log.write(Block(0, 0, pixels.reshape(FRAMES, *SHAPE), truth))
-    log.file.finish()
+    log.finish()
     return log.file.path.read_bytes()
 
 
@@ -187,11 +187,10 @@ def _chunk_parts(content: bytes) -> tuple[bytes, int, str, bytes]:
 
 
 def _inner(content: bytes) -> list[Record]:
-    from recorder.mcap.compression import Decompressor
+    from recorder.mcap.chunks import decompressed
 
     _, size, name, stored = _chunk_parts(content)
-    records = np.empty(size, np.uint8)
-    Decompressor().decompress(memoryview(stored), name, records)
+    records = decompressed(np.frombuffer(stored, np.uint8), name, size)
     return _records(records.tobytes(), 0, size)
 
 

@@ -22,7 +22,6 @@ from recorder.mcap.records import MAX_CHUNK
 from replay.integrity.info import describe
 from replay.integrity.recover import recover_log
 from replay.integrity.verify import check_log
-from replay.recordings.channel_rows import own_messages
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 
@@ -161,14 +160,14 @@ def _same_slowly(path: Path, blocks: list[Block], *, salvage: bool) -> None:
 def tabled_rows(view: ViewFile, start: int, frames: np.ndarray, truth: np.ndarray) -> None:
     """As `ViewFile.take`, by the tables of chunks alone and with nothing in C."""
     outs = (frames.reshape(len(frames), -1).view(np.uint8), truth.view(np.uint8))
-    channels = zip(view._channels, view._layouts, outs, strict=False)
-    for which, (rows, layout, out) in enumerate(channels):
-        for piece in rows.pieces(start, len(out), which):
-            own = own_messages(view.reader, piece.segment, rows.channel)
-            ends = layout.checked_ends(view.path, piece.segment, own)
-            ends = ends[piece.low : piece.low + piece.n]
-            places = ends[:, None, None] - layout.distances[:, None] + np.arange(layout.width)
-            out[piece.at : piece.at + piece.n] = own.data[places].reshape(len(ends), -1)
+    for rows, out in zip(view._channels, outs, strict=False):
+        at = 0
+        for number, low, n in rows.pieces(start, len(out)):
+            own, layout = rows._table(number), rows.layout
+            ends = (own.at + own.size)[low : low + n, None, None]
+            places = ends - layout.distances[:, None] + np.arange(layout.width)
+            out[at : at + n] = own.data[places].reshape(n, -1)
+            at += n
 
 
 def _recover(path: Path) -> None:

@@ -29,7 +29,7 @@ from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals, SignalsHash
 from cdmisfa.experiments.run_folder import RunExhaustedError, RunResult
 from cdmisfa.experiments.session import run
-from recorder.log.split import Split
+from recorder.config import Split
 from recorder.recording import record
 from recorder.world.oscillatory import OscillatoryConfig
 from recorder.world.scenes import open_scene

@@ -28,7 +28,7 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
 
     def tweak() -> None:
         from cdmisfa.experiments import session
-        from recorder.log.viewlog import ViewParts
+        from recorder.log.viewlog import ViewLog
         from replay.runs.writer import RunWriter
 
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -46,7 +46,7 @@ def witnessing(path: Path, pause: float) -> Callable[[], None]:
 
             setattr(kind, name, noted)
 
-        after(ViewParts, "write", lambda log, block: (log._view, log.t))
+        after(ViewLog, "write", lambda log, block: (log._view, log.t))
         after(RunWriter, "block", lambda log, block, signals, learner: ("run", learner.iteration))
         kept = session.Keyframes
         session.Keyframes = lambda *given: kept(*given[:-1], KEYFRAMES)  # type: ignore

@@ -8,10 +8,10 @@ from cdmisfa.core.config import (
     MAX_COMPONENTS,
     MAX_TAU,
     convert_fields,
+    in_range,
     one_of,
     outputs_within_components,
     positive,
-    within,
 )
 
 ATTENTIONS = ("progress", "random", "robin", "novel", "sticky", "gamma", "ucb")
@@ -51,8 +51,8 @@ class ProgressConfig:
         one_of(self, "learner", ATTENTIONS, "attention")
         positive(self, "learner", "components", "outputs", "visit", "test_frames")
         positive(self, "learner", "window", "settled", "agreement", "looks")
-        within(self, "learner", 0.0, 1.0, "explore", "slow", "even")
-        within(self, "learner", 0.0, float(2**62), "watch")
-        within(self, "learner", 1, MAX_COMPONENTS, "components")
-        within(self, "learner", 3, MAX_TAU, "tau")
+        in_range(self, "learner", 0.0, 1.0, "explore", "slow", "even")
+        in_range(self, "learner", 0.0, float(2**62), "watch")
+        in_range(self, "learner", 1, MAX_COMPONENTS, "components")
+        in_range(self, "learner", 3, MAX_TAU, "tau")
         outputs_within_components(self, "learner")

@@ -38,7 +38,7 @@ KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
-@uploads.out("Folder of the run, or s3://...; without it nothing is written.")
+@uploads.out_option("Folder of the run, or s3://...; without it nothing is written.")
 @options.seed()
 @options.preset
 @options.settings()
@@ -201,7 +201,7 @@ def opened_live(
     """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
     from cdmisfa.experiments.sources import open_cameras_now
     from recorder.live import RecordedWhileWatched
-    from recorder.log.folder import refuse_existing
+    from recorder.log.files import refuse_existing
 
     if any(told[name] for name in ("resume", "loop", "salvage", "follow", "dry_run")):
         raise UsageError(

@@ -247,7 +247,7 @@ def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> Non
     help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
     "file's name ends in.",
 )
-@uploads.out("The file to write, for a recording the folder, or s3://...", required=True)
+@uploads.out_option("The file to write, for a recording the folder, or s3://...", required=True)
 @flag("--lossless", "Keep every value of images in a video.")
 @options.look_options
 @options.server_limits

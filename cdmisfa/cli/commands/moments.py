@@ -84,7 +84,7 @@ def _save_unfinished(learner: Any, path: Path, *, force: bool) -> None:
     """Write what a learner is learning as a file of one module."""
     import dataclasses
 
-    from recorder.log.whole import refuse_taken
+    from recorder.log.files import refuse_taken
     from replay.runs.modules import save_modules
 
     module = getattr(learner, "unfinished", None)

@@ -30,11 +30,11 @@ from cdmisfa.core.errors import UsageError
 if TYPE_CHECKING:
     from recorder.cameras.options import LiveOptions
     from recorder.images.options import ImageOptions
-    from recorder.log.begun import Begun
+    from recorder.log.manifest import RecordingStart
     from recorder.recording import ViewRecording
     from replay.camera_logs.options import CameraOptions
 
-CONVERTED = ("foreign",)
+CONVERTED = "foreign"
 """What a recording names as its source where it was converted from camera logs."""
 
 LIVE = ("cameras", "gym")
@@ -43,7 +43,7 @@ LIVE = ("cameras", "gym")
 
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
 @click.argument("source", nargs=-1)
-@uploads.out("Folder of the recording, or s3://...")
+@uploads.out_option("Folder of the recording, or s3://...")
 @number(
     "--frames",
     "Frames of each view; by default 1000, with --resume as many as first asked for, of cameras "
@@ -100,7 +100,7 @@ def record_command(
     """
     from cdmisfa.experiments.sources import configure, is_scene
     from recorder.cameras.words import is_live
-    from recorder.log.begun import Begun
+    from recorder.log.manifest import RecordingStart
     from recorder.recording import recorded, save_picture
     from recorder.world.scenes import SCENES
 
@@ -117,8 +117,8 @@ def record_command(
         return
     _refuse_logs(source)
     resumed = out if writing["resume"] else None
-    begun = Begun() if resumed is None else _begun(resumed)
-    named = "".join(source or begun.source)
+    start = RecordingStart() if resumed is None else _start(resumed)
+    named = "".join(source) or start.scene
     is_scene([named], images)  # which refuses options of cameras
     given_seed = ctx.get_parameter_source("seed") is not ParameterSource.DEFAULT
     asked = named or given_seed or writing["frames"] or writing["split"]
@@ -129,7 +129,7 @@ def record_command(
     if not named:
         where = "" if resumed is None else f"{resumed} does not say of what it is: "
         raise click.UsageError(f"{where}name the SCENE, {' or '.join(SCENES)}")
-    seed = seed if given_seed else begun.options.get("seed", seed)
+    seed = seed if given_seed or start.seed is None else start.seed
     configuration = configure(named, preset, settings, seed)
     if scene_picture is not None:
         save_picture(named, configuration.scene, scene_picture, force=writing["force"])
@@ -149,20 +149,20 @@ def _folder(out: Path | None) -> Path:
     return out
 
 
-def _begun(folder: Path) -> Begun:
-    """How a recording was begun that is to be resumed."""
-    from recorder.log.begun import read_recording
+def _start(folder: Path) -> RecordingStart:
+    """How a recording was started that is to be resumed."""
+    from recorder.log.manifest import read_start
 
-    begun = read_recording(folder)
-    if begun.source and begun.source[0] in LIVE:
+    start = read_start(folder)
+    if start.scene in LIVE:
         raise UsageError(
             f"{folder} is of live streams, which cannot go back: what is recorded can be read, "
             "record the rest into another folder"
         )
-    if begun.source == CONVERTED:
+    if start.scene == CONVERTED:
         command = f"cdmisfa convert SOURCE -o {shlex.quote(str(folder))} --resume"
         raise UsageError(f"{folder} is an unfinished conversion: resume it with {command}")
-    return begun
+    return start
 
 
 def _refuse_logs(words: tuple[str, ...]) -> None:
@@ -189,7 +189,7 @@ def _record_scene(
     **how: Any,
 ) -> list[ViewRecording]:
     """Record a scene, or the rest of it."""
-    from recorder.log.split import Split
+    from recorder.config import Split
     from recorder.recording import DEFAULT_FRAMES, record_scene
 
     with recording(ctx, out, resume=resume, notice="") as (report, stop):
@@ -225,9 +225,9 @@ def record_streams(
 ) -> None:
     """Record live streams until there are so many frames, they end, or Ctrl-C."""
     from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.config import Split
     from recorder.live import RecordedWhileWatched, record_watched
-    from recorder.log.folder import refuse_existing
-    from recorder.log.split import Split
+    from recorder.log.files import refuse_existing
     from recorder.recording import DEFAULT_FRAMES
 
     refuse_existing(out, force=force, goes_on=False)
@@ -263,7 +263,7 @@ def record_streams(
 
 @grouped("convert", common=("out", "topics", "size", "rate", "align", "resume"))
 @click.argument("source", nargs=-1, required=True)
-@uploads.out("Folder of the recording, or s3://...; --dry-run needs none.")
+@uploads.out_option("Folder of the recording, or s3://...; --dry-run needs none.")
 @options.log_options
 @options.dry_run
 @options.live_options
@@ -297,7 +297,7 @@ def convert_command(
     """
     from cdmisfa.experiments.convert import convert
     from recorder.cameras.words import is_live
-    from recorder.log.folder import refuse_existing
+    from recorder.log.files import refuse_existing
     from replay.inputs import open_cameras, places, refuse_what_is_no_log
 
     out = Path("REC") if out is None and dry_run else _folder(out)

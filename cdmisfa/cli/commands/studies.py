@@ -208,20 +208,17 @@ def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
 
     report = demo(out or Path(), stage=_stage, **how)
     if as_json:
-        print_json(report.as_json())
+        print_json(report)
         return
-    print_table(
-        ("module", "view", "policy", "iteration", "follows", "correlation"),
-        [
-            (m.module, m.view, " ".join(m.policy), m.iteration, m.follows, f"{m.correlation:.3f}")
-            for m in report.modules
-        ],
-    )
+    head = ("module", "view", "policy", "iteration", "follows", "correlation")
+    told = {"policy": " ".join, "correlation": "{:.3f}".format}
+    rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
+    print_table(head, rows)
     click.echo()
-    for figure in report.figures:
+    for figure in report["figures"]:
         if figure.suffix == ".png":
             click.echo(f"figure     {figure}")
-    click.echo(f"look at it {quoted(sys.argv[0])} view {quoted(report.run)}")
+    click.echo(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
 
 
 @contextmanager

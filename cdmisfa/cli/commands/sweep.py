@@ -24,7 +24,7 @@ MOST_SEEDS = 1_000_000
 
 @grouped("sweep", common=("out", "grid", "seeds", "settings", "max_iterations", "jobs"))
 @click.argument("source", nargs=-1, required=True)
-@uploads.out(
+@uploads.out_option(
     "Folder of the sweep, or s3://...; what is finished in it is not computed again.",
     required=True,
     goes_on=True,

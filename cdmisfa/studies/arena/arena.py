@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from cdmisfa.agents.progress.config import ATTENTIONS
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.registry import Registry
@@ -122,8 +122,16 @@ def plan_arena(
             config = configure(preset, settings=(*CONTESTANTS[learner], *settings)).learner
             point = {"set": name, "learner": learner, **more}
             for seed in each:
-                number = identity(shown, as_table(config), seed, version)
-                trials.append(ArenaTrial(number, point, seed, entry, config, library, version))
+                trial = ArenaTrial(
+                    id=identity(shown, section_table(config), seed, version),
+                    point=point,
+                    seed=seed,
+                    code=version,
+                    streams=entry,
+                    learner=config,
+                    library=library,
+                )
+                trials.append(trial)
     return trials
 
 

@@ -27,12 +27,12 @@ from cdmisfa.core.blocks import (
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.modules import Module
-from cdmisfa.core.untrusted.regular import read_json
+from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from cdmisfa.studies.arena.pictures import Footage
 from cdmisfa.studies.arena.streams import CHANGE, STREAMS, Showing, make_footage, parse
-from recorder.log.whole import whole
+from recorder.log.files import atomic_write
 from replay.storage.arrays import read_arrays
 
 RECIPE: Final = 2
@@ -85,7 +85,7 @@ class Library:
         path = self._reference(name, seed, components, expansion)
         if parse(name)[0].learnable and not path.is_file():
             arrays = refer(self.stream(name, seed), components, expansion)
-            with whole(path, sync=False) as partial, open(partial, "wb") as file:
+            with atomic_write(path, sync=False) as partial, open(partial, "wb") as file:
                 np.savez(file, **arrays)
 
     def stream(self, name: str, seed: int) -> Footage:
@@ -130,7 +130,7 @@ class Library:
             self._make(showing.kind, seed)
             plain = self.stream(showing.kind, seed)
         made = make_footage(name, seed, plain)
-        with whole(self._folder(name, seed)) as partial:
+        with atomic_write(self._folder(name, seed)) as partial:
             partial.mkdir(parents=True)
             np.save(partial / "frames.npy", made.frames)
             np.save(partial / "state.npy", made.state)

@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from cdmisfa.core.modules import Module
-from cdmisfa.experiments.statistics import Summary, summary, wilson
+from cdmisfa.experiments.statistics import MeanSd, summary, wilson
 
 Settings = Mapping[str, Any]
 Output = tuple[dict[str, Any], Mapping[str, NDArray[Any]]]
@@ -73,7 +73,7 @@ class Findings:
         self,
         quantity: str,
         paper: str,
-        found: Summary,
+        found: MeanSd,
         interval: tuple[float, float] | None = None,
         *,
         digits: int = 3,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cdmisfa.experiments.statistics import Midpoint, Summary, logistic_midpoint
+from cdmisfa.experiments.statistics import MeanSd, Midpoint, logistic_midpoint
 from cdmisfa.experiments.trial import Swap, run_trial
 from cdmisfa.studies import pages
 from cdmisfa.studies.paper import panels
@@ -175,10 +175,10 @@ def _add_lines(
     at = f"at {key} = {value:g}"
     mean, other = map(_within_changes, points)
     interval, of_other = ((point.low, point.high) for point in points)
-    ours = Summary(mean, math.nan, points[0].n)
+    ours = MeanSd(mean, math.nan, points[0].n)
     others = {OTHER: {"mean": other, "interval": of_other}}
     found.line(f"epsilon^d {at}", f"{COLUMNS[key][value]:g}", ours, interval, others=others)
-    share = Summary(neither, math.nan, len(group))
+    share = MeanSd(neither, math.nan, len(group))
     found.line(f"share of trials in neither optimum {at}", told, share)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from cdmisfa.core.config import positive, within
+from cdmisfa.core.config import in_range, positive
 from cdmisfa.core.errors import UsageError
 from recorder.config import SceneConfig, check_view_names
 
@@ -52,9 +52,9 @@ class EyesConfig:
 
     def __post_init__(self) -> None:
         positive(self, "scene.eyes", "near", "far", "half_distance")
-        within(self, "scene.eyes", 1.0, 170.0, "vertical_fov")
-        within(self, "scene.eyes", -89.0, 89.0, "tilt")
-        within(self, "scene.eyes", 1, 4096, "width", "height")
+        in_range(self, "scene.eyes", 1.0, 170.0, "vertical_fov")
+        in_range(self, "scene.eyes", -89.0, 89.0, "tilt")
+        in_range(self, "scene.eyes", 1, 4096, "width", "height")
         if len(self.views) != len(self.yaw):
             raise UsageError(
                 f"scene.eyes.yaw has {len(self.yaw)} angles for the {len(self.views)} views of "
@@ -79,7 +79,7 @@ class BoxConfig:
 
     def __post_init__(self) -> None:
         positive(self, "scene.object1", "half_size", "toggle_every")
-        within(self, "scene.object1", 0.0, 1.0, "grey")
+        in_range(self, "scene.object1", 0.0, 1.0, "grey")
         _range("scene.object1.x", self.x)
 
 
@@ -95,7 +95,7 @@ class CylinderConfig:
 
     def __post_init__(self) -> None:
         positive(self, "scene.object2", "radius", "height")
-        within(self, "scene.object2", 0.0, 1.0, "grey")
+        in_range(self, "scene.object2", 0.0, 1.0, "grey")
         _range("scene.object2.x", self.x)
         _range("scene.object2.y", self.y)
 
@@ -113,8 +113,8 @@ class SphereConfig:
 
     def __post_init__(self) -> None:
         positive(self, "scene.object3", "radius")
-        within(self, "scene.object3", 0.0, 1.0, "grey")
-        within(self, "scene.object3", 0.0, 1e3, "step_x", "step_y")
+        in_range(self, "scene.object3", 0.0, 1.0, "grey")
+        in_range(self, "scene.object3", 0.0, 1e3, "step_x", "step_y")
         _range("scene.object3.x", self.x)
         _range("scene.object3.y", self.y)
 

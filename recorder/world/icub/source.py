@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
 from cdmisfa.core.blocks import Block, HeadPose, SeekableSource, SourceSpec, check_request, freeze
-from cdmisfa.core.config import as_table
+from cdmisfa.core.config import section_table
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig, TableConfig
 from recorder.world.icub.motions import Motions
@@ -181,7 +181,7 @@ class IcubSource(SeekableSource):
 
     def describe(self) -> Mapping[str, Any]:
         """The scene's seed and everything it was built from."""
-        return {"kind": "icub", "seed": self._seed, "scene": as_table(self._scene)}
+        return {"kind": "icub", "seed": self._seed, "scene": section_table(self._scene)}
 
     def close(self) -> None:
         """End the simulator."""

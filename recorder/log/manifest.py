@@ -1,4 +1,7 @@
-"""What the file of a view states about itself: written and read by one class, `ViewFacts`."""
+"""What a recording states: of itself in the file of each view, and in RECORDING how it was started.
+
+RECORDING holds the command that started a recording, stored for --resume.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,21 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.blocks import SourceSpec
-from cdmisfa.core.clock import RECORDED_FPS, frames_of, times_of
+from cdmisfa.core.clock import RECORDED_FPS, nearest_frames, times_of
 from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.core.untrusted import MAX_JSON, parse_json, read_regular
+from recorder.log.files import RECORDING, atomic_write, to_disk
 from recorder.log.messages import SCHEMA_VERSION
 
 MAX_FRAME_VALUES: Final = 64 * 1024 * 1024
@@ -38,7 +44,65 @@ _AT_NEED = ("gaps", "stream_count")
 
 
 @dataclass(frozen=True, slots=True)
-class ViewFacts:
+class RecordingStart:
+    """How a recording was started, as far as it says so.
+
+    Attributes:
+        scene: name of what is recorded; "" where that is not known.
+        seed: of the scene's motions.
+        frames: how many each unfinished view shall have.
+        split: where the parts of each unfinished view end, as `Split.parse` reads it.
+    """
+
+    scene: str = ""
+    seed: int | None = None
+    frames: Mapping[str, int] = field(default_factory=dict)
+    split: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_start(folder: Path) -> RecordingStart:
+    """How an unfinished recording was started, as far as its folder readably says so.
+
+    Raises:
+        UsageError: its file is larger than any that says so.
+        LogDamagedError: the disk does not give it.
+    """
+    path = folder / RECORDING
+    data = read_regular(path, MAX_JSON) if path.is_file() else b""
+    try:
+        values = parse_json(data)
+        frames = {str(v): n for v, n in values["frames"].items() if type(n) is int and n > 0}
+        split = {v: limit for v, limit in values.get("split", {}).items() if isinstance(limit, str)}
+        scene, seed = values.get("scene"), values.get("seed")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return RecordingStart()
+    known = type(seed) is int and 0 <= seed < 2**63
+    scene = scene if isinstance(scene, str) else ""
+    return RecordingStart(scene, seed if known else None, frames, split)
+
+
+def store_start(folder: Path, views: Sequence[str], start: RecordingStart | None = None) -> None:
+    """Store how some views are started, or that they are finished, beside what the others are.
+
+    Raises:
+        LogWriteError: the disk does not take it.
+    """
+    known = read_start(folder)
+    start = start or dataclasses.replace(known, frames={}, split={})
+    frames = {v: n for v, n in known.frames.items() if v not in views} | dict(start.frames)
+    split = {v: limit for v, limit in known.split.items() if v not in views} | dict(start.split)
+    path = folder / RECORDING
+    if not frames:
+        path.unlink(missing_ok=True)
+        to_disk(folder)
+        return
+    values = {"frames": frames, "split": split, "scene": start.scene, "seed": start.seed}
+    with atomic_write(path) as partial:
+        partial.write_text(json.dumps(values) + "\n", "utf-8")
+
+
+@dataclass(frozen=True, slots=True)
+class ViewMetadata:
     """What a view's file states about itself; each is a key of its metadata record.
 
     Attributes:
@@ -90,13 +154,10 @@ class ViewFacts:
         return times_of(frames, self.fps, self.start_ns).astype(np.uint64)
 
     def frames_at(self, times: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """Frames at log times, (n,) nanoseconds.
+        """Frames at log times, (n,) nanoseconds, or near those that are not exactly a frame's."""
+        return np.clip(nearest_frames(times, self.fps, self.start_ns), -1, MAX_FRAMES)
 
-        A time that is not exactly a frame's gets a frame near it.
-        """
-        return np.clip(frames_of(times, self.fps, self.start_ns), -1, MAX_FRAMES)
-
-    def as_metadata(self) -> dict[str, str]:
+    def record(self) -> dict[str, str]:
         """The file's metadata record."""
         others = ["versions", "values", *(n for n in _AT_NEED if not getattr(self, n))]
         names = [f.name for f in dataclasses.fields(self) if f.name not in others]
@@ -104,58 +165,54 @@ class ViewFacts:
         return {"schema": str(SCHEMA_VERSION), **stated, **self.versions}
 
     @classmethod
-    def from_metadata(cls, path: object, values: Mapping[str, str]) -> ViewFacts:
+    def parse(cls, path: object, values: Mapping[str, str]) -> ViewMetadata:
         """Check a file's metadata record.
 
         Raises:
             LogDamagedError: a key that reading depends on is missing or makes no sense.
         """
 
-        def refuse(key: str, remedy: str) -> LogDamagedError:
-            value = values.get(key)
-            said = "misses" if value is None else f"says {value[:60]!r} for"
-            return LogDamagedError(f"{path}: its recording metadata {said} {key}: {remedy}")
+        def demand(right: bool, key: str, remedy: str) -> None:
+            if not right:
+                value = values.get(key)
+                said = "misses" if value is None else f"says {value[:60]!r} for"
+                raise LogDamagedError(f"{path}: its recording metadata {said} {key}: {remedy}")
 
-        def number(key: str, low: int, high: int, default: str | None = None) -> int:
+        def number(key: str, low: int, high: int, default: str = "") -> int:
             text = values.get(key, default)
-            if text is None or not text.isascii() or not text.isdigit() or len(text) > 19:
-                raise refuse(key, "record it again")
-            if not low <= int(text) <= high:
-                raise refuse(key, f"it must be in [{low}, {high}]")
+            demand(_is_number(text, 19), key, "record it again")
+            demand(low <= int(text) <= high, key, f"it must be in [{low}, {high}]")
             return int(text)
 
-        if values.get("schema") != str(SCHEMA_VERSION):
-            raise refuse("schema", f"this version reads schema {SCHEMA_VERSION}")
+        version = f"this version reads schema {SCHEMA_VERSION}"
+        demand(values.get("schema") == str(SCHEMA_VERSION), "schema", version)
         view = values.get("view", "")
-        if not view:
-            raise refuse("view", "record it again")
-        shape = values.get("frame_shape", "").split("x")
-        if not 1 <= len(shape) <= 2 or not all(
-            s.isascii() and s.isdigit() and len(s) < 10 for s in shape
-        ):
-            raise refuse("frame_shape", "it must be as 48x128 or 2")
-        frame_shape = tuple(int(s) for s in shape)
-        dtype = values.get("dtype", "")
-        if (dtype, len(frame_shape)) not in (("uint8", 2), ("float64", 1)):
-            raise refuse("dtype", "it must be uint8 for images, float64 for vectors")
-        if not 0 < math.prod(frame_shape) <= MAX_FRAME_VALUES:
-            raise refuse("frame_shape", "no frame has that size")
+        demand(view != "", "view", "record it again")
+        sides = values.get("frame_shape", "").split("x")
+        whole = len(sides) <= 2 and all(_is_number(side, 9) for side in sides)
+        demand(whole, "frame_shape", "it must be as 48x128 or 2")
+        shape, dtype = tuple(map(int, sides)), values.get("dtype", "")
+        kinds = (("uint8", 2), ("float64", 1))
+        remedy = "it must be uint8 for images, float64 for vectors"
+        demand((dtype, len(shape)) in kinds, "dtype", remedy)
+        most = MAX_FRAME_VALUES
+        demand(0 < math.prod(shape) <= most, "frame_shape", "no frame has that size")
         try:
             fps = float(values.get("fps", ""))
         except ValueError:
             fps = math.nan
         slowest, fastest = RECORDED_FPS
-        if not slowest <= fps <= fastest:
-            raise refuse("fps", f"it must be in [{slowest:g}, {fastest:.0f}]")
+        remedy = f"it must be in [{slowest:g}, {fastest:.0f}]"
+        demand(slowest <= fps <= fastest, "fps", remedy)
         truth = _names(values.get("truth", ""))
-        if len(set(truth)) != len(truth) or not all(n.isidentifier() for n in truth):
-            raise refuse("truth", "they must be different names")
+        different = len(set(truth)) == len(truth) and all(n.isidentifier() for n in truth)
+        demand(different, "truth", "they must be different names")
         return cls(
             scene=values.get("scene", ""),
             view=view,
             stream_index=number("stream_index", 0, MAX_STREAMS),
             streams=_names(values.get("streams", "")),
-            frame_shape=frame_shape,
+            frame_shape=shape,
             dtype=dtype,
             truth=truth,
             fps=fps,
@@ -171,8 +228,8 @@ class ViewFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
-    """What makes two recordings the same one.
+class RecordingSpec:
+    """What is recorded: two recordings of which this is the same are one.
 
     Attributes:
         kind: name of what is recorded: a scene's, or the kind of a source.
@@ -194,10 +251,10 @@ class Identity:
         """The configuration as the attachment holds it."""
         return (json.dumps(self.config, indent=2, sort_keys=True) + "\n").encode()
 
-    def facts(self, view: str, first_frame: int = 0) -> ViewFacts:
+    def metadata(self, view: str, first_frame: int = 0) -> ViewMetadata:
         """What the file of a view that begins with a frame states."""
         spec, named = self.spec, len(self.spec.streams) <= MOST_NAMED
-        return ViewFacts(
+        return ViewMetadata(
             scene=self.kind,
             view=view,
             stream_index=spec.streams.index(view),
@@ -226,7 +283,7 @@ def version(package: str) -> str:
 
 
 def _text(value: Any) -> str:
-    """A fact as a metadata record has it."""
+    """A value as a metadata record has it."""
     if isinstance(value, tuple):
         between = "," if not value or isinstance(value[0], str) else "x"
         return between.join(map(str, value))
@@ -235,3 +292,8 @@ def _text(value: Any) -> str:
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(text.split(",")) if text else ()
+
+
+def _is_number(text: str, most: int) -> bool:
+    """Whether a text is a whole number of at most so many digits."""
+    return text.isascii() and text.isdigit() and len(text) <= most

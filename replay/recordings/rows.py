@@ -1,0 +1,271 @@
+"""The messages of one channel, numbered through all chunks of a file."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.arrays import ByteArray
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.kernels.frames import gather
+from cdmisfa.kernels.frames import layout as kernel_layout
+from recorder.log.manifest import ViewMetadata
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import Channel, MalformedRecord, Segment
+from recorder.mcap.tables import MessageTable
+
+
+class Run(NamedTuple):
+    """The frames [start, stop), as the messages of a channel from `row` on."""
+
+    start: int
+    stop: int
+    row: int
+
+
+class RowLayout:
+    """Where the messages of a channel hold their values, counted from a message's end.
+
+    Args:
+        what: a message, as an error names it.
+        least: fewest bytes of a message.
+        marks: by distance bytes that are the same in every message.
+        distances: (R,) of each value.
+        width: bytes of a value.
+    """
+
+    def __init__(
+        self, what: str, least: int, marks: dict[int, int], distances: list[int], width: int
+    ) -> None:
+        self.what, self.least = what, least
+        self.distances, self.width = np.array(distances, np.int64), width
+        places, values = list(marks), list(marks.values())
+        self._kernel = kernel_layout(least, places, values, distances, width)
+
+    def read(self, table: MessageTable, out: ByteArray | None) -> None:
+        """Check messages, and copy their values.
+
+        Args:
+            table: n messages.
+            out: (n, bytes of a message's values), written; None to check only.
+
+        Raises:
+            MalformedRecord: one is laid out otherwise.
+        """
+        if not gather(table.data, table.records, self._kernel, out):
+            wrong = "shorter than" if (table.size < self.least).any() else "laid out unlike"
+            raise MalformedRecord(f"{self.what} is {wrong} the others")
+
+
+class ChannelRows:
+    """The messages of one channel, numbered through all chunks of a file by their log time.
+
+    Args:
+        reader: the file.
+        channel: the channel.
+        facts: the clock of the recording.
+
+    Attributes:
+        runs: the frames that are there; one, except where gaps and damage are left out.
+        layout: where the messages hold their values, once a message is known.
+    """
+
+    def __init__(self, reader: LogReader, channel: Channel, facts: ViewMetadata) -> None:
+        self.channel = channel
+        self.runs: list[Run] = []
+        self.layout: RowLayout | None = None
+        self._reader = reader
+        self._facts = facts
+        self._may_lack = reader.salvage or facts.gaps
+        self._segments: list[Segment] = []
+        self._starts = [0]
+        self._seen: list[Segment] = []
+        self._unconfirmed: set[int] = set()
+        self._own: tuple[int, MessageTable] | None = None
+
+    def extend(self) -> None:
+        """Number the messages that are there now.
+
+        Raises:
+            LogDamagedError: a log time that is no frame's, a frame twice or out of order, and
+                without `salvage` a frame that is missing, unless the file says that it has gaps.
+        """
+        segments, seen = self._reader.segments, self._seen
+        if seen and seen[-1] is not segments[len(seen) - 1]:
+            self._forget(seen.pop())
+        new = segments[len(seen) :]
+        if self._reader.by_index and not self._may_lack:
+            # The log times of each chunk are compared with the summary's count when it is read.
+            for segment in new:
+                if self._take(segment):
+                    self._unconfirmed.add(len(self._segments) - 1)
+            first, count = self._facts.first_frame, self._starts[-1]
+            self.runs = [Run(first, first + count, 0)] if count else []
+            return
+        for segment in new:
+            self.add(segment)
+
+    def add(self, segment: Segment) -> None:
+        """Number the messages of the next chunk; raises as `extend`."""
+        if not self._take(segment):
+            return
+        number = len(self._segments) - 1
+        if not (self._reader.salvage and self._reader.table(segment) is None):
+            self._number(self._times(number), self._starts[number], self.runs)
+
+    def check_last(self, segment: Segment) -> None:
+        """Check how messages are laid out in the chunk that was added last, if it is whole.
+
+        Raises:
+            LogDamagedError: one is laid out otherwise than others.
+        """
+        if self._segments and self._segments[-1] is segment:
+            number = len(self._segments) - 1
+            if self._reader.table(segment) is not None:
+                self._check(number, self._table(number), None)
+
+    @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """The frames [start, stop) that there are messages of."""
+        return [(run.start, run.stop) for run in self.runs]
+
+    def payload(self, frame: int) -> bytes:
+        """The message of a frame."""
+        number, low, _ = next(self.pieces(frame, 1))
+        return self._table(number).payload(low)
+
+    def pieces(self, frame: int, count: int) -> Iterator[tuple[int, int, int]]:
+        """Where the messages of `count` frames of one run are, from a frame on.
+
+        Returns:
+            Of each chunk its number among those of the channel, the first message, and how many.
+        """
+        run = self.runs[bisect.bisect_right(self.runs, frame, key=lambda run: run.start) - 1]
+        row = run.row + frame - run.start
+        stop, number = row + count, bisect.bisect_right(self._starts, row) - 1
+        while row < stop:
+            start, end = self._starts[number], min(self._starts[number + 1], stop)
+            yield number, row - start, end - row
+            row, number = end, number + 1
+
+    def place(self, number: int) -> int:
+        """Where a chunk begins in the file."""
+        return self._segments[number].offset
+
+    def read(self, number: int, low: int, out: ByteArray) -> None:
+        """Copy the values of messages of a chunk from the `low`th on.
+
+        Args:
+            number: of the chunk among those of the channel.
+            low: the first message.
+            out: (n, bytes of a message's values), written.
+
+        Raises:
+            LogDamagedError: the chunk is damaged, or one is laid out otherwise than others.
+        """
+        table = self._table(number)
+        own = MessageTable(table.data, table.records[low : low + len(out)])
+        self._check(number, own, out)
+
+    def _check(self, number: int, table: MessageTable, out: ByteArray | None) -> None:
+        try:
+            if self.layout is not None:
+                self.layout.read(table, out)
+        except MalformedRecord as error:
+            where = f"{self._reader.path}: {self._segments[number].name}"
+            raise LogDamagedError(f"{where}: {error}") from None
+
+    def _take(self, segment: Segment) -> bool:
+        """Count the channel's messages in the next chunk of the file; whether it has any."""
+        self._seen.append(segment)
+        counts = segment.channel_counts()
+        if counts is None:
+            table = self._reader.table(segment)
+            count = 0 if table is None else int((table.channel == self.channel.id).sum())
+        else:
+            count = counts.get(self.channel.id, 0)
+        if count:
+            self._segments.append(segment)
+            self._starts.append(self._starts[-1] + count)
+        return count > 0
+
+    def _forget(self, segment: Segment) -> None:
+        """Forget the last chunk, to which its recorder has added."""
+        if self._segments and self._segments[-1] is segment:
+            self._segments.pop()
+            self._starts.pop()
+            stop = self._starts[-1]
+            runs = [run for run in self.runs if run.row < stop]
+            self.runs = [r._replace(stop=min(r.stop, r.start + stop - r.row)) for r in runs]
+            self._own = None
+
+    def _number(self, times: NDArray[np.uint64], row: int, found: list[Run]) -> None:
+        """Add the frames of messages from `row` on to the runs found."""
+        frames = self._facts.frames_at(times)
+        exact = self._facts.times(frames) == times
+        before = found[-1].stop if found else self._facts.first_frame
+        steps = np.diff(frames, prepend=before - 1)
+        wrong = np.flatnonzero(~exact | (steps < 1 if self._may_lack else steps != 1))
+        if len(wrong):
+            at = int(wrong[0])
+            raise LogDamagedError(
+                f"{self._reader.path}: {self.channel.topic}: after frame "
+                f"{int(frames[at]) - int(steps[at])} comes log time {times[at]} ns, frame "
+                f"{frames[at]}: frames are missing or doubled; {self._remedy()}"
+            )
+        edges = [0, *(np.flatnonzero(steps[1:] != 1) + 1).tolist(), len(frames)]
+        for low, high in itertools.pairwise(edges):
+            start, count = int(frames[low]), high - low
+            last = found[-1] if found else None
+            if last and last.stop == start and last.row + start - last.start == row + low:
+                found[-1] = last._replace(stop=start + count)
+            else:
+                found.append(Run(start, start + count, row + low))
+
+    def _remedy(self) -> str:
+        if self._reader.salvage:
+            return "save what can be read with cdmisfa recover, and learn from that"
+        return "run cdmisfa verify; cdmisfa learn --salvage leaves out what is missing"
+
+    def _times(self, number: int) -> NDArray[np.uint64]:
+        """Log times of the channel's messages in a chunk."""
+        segment = self._segments[number]
+        if not segment.indexes:
+            return self._table(number).log_time
+        try:
+            own = [p[:, 0] for c, p in self._reader.index(segment) if c == self.channel.id]
+        except MalformedRecord as error:
+            raise LogDamagedError(f"{self._reader.path}: {error}") from None
+        return np.concatenate(own)
+
+    def _table(self, number: int) -> MessageTable:
+        """The channel's messages in a chunk.
+
+        Raises:
+            LogDamagedError: the chunk is damaged, or does not hold what its index says.
+        """
+        if self._own is not None and self._own[0] == number:
+            return self._own[1]
+        self._own = None  # so that its memory is used again
+        reader, segment, channel = self._reader, self._segments[number], self.channel
+        table = reader.table(segment)
+        if table is None:
+            raise LogDamagedError(f"{reader.path}: {segment.name} is damaged")
+        own = table.select(table.channel == channel.id)
+        row, stop = self._starts[number : number + 2]
+        if len(own) != stop - row:
+            raise LogDamagedError(
+                f"{reader.path}: {segment.name} holds {len(own)} messages of {channel.topic!r}, "
+                f"its index says {stop - row}; run cdmisfa recover"
+            )
+        if number in self._unconfirmed:
+            first = self._facts.first_frame
+            self._number(own.log_time, row, [Run(first, first + row, 0)] if row else [])
+            self._unconfirmed.remove(number)
+        self._own = number, own
+        return own

@@ -1,0 +1,234 @@
+"""Chunks: decompressed, walked over and copied from, sound and broken."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from reference import frames as reference
+
+from cdmisfa.core.blocks import Block, SourceSpec
+from cdmisfa.core.errors import LogDamagedError
+from cdmisfa.kernels import frames as kernels
+from recorder.config import RecordConfig
+from recorder.log.manifest import RecordingSpec
+from recorder.log.viewlog import ViewLog
+from recorder.mcap.chunks import decompressed
+from recorder.mcap.reader import LogReader
+from recorder.mcap.records import MalformedRecord, Segment
+from recorder.recording import record_scene
+from replay.recordings.view_file import ViewFile
+from tools.fuzz.oracle import tabled_rows
+
+pytestmark = pytest.mark.usefixtures("both_modules")
+
+FRAMES = 200
+PICTURES = SourceSpec(("left",), (6, 8), "uint8", ("x", "y"), 50.0, 10**18)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same pictures with each compression."""
+    paths = {}
+    random = np.random.default_rng(7)
+    frames = random.integers(0, 256, (FRAMES, 6, 8), np.uint8)
+    block = Block(0, 0, frames, random.normal(size=(FRAMES, 2)))
+    for compression in ("zstd", "lz4", "none"):
+        folder = tmp_path_factory.mktemp(compression)
+        settings = RecordConfig(compression=compression)
+        log = ViewLog(folder, "left", RecordingSpec("icub", 3, PICTURES, {}), settings)
+        log.write(block)
+        log.finish()
+        paths[compression] = folder / "left.mcap"
+    return paths
+
+
+def plain(view: ViewFile, start: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    frames = np.empty((n, *view.facts.frame_shape), view.facts.dtype)
+    truth = np.empty((n, len(view.facts.truth)))
+    tabled_rows(view, start, frames, truth)
+    return frames, truth
+
+
+def fast(view: ViewFile, start: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    frames = np.zeros((n, *view.facts.frame_shape), view.facts.dtype)
+    truth = np.zeros((n, len(view.facts.truth)))
+    view.take(start, frames, truth)
+    return frames, truth
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_blocks_are_those_of_the_tables(pictures: dict[str, Path], compression: str) -> None:
+    view = ViewFile(pictures[compression])
+    for start, n in [(0, FRAMES), (0, 1), (49, 2), (150, 50), (13, 120), (0, 40), (199, 1)]:
+        for ours, theirs in zip(fast(view, start, n), plain(view, start, n), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    view.close()
+
+
+def test_vectors_are_those_of_the_tables(tmp_path: Path) -> None:
+    record_scene("oscillatory", tmp_path, frames=FRAMES)
+    for path in sorted(tmp_path.glob("*.mcap")):
+        view = ViewFile(path)
+        for ours, theirs in zip(fast(view, 3, 190), plain(view, 3, 190), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+        view.close()
+
+
+def chunk_of(messages: list[tuple[int, int, bytes]], between: bytes = b"") -> bytes:
+    head = struct.Struct("<BQHIQQ")
+    return between + b"".join(
+        head.pack(5, 22 + len(data), channel, i, time, time) + data + between
+        for i, (channel, time, data) in enumerate(messages)
+    )
+
+
+RECORDS = chunk_of([(i % 3, 100 + i, bytes(i % 40)) for i in range(60)], b"\3\2" + bytes(9))
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data())
+def test_a_broken_chunk_is_walked_over_as_far_as_it_is_sound(data: st.DataObject) -> None:
+    raw = bytearray(RECORDS[: data.draw(st.integers(0, len(RECORDS)))])
+    for _ in range(data.draw(st.integers(0, 3)) if raw else 0):
+        # Mostly where headers and lengths stand.
+        at = data.draw(st.integers(0, min(400, len(raw) - 1)))
+        raw[at] = data.draw(st.sampled_from([0, 1, 5, 7, 9, 16, 31, 128, 255]))
+    messages, others, place = kernels.walk_records(np.frombuffer(bytes(raw), np.uint8))
+    true = reference.walk_records(bytes(raw))
+    assert ([row[:6] for row in messages.tolist()], others.tolist(), place) == true
+
+
+def test_a_flipped_bit_is_found(pictures: dict[str, Path], tmp_path: Path) -> None:
+    with LogReader(pictures["none"]) as reader:
+        place = reader.segments[2].data_offset + 700
+    broken = bytearray(pictures["none"].read_bytes())
+    broken[place] ^= 1
+    path = tmp_path / "left.mcap"
+    path.write_bytes(broken)
+    with contextlib.closing(ViewFile(path, salvage=True)) as view:
+        assert view.ranges == [(0, 100), (150, 200)]
+    with contextlib.closing(ViewFile(path)) as view:
+        assert fast(view, 0, 100)[0].any()
+        with pytest.raises(LogDamagedError, match="damaged"):
+            fast(view, 99, 2)
+
+
+def parts_of(path: Path, number: int) -> tuple[Segment, bytearray]:
+    """A chunk as its file's summary names it, and the bytes of the file."""
+    with LogReader(path) as reader:
+        assert reader.by_index
+        return reader.segments[number], bytearray(path.read_bytes())
+
+
+@pytest.mark.parametrize("compression", ["zstd", "none"])
+def test_a_chunk_that_is_not_as_the_summary_says_is_refused(
+    pictures: dict[str, Path], tmp_path: Path, compression: str
+) -> None:
+    chunk, raw = parts_of(pictures[compression], 2)
+    path = tmp_path / "left.mcap"
+    for place in range(chunk.offset, chunk.data_offset):
+        raw[place] ^= 2
+        path.write_bytes(raw)
+        raw[place] ^= 2
+        with contextlib.closing(ViewFile(path)) as view:
+            assert fast(view, 0, 100)[0].any()
+            with pytest.raises(LogDamagedError, match=f"chunk at byte {chunk.offset} .*"):
+                fast(view, 99, 2)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_time_that_is_not_its_frames_is_refused_where_its_chunk_is_read(
+    pictures: dict[str, Path], tmp_path: Path, which: int
+) -> None:
+    """Even if its index and all checksums that are read agree."""
+    chunk, raw = parts_of(pictures["none"], 2)
+    pair = chunk.indexes[which].offset + 16 * 7
+    time, place = struct.unpack_from("<QQ", raw, pair)
+    later = struct.pack("<Q", time + 1)
+    message = chunk.data_offset + place + 15
+    assert raw[message : message + 8] == raw[pair : pair + 8]
+    raw[message : message + 8] = raw[pair : pair + 8] = later
+    data = raw[chunk.data_offset :][: chunk.stored]
+    raw[chunk.offset + 33 : chunk.offset + 37] = struct.pack("<I", zlib.crc32(data))
+    path = tmp_path / "left.mcap"
+    path.write_bytes(raw)
+    with contextlib.closing(ViewFile(path)) as view:
+        assert fast(view, 0, 100)[0].any()
+        for _ in range(2):
+            with pytest.raises(LogDamagedError, match=f"after frame 106 comes log time {time + 1}"):
+                fast(view, 99, 2)
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_values_are_copied_from_within_the_payloads_only(data: st.DataObject) -> None:
+    raw = data.draw(st.binary(max_size=60))
+    edge = st.sampled_from([-1, 0, 1, 2**62, -(2**63), 2**63 - 1])
+    place = st.integers(0, len(raw)) | edge
+    spans = data.draw(st.lists(st.tuples(place, place), max_size=3))
+    messages = np.zeros(len(spans), kernels.MESSAGE)
+    messages["at"], messages["size"] = [at for at, _ in spans], [size for _, size in spans]
+    distances, width = data.draw(st.lists(place, max_size=3)), data.draw(st.integers(0, 20))
+    marks = data.draw(st.dictionaries(place, st.integers(0, 1), max_size=2))
+    laid_out = data.draw(place), list(marks), list(marks.values()), distances, width
+    out = np.zeros((len(spans), len(distances) * width), np.uint8)
+    taken = kernels.gather(np.frombuffer(raw, np.uint8), messages, kernels.layout(*laid_out), out)
+    true = reference.gather(raw, spans, *laid_out)
+    assert taken == (true is not None)
+    assert not taken or out.tobytes() == true
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_chunks_that_are_held_stay_as_they_are_while_others_are_decoded(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    path = tmp_path / "log.mcap"
+    random = np.random.default_rng(1)
+    payloads = [random.integers(0, 9, 3000, np.uint8).tobytes() for _ in range(60)]
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=8192, compression=compression)
+        writer.start()
+        channel = writer.register_channel("a", "b", 0)
+        for i, payload in enumerate(payloads):
+            writer.add_message(channel, i, payload, i)
+        writer.finish()
+    with LogReader(path) as reader:
+        held = [table for _, table in reader.tables()]
+        assert len(held) == 20
+        found = [table.payload(row) for table in held for row in range(len(table))]
+        assert found == payloads
+        for number in (7, 3, 4, 5, 6, 19, 0, 1, 2):
+            table = reader.table(reader.segments[number])
+            assert table is not None
+            assert [table.payload(row) for row in range(3)] == payloads[3 * number : 3 * number + 3]
+
+
+@pytest.mark.parametrize("size", [1, 65_535, 65_536, 200_000])
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("name", ["lz4", "zstd"])
+def test_a_chunk_that_holds_more_or_less_than_it_states_is_refused(
+    size: int, stated: bool, name: str
+) -> None:
+    data = np.random.default_rng(size).integers(0, 9, size, np.uint8).tobytes()
+    if name == "lz4":
+        raw = lz4.frame.compress(data, store_size=stated)
+    else:
+        raw = zstandard.ZstdCompressor(write_content_size=stated).compress(data)
+    stored = np.frombuffer(raw, np.uint8)
+    assert decompressed(stored, name, size).tobytes() == data
+    for wrong in (size - 1, size + 1):
+        with pytest.raises(MalformedRecord, match=f"it states {wrong} bytes decompressed"):
+            decompressed(stored, name, wrong)
+    with pytest.raises(MalformedRecord, match=r"cut short|decompressed and holds"):
+        decompressed(stored[:-1], name, size)
+    assert data.startswith(decompressed(stored[: size // 2 + 20], name, size, cut=True).tobytes())
