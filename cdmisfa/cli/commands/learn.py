@@ -13,7 +13,6 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import live_source
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.making import grouped, option
 from cdmisfa.cli.printing import (
@@ -23,6 +22,8 @@ from cdmisfa.cli.printing import (
     quoted,
     say_about,
     say_changes,
+    say_counts,
+    tell,
 )
 from cdmisfa.cli.progress import Bar, bar
 from cdmisfa.core.errors import UsageError
@@ -215,24 +216,43 @@ def opened_logs(
             say_changes(frames)
 
 
+@contextlib.contextmanager
 def opened_live(
     told: Mapping[str, Any], source: tuple[str, ...], live: LiveOptions, cameras: CameraOptions
-) -> contextlib.AbstractContextManager[tuple[FrameSource, Configuration]]:
+) -> Iterator[tuple[FrameSource, Configuration]]:
     """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
+    from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.live import RecordedWhileWatched
+    from recorder.log.files import refuse_existing
+
     if any(told[name] for name in ("resume", "loop", "salvage", "follow", "dry_run")):
         raise UsageError(
             "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
             "and --dry-run, or learn from a recording of them"
         )
-    return live_source(
+    record_to = told["record_to"]
+    for folder in filter(None, (told["out"], record_to)):  # before the cameras are opened
+        refuse_existing(folder, force=told["force"], goes_on=False)
+    frames, configuration = open_cameras_now(
         source,
         replace(live, seed=told["seed"]),
-        cameras,
-        told["out"],
-        told["record_to"],
+        cameras=cameras,
+        preset=told["preset"],
         settings=settings_of(told),
-        **{name: told[name] for name in ("preset", "fsync_every", "force")},
+        say=tell,
     )
+    with contextlib.closing(frames):
+        try:
+            if record_to is None:
+                yield frames, configuration
+                return
+            how = {name: told[name] for name in ("fsync_every", "force")}
+            settings = configuration.record
+            with RecordedWhileWatched(frames, record_to, settings=settings, **how) as recorded:
+                yield recorded, configuration
+            tell(f"recording {record_to}")
+        finally:
+            say_counts(frames)
 
 
 def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:

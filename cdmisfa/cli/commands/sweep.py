@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
@@ -11,9 +11,6 @@ from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import grouped, option
 from cdmisfa.cli.printing import SCHEMA, print_json, print_table, quoted
 from cdmisfa.cli.progress import bar
-
-if TYPE_CHECKING:
-    from replay.camera_logs.options import CameraOptions
 
 MOST_SEEDS = 1_000_000
 
@@ -58,18 +55,8 @@ def sweep_command(
     out: Path,
     grid: tuple[str, ...],
     seeds: str,
-    preset: str | None,
-    settings: tuple[str, ...],
-    max_iterations: int | None,
-    max_modules: int | None,
-    loop: bool,
-    jobs: int,
-    engine: str,
-    scheduler: str | None,
-    keep_logs: bool,
-    retry_failed: bool,
     as_json: bool,
-    cameras: CameraOptions,
+    **told: Any,
 ) -> None:
     """Learn from a source many times, over a grid of settings and seeds.
 
@@ -84,24 +71,8 @@ def sweep_command(
             shown.update(finished, total, f"{failed} failed" if failed else "")
 
         try:
-            report = sweep(
-                source,
-                out,
-                grid=parse_grid(grid),
-                seeds=parse_seeds(seeds),
-                preset=preset,
-                settings=settings,
-                loop=loop,
-                cameras=cameras,
-                max_iterations=max_iterations,
-                max_modules=max_modules,
-                jobs=jobs,
-                engine=engine,
-                scheduler=scheduler,
-                keep_logs=keep_logs,
-                retry_failed=retry_failed,
-                progress=progress,
-            )
+            points, numbers = parse_grid(grid), parse_seeds(seeds)
+            report = sweep(source, out, grid=points, seeds=numbers, progress=progress, **told)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"{out} keeps the trials that are finished: say the same again to go on"
@@ -118,10 +89,7 @@ def sweep_command(
             {
                 "schema": SCHEMA,
                 "sweep": report.folder,
-                "trials": report.trials,
-                "skipped": report.skipped,
-                "computed": report.computed,
-                "outdated": report.outdated,
+                **{k: getattr(report, k) for k in ("trials", "skipped", "computed", "outdated")},
                 "failed": failed,
             }
         )
