@@ -34,7 +34,7 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.video import video_camera
+from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_header
@@ -181,7 +181,7 @@ def write_clip(clip: Path) -> Path:
 def test_a_video_plays_at_its_own_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr("recorder.cameras.video.time", clock)
-    camera = video_camera(f"av:{write_clip(tmp_path / 'clip.mkv')}", "clip", timeout=5)
+    camera = VideoCamera(f"av:{write_clip(tmp_path / 'clip.mkv')}", "clip", timeout=5)
     shown = [(clock.now, age, int(image[0, 0])) for age, image in camera.pictures()]
     assert [grey for _, _, grey in shown] == list(range(20))
     assert [age for _, age, _ in shown] == [0] * 20
