@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import io
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 from PIL import Image
 
+from recorder.images.decoding import MessageKind
+
 HEIGHT, WIDTH = 12, 16
 START_MS = 1000
+RAW = MessageKind("foxglove.RawImage", "protobuf")
+PACKED = MessageKind("foxglove.CompressedImage", "protobuf")
 
 
 def pictures(count: int, seed: int = 0) -> Iterator[np.ndarray]:
@@ -23,23 +29,51 @@ def pictures(count: int, seed: int = 0) -> Iterator[np.ndarray]:
         yield np.clip(texture + wave, 0, 255).astype(np.uint8)
 
 
+def raw(image: np.ndarray, encoding: str = "mono8") -> bytes:
+    """A foxglove.RawImage, (height, width, ...)."""
+    height, width = image.shape[:2]
+    message = RawImage(height=height, width=width, encoding=encoding, frame_id="cam")
+    message.step, message.data = image.nbytes // height, np.ascontiguousarray(image).tobytes()
+    return bytes(message.SerializeToString())
+
+
+def encoded(image: np.ndarray, kind: str = "PNG") -> bytes:
+    """A PNG or JPEG file."""
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, kind, quality=95)
+    return stream.getvalue()
+
+
+def packed(image: np.ndarray) -> bytes:
+    """A foxglove.CompressedImage, PNG."""
+    return bytes(CompressedImage(data=encoded(image), format="png").SerializeToString())
+
+
 def write_cameras(path: Path, cameras: Mapping[str, tuple[int, int]]) -> None:
-    """An MCAP log of foxglove.RawImage: topic to count and milliseconds between images."""
-    messages = []
+    """A log of foxglove.RawImage: topic to count and milliseconds between images, by time."""
+    topics = {}
+    for seed, (topic, (count, step)) in enumerate(cameras.items()):
+        images = enumerate(pictures(count, seed))
+        topics[topic] = [(START_MS + i * step, image) for i, image in images]
+    write_images(path, topics)
+
+
+def write_images(
+    path: Path, topics: Mapping[str, Iterable[tuple[int, np.ndarray]]], profile: str = ""
+) -> Path:
+    """A log of foxglove.RawImage: on each topic milliseconds and images; by time."""
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=8192)
-        writer.start()
-        schema = writer.register_schema("foxglove.RawImage", "protobuf", b"")
-        for seed, (topic, (count, step)) in enumerate(cameras.items()):
-            channel = writer.register_channel(topic, "protobuf", schema)
-            for i, image in enumerate(pictures(count, seed)):
-                message = RawImage(
-                    width=WIDTH, height=HEIGHT, step=WIDTH, encoding="mono8", data=image.tobytes()
-                )
-                messages.append((START_MS + i * step, channel, message.SerializeToString()))
+        writer = Writer(file, chunk_size=4096)
+        writer.start(profile)
+        schema = writer.register_schema(RAW.schema, RAW.encoding, b"")
+        messages = []
+        for topic, images in topics.items():
+            channel = writer.register_channel(topic, RAW.encoding, schema)
+            messages += [(ms * 1_000_000, channel, raw(image)) for ms, image in images]
         for time, channel, data in sorted(messages):
-            writer.add_message(channel, time * 1_000_000, data, time * 1_000_000)
+            writer.add_message(channel, time, data, time)
         writer.finish()
+    return path
 
 
 def write_pictures(folder: Path, count: int) -> list[int]:

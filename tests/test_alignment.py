@@ -13,7 +13,6 @@ from cdmisfa.core.clock import NANOSECONDS, time_of
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.alignment import (
     Times,
-    by_index,
     by_time,
     counts,
     of_other_rate,
@@ -50,25 +49,12 @@ def test_every_frame_shows_the_last_image_at_or_before_it(
         assert (found["repeated"], found["dropped"]) == (len(clock) - shown, len(stream) - shown)
 
 
-def test_the_shortest_stream_ends_all_by_index() -> None:
-    streams = [times(1, 1), times(1, 1, 1, 1)]
-    one, two = by_index(streams)
-    assert one.tolist() == two.tolist() == [0, 1, 2]
-    assert counts(streams[0], one) == {"messages": 3, "repeated": 0, "dropped": 0}
-    assert counts(streams[1], two) == {"messages": 5, "repeated": 0, "dropped": 2}
-
-
-def test_a_rate_is_another_from_a_hundredth_on() -> None:
-    images = times(*[20_000_000] * 9)
-    assert step_of(images) == 0.02
-    assert not of_other_rate(images, 50.4)
-    assert of_other_rate(images, 51)
-    assert not of_other_rate(images[:1], 51)
-    assert not of_other_rate(times(0, 0, 0), 51)  # they tell no rate
-
-
-def test_streams_differ_by_more_than_half_a_step() -> None:
+def test_a_rate_is_another_from_a_hundredth_on_and_times_from_half_a_step_on() -> None:
     first = times(*[20_000_000] * 9)
+    assert step_of(first) == 0.02
+    for images, fps, other in ((first, 50.4, 0), (first, 51, 1), (first[:1], 51, 0)):
+        assert of_other_rate(images, fps) == other
+    assert not of_other_rate(times(0, 0, 0), 51)  # they tell no rate
     assert unlike(first, first + np.uint64(10_000_000)) == ""
     assert unlike(first, first + np.uint64(10_000_001)) == "images at different times"
     assert unlike(first, first[1:]) == "10 and 9 images"

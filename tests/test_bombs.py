@@ -19,7 +19,7 @@ from test_modules import learned
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.learning import Keyframe
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.core.untrusted.memory import BUDGET, budget
+from cdmisfa.core.untrusted import BUDGET, budget
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS
 from cdmisfa.experiments.sweep import sweep

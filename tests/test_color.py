@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_files import PACKED, packed, raw
 from conftest import Cdmisfa
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from message_files import STEP, every, write_mcap
 from PIL import Image
 
@@ -18,7 +16,6 @@ from cdmisfa import GymSource
 from cdmisfa.core.errors import UsageError
 from recorder.cameras.options import LiveOptions
 from recorder.cameras.words import CAMERAS, CameraKind, open_live
-from recorder.images.decoding import MessageKind
 from recorder.images.framing import Framing
 from recorder.images.messages import image_decoder
 from recorder.images.videos import frame_colors
@@ -39,30 +36,24 @@ def beside(images: np.ndarray) -> np.ndarray:
     return np.concatenate([images[..., c] for c in range(3)], axis=-1)
 
 
-def raw(image: np.ndarray, encoding: str) -> bytes:
-    height, width = image.shape[:2]
-    step = image.size // height * image.itemsize
-    message = RawImage(width=width, height=height, step=step, encoding=encoding)
-    message.data = np.ascontiguousarray(image).tobytes()
-    return bytes(message.SerializeToString())
+def decoded(message: bytes) -> np.ndarray:
+    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
+    assert decode is not None
+    return decode(message)
 
 
 @pytest.mark.parametrize(
     ("encoding", "places"), [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("bgra8", (2, 1, 0, 0))]
 )
 def test_pixels_keep_their_colours(encoding: str, places: tuple[int, ...]) -> None:
-    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
-    assert decode is not None
     image = colors(1)[0]
-    assert (decode(raw(image[:, :, list(places)], encoding)) == image).all()
+    assert (decoded(raw(image[:, :, list(places)], encoding)) == image).all()
 
 
 @pytest.mark.parametrize("bits", [8, 16])
 def test_two_by_two_pixels_of_a_bayer_pattern_are_one_in_colours(bits: int) -> None:
-    decode = image_decoder("foxglove.RawImage", "protobuf", color=True)
-    assert decode is not None
     pattern = np.array([[10, 200, 11], [101, 30, 0], [1, 2, 3]]) << (bits - 8)
-    shown = decode(raw(pattern.astype(f"<u{bits // 8}"), f"bayer_grbg{bits}"))
+    shown = decoded(raw(pattern.astype(f"<u{bits // 8}"), f"bayer_grbg{bits}"))
     assert shown.tolist() == [[[200, 20, 101]]]
 
 
@@ -105,14 +96,8 @@ def test_colours_of_other_formats_are_taken(tmp_path: Path) -> None:
 def test_colours_are_learned_from_recorded_and_replayed_alike(
     cdmisfa: Cdmisfa, tmp_path: Path
 ) -> None:
-    def packed(image: np.ndarray) -> bytes:
-        data = io.BytesIO()
-        Image.fromarray(image).save(data, "PNG")
-        return bytes(CompressedImage(data=data.getvalue(), format="png").SerializeToString())
-
-    kind = MessageKind("foxglove.CompressedImage", "protobuf")
     messages = (packed(image) for image in colors())
-    log = write_mcap(tmp_path / "a.mcap", kind, {"/cam": every(STEP, messages)})
+    log = write_mcap(tmp_path / "a.mcap", PACKED, {"/cam": every(STEP, messages)})
     options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
     out = tmp_path / "run"
     run = cdmisfa("learn", log, "--color", *options, "-o", out, "--no-rerun").json

@@ -8,19 +8,23 @@ import json
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from camera_files import encoded
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer
+from message_files import write_mcap
 from PIL import Image, ImageOps
+from video_packets import cdr as ros2
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.testing.sources import SourceContract
+from recorder.images.decoding import MessageKind
 from recorder.images.messages import holds_distances, image_decoder
 from recorder.images.pixels import (
     ENCODINGS,
@@ -32,23 +36,31 @@ from recorder.images.pixels import (
 )
 from replay.camera_logs.source import ForeignSource
 
+RAW_IMAGES = MessageKind("foxglove.RawImage", "protobuf")
 RANDOM = np.random.default_rng(5)
 GRAY = RANDOM.integers(0, 256, (6, 8), np.uint8)
 COLOUR = RANDOM.integers(0, 256, (6, 8, 3), np.uint8)
 
 
+def sized(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
 def cdr(*, height: int, width: int, encoding: str, big: int, step: int, data: bytes) -> bytes:
-    out = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + struct.pack("<I", 4) + b"cam\0"
-    out += struct.pack("<II", height, width)
-    out += struct.pack("<I", len(encoding) + 1) + encoding.encode() + b"\0" + bytes([big])
-    out += bytes(-(len(out) - 4) % 4) + struct.pack("<II", step, len(data))
-    return out + data
+    head = ros2(height, width, encoding.encode() + b"\0") + bytes([big])
+    return head + bytes(-len(head) % 4) + struct.pack("<I", step) + sized(data)
 
 
 def ros1(*, height: int, width: int, encoding: str, big: int, step: int, data: bytes) -> bytes:
-    out = struct.pack("<III", 1, 5, 6) + struct.pack("<I", 3) + b"cam"
-    out += struct.pack("<II", height, width) + struct.pack("<I", len(encoding)) + encoding.encode()
-    return out + bytes([big]) + struct.pack("<II", step, len(data)) + data
+    head = struct.pack("<III", 1, 5, 6) + sized(b"cam") + struct.pack("<II", height, width)
+    return head + sized(encoding.encode()) + bytes([big]) + struct.pack("<I", step) + sized(data)
+
+
+def shown(kind: tuple[str, str], message: bytes, **options: Any) -> np.ndarray:
+    """What a decoder makes of a message of a kind."""
+    decoder = image_decoder(*kind, **options)
+    assert decoder is not None
+    return decoder(message)
 
 
 def raw_protobuf(**fields: object) -> bytes:
@@ -90,21 +102,17 @@ def pixels(encoding: str, *, big: bool = False, pad: int = 0) -> tuple[bytes, in
 def test_pixels_of_every_format_become_gray(kind: tuple[str, str], encoding: str, pad: int) -> None:
     data, step, height = pixels(encoding, pad=pad)
     made = RAW[kind](height=height, width=8, encoding=encoding, big=0, step=step, data=data)
-    decoder = image_decoder(*kind)
-    assert decoder is not None
     expected = GRAY
     if encoding not in ("mono8", "mono16", "8UC1", "16UC1"):
         expected = np.asarray(Image.fromarray(COLOUR).convert("L"))
-    np.testing.assert_array_equal(decoder(made), expected)
+    np.testing.assert_array_equal(shown(kind, made), expected)
 
 
 def test_big_endian_pixels_are_read_as_such() -> None:
     data, step, height = pixels("mono16", big=True)
     for kind in (("sensor_msgs/msg/Image", "cdr"), ("sensor_msgs/Image", "ros1")):
         made = RAW[kind](height=height, width=8, encoding="mono16", big=1, step=step, data=data)
-        decoder = image_decoder(*kind)
-        assert decoder is not None
-        np.testing.assert_array_equal(decoder(made), GRAY)
+        np.testing.assert_array_equal(shown(kind, made), GRAY)
 
 
 @pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
@@ -132,23 +140,12 @@ def test_distances_are_shown_in_a_range(kind: tuple[str, str], encoding: str) ->
         values = np.round(np.nan_to_num(metres, posinf=0) * 1000).astype("<u2")
     step, data = 5 * values.itemsize, values.tobytes()
     made = RAW[kind](height=2, width=5, encoding=encoding, big=0, step=step, data=data)
-    decoder = image_decoder(*kind, depth=(1.0, 2.0))
-    assert decoder is not None
-    np.testing.assert_array_equal(decoder(made), expected)
-    below, plain = image_decoder(*kind, depth=(-1.0, 2.0)), image_decoder(*kind)
-    assert below is not None
-    assert plain is not None
+    np.testing.assert_array_equal(shown(kind, made, depth=(1.0, 2.0)), expected)
     with pytest.raises(UsageError, match="--range: no distance is below 0"):
-        below(made)
+        shown(kind, made, depth=(-1.0, 2.0))
     if encoding == "32FC1":
         with pytest.raises(UsageError, match="--range"):
-            plain(made)
-
-
-def encoded(image: np.ndarray, kind: str) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, kind, **({"quality": 95} if kind == "JPEG" else {}))
-    return stream.getvalue()
+            shown(kind, made)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
@@ -156,42 +153,29 @@ def encoded(image: np.ndarray, kind: str) -> bytes:
 def test_compressed_images_become_gray(kind: str, image: np.ndarray) -> None:
     smooth = np.asarray(Image.fromarray(image).resize((64, 48), Image.Resampling.BICUBIC))
     data = encoded(smooth, kind)
-    header = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + struct.pack("<I", 4) + b"cam\0"
-    ros2 = (
-        header + struct.pack("<I", 5) + b"jpeg\0" + bytes(3) + struct.pack("<I", len(data)) + data
-    )
-    one = struct.pack("<IIII", 1, 5, 6, 3) + b"cam" + struct.pack("<I", 4) + b"jpeg"
-    one += struct.pack("<I", len(data)) + data
     messages = {
         ("foxglove.CompressedImage", "protobuf"): CompressedImage(data=data).SerializeToString(),
         ("foxglove.CompressedImage", "json"): raw_json(data=data, format="jpeg"),
-        ("sensor_msgs/msg/CompressedImage", "cdr"): ros2,
-        ("sensor_msgs/CompressedImage", "ros1"): one,
+        **ros_compressed("jpeg", data),
     }
     expected = np.asarray(Image.fromarray(smooth).convert("L"), np.int64)
     for which, message in messages.items():
-        decoder = image_decoder(*which)
-        assert decoder is not None
-        assert abs(decoder(message) - expected).max() <= (0 if kind == "PNG" else 6)
+        assert abs(shown(which, message) - expected).max() <= (0 if kind == "PNG" else 6)
 
 
 def ros_compressed(form: str, data: bytes) -> dict[tuple[str, str], bytes]:
     """A message of ROS 2 and one of ROS 1."""
-    name = form.encode() + b"\0"
-    two = b"\0\1\0\0" + struct.pack("<iII", 5, 6, 4) + b"cam\0"
-    two += struct.pack("<I", len(name)) + name + bytes(-len(name) % 4)
-    one = struct.pack("<IIII", 1, 5, 6, 3) + b"cam" + struct.pack("<I", len(form)) + form.encode()
+    text = form.encode()
+    one = struct.pack("<III", 1, 5, 6) + sized(b"cam") + sized(text) + sized(data)
     return {
-        (f"sensor_msgs/{part}CompressedImage", encoding): message
-        + struct.pack("<I", len(data))
-        + data
-        for part, encoding, message in (("msg/", "cdr", two), ("", "ros1", one))
+        ("sensor_msgs/msg/CompressedImage", "cdr"): ros2(text + b"\0", data),
+        ("sensor_msgs/CompressedImage", "ros1"): one,
     }
 
 
 def test_compressed_distances_are_shown_in_a_range() -> None:
     metres = np.array([[0.0, 0.5, 1.0], [1.5, 3.0, 1.02]])
-    shown = np.array([[0, 0, 0], [128, 255, 5]], np.uint8)
+    expected = np.array([[0, 0, 0], [128, 255, 5]], np.uint8)
     plain = encoded((metres * 1000).astype(np.uint16), "PNG")
     scale, offset = 20000.0, -3.0  # a metre is a step of 1 in 20000
     with np.errstate(divide="ignore"):
@@ -206,16 +190,13 @@ def test_compressed_distances_are_shown_in_a_range() -> None:
     ):
         for kind, message in ros_compressed(form, data).items():
             assert holds_distances(*kind, message)
-            decoder, without = image_decoder(*kind, depth=(1.0, 2.0)), image_decoder(*kind)
-            assert decoder is not None
-            assert without is not None
-            np.testing.assert_array_equal(decoder(message), shown)
+            np.testing.assert_array_equal(shown(kind, message, depth=(1.0, 2.0)), expected)
             if form.startswith("16"):
                 high = (metres * 1000).astype(np.uint16) >> 8
-                np.testing.assert_array_equal(without(message), high)
+                np.testing.assert_array_equal(shown(kind, message), high)
             else:
                 with pytest.raises(UsageError, match="--range"):
-                    without(message)
+                    shown(kind, message)
 
 
 @pytest.mark.parametrize(
@@ -229,10 +210,8 @@ def test_compressed_distances_are_shown_in_a_range() -> None:
 )
 def test_compressed_distances_that_are_none_are_named(form: str, data: bytes, why: str) -> None:
     for kind, message in ros_compressed(form, data).items():
-        decoder = image_decoder(*kind, depth=(1.0, 2.0))
-        assert decoder is not None
         with pytest.raises(MalformedImage, match=why):
-            decoder(message)
+            shown(kind, message, depth=(1.0, 2.0))
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
@@ -262,10 +241,8 @@ def test_other_formats_are_refused_by_name(encoding: str) -> None:
 
 @given(data=st.binary(max_size=300), which=st.sampled_from(sorted(RAW)))
 def test_bytes_that_are_no_image_are_refused(data: bytes, which: tuple[str, str]) -> None:
-    decoder = image_decoder(*which)
-    assert decoder is not None
     try:
-        image = decoder(data)
+        image = shown(which, data)
     except MalformedImage:
         return
     assert image.dtype == np.uint8
@@ -279,34 +256,22 @@ def test_an_image_is_averaged_over_areas() -> None:
         shrink(image, 100, 128)
 
 
-def write(
-    path: Path,
-    streams: dict[str, tuple[int, int]],
-    *,
-    schema: str = "foxglove.RawImage",
-    width: int = 8,
-    wide_from: int = 0,
-) -> None:
+def write(path: Path, streams: dict[str, tuple[int, int]], *, width_from: int = 999) -> None:
     """A log with `count` images on each topic, `step` milliseconds apart; all are of one value.
 
-    From image `wide_from` on they claim to be `width` wide.
+    From image `width_from` on they claim to be wider than they are.
     """
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=3000)
-        writer.start()
-        number = writer.register_schema(schema, "protobuf", b"")
-        messages = []
-        for topic, (count, step) in streams.items():
-            channel = writer.register_channel(topic, "protobuf", number)
-            for i in range(count):
-                claimed = width if i >= wide_from else 8
-                image = RawImage(
-                    width=claimed, height=6, step=8, encoding="mono8", data=bytes([i]) * 48
-                )
-                messages.append((1000 + i * step, channel, image.SerializeToString()))
-        for time, channel, data in sorted(messages):
-            writer.add_message(channel, time * 1_000_000, data, time * 1_000_000)
-        writer.finish()
+
+    def image(i: int) -> bytes:
+        width = 9 if i >= width_from else 8
+        fields = {"height": 6, "step": 8, "encoding": "mono8", "data": bytes([i]) * 48}
+        return RawImage(width=width, **fields).SerializeToString()  # type: ignore[arg-type]
+
+    topics = {
+        topic: [((1000 + i * step) * 1_000_000, image(i)) for i in range(count)]
+        for topic, (count, step) in streams.items()
+    }
+    write_mcap(path, RAW_IMAGES, topics)
 
 
 class TestForeign(SourceContract):
@@ -319,15 +284,6 @@ class TestForeign(SourceContract):
 
     def open(self) -> FrameSource:
         return ForeignSource(self.path, ["/left", "/right"], size=(3, 4))
-
-
-def test_frames_come_in_order_at_their_rate(tmp_path: Path) -> None:
-    write(tmp_path / "a.mcap", {"/left": (30, 20), "/right": (30, 20)})
-    source = ForeignSource(tmp_path / "a.mcap", ["/right", "/left"], size=(3, 4))
-    assert source.spec.streams == ("/right", "/left")
-    assert (source.spec.fps, source.spec.length) == (50.0, 30)
-    assert source.take(1, 30).frames[:, 0, 0].tolist() == list(range(30))
-    assert source.alignment["/left"] == {"messages": 30, "repeated": 0, "dropped": 0}
 
 
 def test_streams_that_differ_are_refused_with_what_would_work(tmp_path: Path) -> None:
@@ -364,7 +320,7 @@ def test_topics_are_named_where_they_are_wrong(tmp_path: Path) -> None:
         ForeignSource(path, size=(3, 4))
     with pytest.raises(UsageError, match="no topic /lefd"):
         ForeignSource(path, ["/lefd"], size=(3, 4))
-    write(path, {"/imu": (3, 20)}, schema="foxglove.Imu")
+    write_mcap(path, MessageKind("foxglove.Imu", "protobuf"), {"/imu": [(1, b"")]})
     with pytest.raises(UsageError, match=r"foxglove\.Imu in protobuf"):
         ForeignSource(path, ["/imu"], size=(3, 4))
 
@@ -374,10 +330,10 @@ def test_a_message_that_is_no_image_is_named(tmp_path: Path) -> None:
     write(path, {"/left": (3, 20)})
     with pytest.raises(UsageError, match=r"a\.mcap: .* 8x6 is smaller than 80x60.*--size"):
         ForeignSource(path, size=(60, 80))
-    write(path, {"/left": (3, 20)}, width=9)
+    write(path, {"/left": (3, 20)}, width_from=0)
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1000000000 ns"):
         ForeignSource(path, size=(3, 4))
-    write(path, {"/left": (3, 20)}, width=9, wide_from=1)
+    write(path, {"/left": (3, 20)}, width_from=1)
     source = ForeignSource(path, size=(3, 4))
     with pytest.raises(LogDamagedError, match=r"a\.mcap: /left at 1020000000 ns"):
         source.take(0, 2)

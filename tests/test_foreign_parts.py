@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from camera_files import HEIGHT, WIDTH, pictures, write_cameras, write_images
 from conftest import Cdmisfa
 from folders import contents
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from mcap.writer import Writer
 from waiting import wait_for
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -28,24 +26,11 @@ BOTH = ("--topic", "/left", "--topic", "/right", "--size", f"{WIDTH}x{HEIGHT}")
 
 def write_part(path: Path, rows: range, topics: tuple[str, ...] = ("/left", "/right")) -> None:
     """Some of the images of each topic, 20 ms apart from the first of all on."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2048)
-        writer.start("ros2")
-        schema = writer.register_schema("foxglove.RawImage", "protobuf", b"")
-        for seed, topic in enumerate(topics):
-            channel = writer.register_channel(topic, "protobuf", schema)
-            for i, image in enumerate(pictures(rows.stop, seed)):
-                if i in rows:
-                    message = RawImage(
-                        width=WIDTH,
-                        height=HEIGHT,
-                        step=WIDTH,
-                        encoding="mono8",
-                        data=image.tobytes(),
-                    )
-                    stamp = (1000 + 20 * i) * 1_000_000
-                    writer.add_message(channel, stamp, message.SerializeToString(), stamp)
-        writer.finish()
+    images = {}
+    for seed, topic in enumerate(topics):
+        every = enumerate(pictures(rows.stop, seed))
+        images[topic] = [(1000 + 20 * i, image) for i, image in every if i in rows]
+    write_images(path, images, "ros2")
 
 
 @pytest.fixture

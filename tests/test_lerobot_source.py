@@ -9,9 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from camera_files import pictures, write_cameras
+from camera_files import encoded, pictures, write_cameras
 from conftest import Cdmisfa
-from test_matrix import png
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from replay.camera_logs.lerobot import PAUSE
@@ -44,7 +43,9 @@ def dataset(cdmisfa: Cdmisfa, tmp_path: Path) -> Path:
 def as_pictures(dataset: Path) -> None:
     """Keep the images in the table instead of a video."""
     table = dataset / "data/chunk-000/file-000.parquet"
-    images = [{"bytes": png(image), "path": f"{i}.png"} for i, image in enumerate(pictures(COUNT))]
+    images = [
+        {"bytes": encoded(image), "path": f"{i}.png"} for i, image in enumerate(pictures(COUNT))
+    ]
     pq.write_table(pq.read_table(table).append_column(KEY, pa.array(images)), table)
     info = json.loads((dataset / "meta/info.json").read_text())
     info["features"][KEY]["dtype"] = "image"

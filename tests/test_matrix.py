@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shlex
 from collections.abc import Iterator
@@ -10,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures, write_cameras, write_pictures
+from camera_files import HEIGHT, WIDTH, packed, pictures, write_cameras, write_pictures
 from conftest import Cdmisfa
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from message_files import STEP, every, write_mcap
 from PIL import Image
 from test_bags import ros1_bag, ros2_bag, ros2_database, ros2_mcap
@@ -60,12 +58,6 @@ def write_images(path: Path, schema: str, encoding: str, messages: Iterator[byte
     return write_mcap(path, MessageKind(schema, encoding), {"/cam": every(STEP, messages)})
 
 
-def png(image: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "PNG")
-    return stream.getvalue()
-
-
 def raw(image: np.ndarray) -> dict[str, object]:
     fields = {"height": HEIGHT, "width": WIDTH, "encoding": "mono8", "step": WIDTH}
     return {**fields, "big": 0, "data": image.tobytes()}
@@ -108,7 +100,6 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
     ):
         assert run([str(base / word) if word in made else word for word in words]) == 0
     images = list(pictures(COUNT))
-    packed = (CompressedImage(data=png(i), format="png").SerializeToString() for i in images)
     with serving() as web:
         web.files["/a.mcap"] = (base / "a.mcap").read_bytes()
         yield {
@@ -116,7 +107,9 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[ob
             "run": [base / "run"],
             "foxglove mcap": [base / "a.mcap"],
             "compressed mcap": [
-                write_images(base / "c.mcap", "foxglove.CompressedImage", "protobuf", packed)
+                write_images(
+                    base / "c.mcap", "foxglove.CompressedImage", "protobuf", map(packed, images)
+                )
             ],
             "json mcap": [
                 write_images(
@@ -206,6 +199,22 @@ def test_a_command_takes_a_log_or_says_why_not(
             assert done.json["messages"] >= streams * COUNT
         case "convert":
             assert [view["frames"] for view in done.json["views"]] == [COUNT] * streams
+
+
+@pytest.mark.parametrize("kind", [k for k in FORMATS if k not in ("recording", "run", "glob")])
+def test_a_log_and_its_conversion_are_learned_alike(
+    kind: str, logs: dict[str, list[object]], cdmisfa: Cdmisfa, tmp_path: Path
+) -> None:
+    words = command_line("convert", kind, logs[kind], tmp_path)
+    assert cdmisfa(*words).code == 0
+    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
+    learned = cdmisfa(
+        "learn", *words[1 : words.index("-o")], *words[words.index("--json") :], *quick
+    )
+    assert learned.code == 0, learned.err
+    assert {len(file.get("sha256", "x" * 64)) for file in learned.json["source"]["files"]} == {64}
+    again = cdmisfa("learn", tmp_path / "rec", "--algorithm", "progress", *quick)
+    assert again.json["signals_sha256"] == learned.json["signals_sha256"]
 
 
 def test_the_commands_of_the_page_work(

@@ -143,11 +143,9 @@ def ros_mcap(folder: Path, *, ros1: bool) -> Path:
     text, _ = store.generate_msgdef(name, ros_version=1 if ros1 else 2)
     pack = store.serialize_ros1 if ros1 else store.serialize_cdr
     rows = (bytes(pack(joint_state(store, row, ros1=ros1), name)) for row in angles())
-    kind = (
-        MessageKind("sensor_msgs/JointState", "ros1", text.encode(), "ros1msg")
-        if ros1
-        else MessageKind(name, "cdr", text.encode(), "ros2msg")
-    )
+    kind = MessageKind(name, "cdr", text.encode(), "ros2msg")
+    if ros1:
+        kind = MessageKind("sensor_msgs/JointState", "ros1", text.encode(), "ros1msg")
     return write_mcap(folder / "joints.mcap", kind, {"/joint_states": every(STEP, rows)})
 
 
@@ -230,23 +228,6 @@ def test_broken_messages_are_said_to_be(encoding: str) -> None:
         except CdmisfaError:
             broken += 1
     assert broken > 150
-
-
-def test_topics_of_other_rates_are_put_on_one_clock_and_pauses_are_gaps(tmp_path: Path) -> None:
-    def counted(first: int, count: int) -> Iterator[bytes]:
-        return (json.dumps({"k": first + i}).encode() for i in range(count))
-
-    kind = MessageKind("k", "json")
-    path = write_mcap(
-        tmp_path / "a.mcap",
-        kind,
-        {"/fast": every(STEP, counted(0, 90)), "/slow": every(2 * STEP, counted(1000, 45))},
-    )
-    with contextlib.closing(ForeignSource(path, ["/*"], fields=["k"], align="time")) as source:
-        fast, slow = source.take_all(5)
-        assert fast.frames[:, 0].tolist() == [0, 1, 2, 3, 4]
-        assert slow.frames[:, 0].tolist() == [1000, 1000, 1001, 1001, 1002]
-        assert source.alignment["/slow"]["repeated"] == 44
 
 
 def write_table(path: Path, columns: dict[str, Any]) -> Path:
@@ -383,14 +364,6 @@ def test_streams_that_differ_are_not_learned_from_together(tmp_path: Path) -> No
         pytest.raises(UsageError, match=r"holds 2 numbers, and the first 3.*position\[0:2\]"),
     ):
         source.take(0, 2)
-
-
-def test_a_table_that_is_none_is_damaged(tmp_path: Path) -> None:
-    (tmp_path / "t.parquet").write_bytes(b"PAR1" + b"x" * 100)
-    (tmp_path / "t.csv").write_bytes(b"a,b\n1,2\n1,2,3\n")
-    for name, why in (("t.parquet", "PyArrow cannot read it"), ("t.csv", "line 3 holds 3 cells")):
-        with pytest.raises(LogDamagedError, match=why):
-            ForeignSource(tmp_path / name, rate=5)
 
 
 def test_a_few_bytes_that_are_many_rows_are_refused(tmp_path: Path) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures, write_cameras
+from camera_files import HEIGHT, WIDTH, encoded, pictures, write_cameras
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
-from PIL import Image
 
 from cdmisfa.experiments.convert import convert
 from recorder.mcap.reader import LogReader
@@ -57,31 +55,22 @@ def pixels(data: bytes) -> np.ndarray:
     return np.frombuffer(RawImage.FromString(data).data, np.uint8).reshape(SIZE)
 
 
-def png(image: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, "PNG")
-    return stream.getvalue()
-
-
 def stamp(i: int) -> int:
     return 10**18 + 20_000_000 * i
 
 
-def test_mcaps_own_reader_sees_every_message(recording: Path) -> None:
+@pytest.mark.parametrize("reader", ["mcap", "small_mcap"])
+def test_others_readers_see_every_message(recording: Path, reader: str) -> None:
+    library = pytest.importorskip(reader)
     with recording.open("rb") as file:
-        theirs = [(m.log_time, m.data) for _, _, m in make_reader(file, True).iter_messages()]
-    with LogReader(recording) as reader:
-        assert theirs == [(m.log_time, m.data) for m in reader.messages()]
-    np.testing.assert_array_equal([pixels(data) for _, data in theirs], EXPECTED)
-
-
-def test_small_mcap_sees_every_message(recording: Path) -> None:
-    small_mcap = pytest.importorskip("small_mcap")
-    with recording.open("rb") as file:
-        found = small_mcap.read_message(file, validate_crc=True)
+        if reader == "mcap":
+            found = make_reader(file, validate_crcs=True).iter_messages()
+        else:
+            found = library.read_message(file, validate_crc=True)
         theirs = [(channel.topic, m.log_time, bytes(m.data)) for _, channel, m in found]
-    with LogReader(recording) as reader:
-        assert theirs == [(m.channel.topic, m.log_time, m.data) for m in reader.messages()]
+    with LogReader(recording) as ours:
+        assert theirs == [(m.channel.topic, m.log_time, m.data) for m in ours.messages()]
+    np.testing.assert_array_equal([pixels(data) for _, _, data in theirs], EXPECTED)
 
 
 def test_rerun_shows_images_as_images(recording: Path) -> None:
@@ -115,7 +104,7 @@ def test_logs_of_the_foxglove_sdk_are_streams(
                     width=WIDTH, height=HEIGHT, step=WIDTH, encoding="mono8", data=image.tobytes()
                 )
             else:
-                message = messages.CompressedImage(data=png(image), format="png")
+                message = messages.CompressedImage(data=encoded(image), format="png")
             channel.log(message, log_time=stamp(i))
     _check(tmp_path / "a.mcap")
 
@@ -135,7 +124,7 @@ def test_logs_of_mcap_ros2_are_streams(tmp_path: Path, kind: str) -> None:
                 message |= {"height": HEIGHT, "width": WIDTH, "encoding": "mono8"}
                 message |= {"is_bigendian": 0, "step": WIDTH, "data": image.tobytes()}
             else:
-                message |= {"format": "mono8; png compressed mono8", "data": png(image)}
+                message |= {"format": "mono8; png compressed mono8", "data": encoded(image)}
             writer.write_message("/cam", schema, message, stamp(i), stamp(i), i)
         writer.finish()
     _check(tmp_path / "a.mcap")

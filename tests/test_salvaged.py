@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import random
 from collections.abc import Sequence
 from fractions import Fraction
@@ -12,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from camera_files import HEIGHT, WIDTH, pictures
+from camera_files import HEIGHT, PACKED, RAW, WIDTH, packed, pictures, raw
 from conftest import Cdmisfa
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 from message_files import START, STEP, every, write_mcap
-from PIL import Image
 from video_packets import COUNT, FOXGLOVE, GROUP, foxglove, video
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -26,28 +23,15 @@ from recorder.images.decoding import MessageKind
 from replay.camera_logs.source import ForeignSource
 
 SIZE = (HEIGHT, WIDTH)
-RAW = MessageKind("foxglove.RawImage", "protobuf")
-PNG = MessageKind("foxglove.CompressedImage", "protobuf")
-
-
-def raw(image: np.ndarray[Any, Any], encoding: str = "mono8") -> bytes:
-    fields = {"width": WIDTH, "height": HEIGHT, "step": WIDTH, "encoding": encoding}
-    return RawImage(**fields, data=image.tobytes()).SerializeToString()
-
-
-def png(image: np.ndarray[Any, Any]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(image).save(file, "PNG")
-    return CompressedImage(format="png", data=file.getvalue()).SerializeToString()
 
 
 def write(path: Path, broken: Sequence[int], count: int = 40) -> Path:
-    messages = [png(image) for image in pictures(count)]
+    messages = [packed(image) for image in pictures(count)]
     for row in broken:
         image = CompressedImage.FromString(messages[row])
         image.data = image.data[:60]
         messages[row] = image.SerializeToString()
-    return write_mcap(path, PNG, {"/cam": every(STEP, messages)})
+    return write_mcap(path, PACKED, {"/cam": every(STEP, messages)})
 
 
 def shown(path: Path, rows: Sequence[int]) -> list[np.ndarray[Any, Any]]:
@@ -210,7 +194,9 @@ def test_channels_of_one_topic_and_kind_are_one_stream(cdmisfa: Cdmisfa, tmp_pat
             np.testing.assert_array_equal(source.take(0, 40).frames, images)
     for row, frame in enumerate(shown(path, range(40))):  # by a pass over the log
         np.testing.assert_array_equal(frame, images[row])
-    path = write_channels(tmp_path / "b.mcap", [halves[0], (PNG, list(map(png, images[1::2])))])
+    path = write_channels(
+        tmp_path / "b.mcap", [halves[0], (PACKED, list(map(packed, images[1::2])))]
+    )
     for words in ((), ("--topic", "/cam")):
         done = cdmisfa("convert", path, *words, "-o", tmp_path / "rec")
         assert done.code == 2

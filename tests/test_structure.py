@@ -38,7 +38,6 @@ FORBIDDEN = {
     "cdmisfa.cli": ("rerun", "mcap", "pybullet"),
     "cdmisfa.cli.commands": ("rerun", "mcap", "pybullet"),
     "cdmisfa.core": ("cdmisfa.features.sfa", "recorder.config", "replay.palette", "rerun"),
-    "cdmisfa.core.untrusted": ("cdmisfa.features.sfa", "recorder.config", "replay.palette"),
     "cdmisfa.experiments": ("cdmisfa.studies.paper.reproduce", "cdmisfa.cli.app"),
     "cdmisfa.agents.progress": ("cdmisfa.experiments.session", "replay.palette", "rerun"),
     "cdmisfa.features": ("cdmisfa.agents.learner", "replay.palette", "pybullet"),
@@ -72,8 +71,6 @@ FORBIDDEN = {
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.frames", "pybullet"),
-    "replay.view.layouts": ("replay.viewer.window", "replay.export.figures", "recorder.recording"),
-    "replay.view.world": ("replay.viewer.window", "replay.export.figures", "recorder.world.scenes"),
     "replay.viewer": ("cdmisfa.experiments.session", "recorder.world.icub.world"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,6 @@ import foxglove as foxglove_sdk
 import numpy as np
 import pytest
 from camera_files import HEIGHT, WIDTH
-from conftest import Cdmisfa
 from foxglove.channels import CompressedVideoChannel
 from foxglove.messages import CompressedVideo
 from message_files import STEP, every, write_mcap
@@ -107,18 +105,6 @@ def test_what_follows_a_broken_picture_is_not_made_up(tmp_path: Path) -> None:
         pytest.raises(LogDamagedError, match="its video is broken there"),
     ):
         source.take(0, COUNT)
-
-
-def test_a_robots_video_is_learned_from_and_converted(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    path, size = write(tmp_path / "a.mcap", video("h264")), f"{WIDTH}x{HEIGHT}"
-    facts = cdmisfa("info", path, "--json").json
-    assert "foxglove.CompressedVideo" in json.dumps(facts)
-    quick = ("--max-iterations", "3", "--set", "learner.tau=10", "--json")
-    learned = cdmisfa("learn", path, "--size", size, *quick)
-    assert learned.code == 0, learned.err
-    assert cdmisfa("convert", path, "--size", size, "-o", tmp_path / "rec").code == 0
-    again = cdmisfa("learn", tmp_path / "rec", "--algorithm", "progress", *quick).json
-    assert again["signals_sha256"] == learned.json["signals_sha256"]
 
 
 def test_a_running_robots_video_is_shown_from_its_first_whole_picture() -> None:

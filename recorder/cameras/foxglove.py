@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.video import Steady
 from recorder.images.decoding import MessageKind, Taken, decoder_of
 from recorder.images.messages import holds_distances

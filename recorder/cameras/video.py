@@ -13,7 +13,7 @@ from typing import Any, Final
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
-from cdmisfa.core.untrusted.memory import BUDGET, budget
+from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.pixels import MAX_PIXELS
 from recorder.images.videos import frame_colors, frame_gray, most_pixels, pyav
 

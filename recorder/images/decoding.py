@@ -13,7 +13,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, one_line
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.images.fields import Field, field_value, members, numbers_of
 from recorder.images.messages import SCHEMAS, foxglove_image, image_decoder, ros_stamp
 from recorder.images.options import Reading

@@ -14,7 +14,7 @@ from PIL import Image
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted.memory import BUDGET, budget
+from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.options import Depth
 
 Shown = NDArray[Any]

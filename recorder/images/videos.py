@@ -14,7 +14,7 @@ import numpy as np
 
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.untrusted.memory import BUDGET
+from cdmisfa.core.untrusted import BUDGET
 from recorder.images.pixels import MAX_PIXELS, RECIPE, MalformedImage, raw_image
 
 VIDEO_RECIPE: Final = (

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import RECORDED_FPS, nearest_frames, times_of
 from cdmisfa.core.errors import LogDamagedError
-from cdmisfa.core.untrusted.memory import MAX_JSON, parse_json
-from cdmisfa.core.untrusted.regular import read_regular
+from cdmisfa.core.untrusted import MAX_JSON, parse_json, read_regular
 from recorder.log.files import RECORDING, atomic_write, to_disk
 from recorder.log.messages import SCHEMA_VERSION
 

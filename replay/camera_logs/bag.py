@@ -21,7 +21,7 @@ import numpy as np
 import zstandard
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
+from cdmisfa.core.untrusted import check_regular, opened_regular, read_regular
 from recorder.images.decoding import MessageKind, decoder_of
 from recorder.images.fields import NUMBERS_RECIPE
 from recorder.images.options import IMAGES, Reading

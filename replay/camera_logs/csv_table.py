@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted.regular import check_regular
+from cdmisfa.core.untrusted import check_regular
 from replay.camera_logs.stream import arrow_explained
 
 MAX_BYTES: Final = 1024**3

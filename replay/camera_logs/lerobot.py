@@ -14,7 +14,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted.regular import check_regular, read_json
+from cdmisfa.core.untrusted import check_regular, read_json
 from recorder.images.options import Size
 from recorder.images.pixels import compressed_image
 from recorder.mcap.records import MAX_CHUNK, MalformedRecord

@@ -18,8 +18,7 @@ import numpy as np
 from cdmisfa.core.arrays import ByteArray
 from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.untrusted.memory import data_bytes
-from cdmisfa.core.untrusted.regular import check_regular, opened_regular, read_regular
+from cdmisfa.core.untrusted import check_regular, data_bytes, opened_regular, read_regular
 from recorder.images.options import Size
 from recorder.images.pixels import MAX_PIXELS, compressed_image, picture_size
 from recorder.images.videos import VIDEO_RECIPE, frame_colors, frame_gray, pyav

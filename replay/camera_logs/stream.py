@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted.memory import BUDGET, budget
+from cdmisfa.core.untrusted import BUDGET, budget
 from recorder.images.decoding import MessageKind, Stamp, Taken, decoder_of, stamp_of
 from recorder.images.messages import SCHEMAS, holds_distances
 from recorder.images.options import Reading, Size

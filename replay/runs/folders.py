@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
-from cdmisfa.core.untrusted.memory import MAX_LIST
-from cdmisfa.core.untrusted.regular import read_json
+from cdmisfa.core.untrusted import MAX_LIST, read_json
 from recorder.log.files import partial_path
 from recorder.mcap.reader import LogReader
 

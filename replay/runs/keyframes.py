@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.errors import LogDamagedError, one_line
 from cdmisfa.core.learning import Keyframe, LearnerState
 from cdmisfa.core.modules import Module
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.mcap.reader import LogReader
 from replay.runs.codec import define_message, parsed
 from replay.runs.folders import run_log

@@ -18,7 +18,7 @@ from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.learning import ARITHMETIC
 from cdmisfa.core.signals import SCHEMA_VERSION
-from cdmisfa.core.untrusted.memory import parse_json
+from cdmisfa.core.untrusted import parse_json
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Channel
 from recorder.mcap.store import PARTIAL

@@ -27,7 +27,7 @@ from cdmisfa.core.blocks import (
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.expansion import expand
 from cdmisfa.core.modules import Module
-from cdmisfa.core.untrusted.regular import read_json
+from cdmisfa.core.untrusted import read_json
 from cdmisfa.experiments.documents import write_json
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from cdmisfa.studies.arena.pictures import Footage
