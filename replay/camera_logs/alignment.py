@@ -192,7 +192,7 @@ def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows
     frame = np.cumsum(ticks) - ticks[0]
     gaps = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
     if count and frame[-1] > MAX_FRAMES:
-        said = f"it has {in_words(gaps, fps)}, {frame[-1] + 1} frames in all"
+        said = f"it has {gaps_in_words(gaps, fps)}, {frame[-1] + 1} frames in all"
         raise UsageError(f"{said}: choose a part without, with --from or --to")
     shows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
     return [stream[shows] for stream in rows], gaps
@@ -218,7 +218,7 @@ def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Span
     return found
 
 
-def in_words(gaps: Sequence[Span], fps: float) -> str:
+def gaps_in_words(gaps: Sequence[Span], fps: float) -> str:
     """How many gaps there are, how long the longest is, and when it begins."""
     start, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
     many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"

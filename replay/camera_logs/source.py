@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
-from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
@@ -24,7 +23,7 @@ from replay.camera_logs.alignment import (
     by_time,
     counts,
     gaps_by_time,
-    in_words,
+    gaps_in_words,
     known_times,
     missing,
     of_other_rate,
@@ -98,7 +97,11 @@ class ForeignSource(LoggedSource):
             LogDamagedError: a log is damaged.
         """
         self._options = options = CameraOptions(topics=tuple(topics), **chosen)
-        _check(options)
+        if options.stop is not None and not options.start < options.stop:
+            raise UsageError(
+                f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
+                "seconds after the first image: no image lies between them"
+            )
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
@@ -159,7 +162,7 @@ class ForeignSource(LoggedSource):
         held = "no block reaches across" if self.gaps else "the last image is shown"
         for images, own in zip(self._streams, self._gaps, strict=True):
             if own:
-                said = in_words(own, self._fps)
+                said = gaps_in_words(own, self._fps)
                 yield f"{images.path}: {images.topic} has {said}: {held}"
         if self._options.align is not None:
             return
@@ -366,17 +369,3 @@ class ForeignSource(LoggedSource):
         words += option_words(replace(self._options, topics=(), align=None, rate=None))
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
-
-
-def _check(options: CameraOptions) -> None:
-    """Refuse what no log can be read with."""
-    slowest, fastest = RECORDED_FPS
-    if options.rate is not None and not slowest <= options.rate <= fastest:
-        raise UsageError(f"--rate is {options.rate}: it must be in [{slowest:g}, {fastest:.0f}]")
-    if options.size is not None and min(options.size) < 1:
-        raise UsageError(f"--size is {options.size[1]}x{options.size[0]}: it must be above 0")
-    if options.stop is not None and not options.start < options.stop:
-        raise UsageError(
-            f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in seconds "
-            "after the first image: no image lies between them"
-        )

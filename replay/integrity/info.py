@@ -13,7 +13,7 @@ from cdmisfa.core.untrusted import parse_json
 from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, Problem
 from replay.camera_logs.opening import channels_of, only_foreign
-from replay.inputs import places
+from replay.inputs import locations
 from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
@@ -89,7 +89,7 @@ def describe(*words: str | Location) -> LogInfo:
         UsageError: no such log.
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
-    named = places(words)
+    named = locations(words)
     files = [found for place in named for found in _describe_place(place)]
     kinds, states = {f.kind for f in files}, {f.crc for f in files}
     worst: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")
