@@ -33,7 +33,6 @@ from replay.camera_logs.alignment import (
     retimed,
     step_of,
     unlike,
-    with_gaps,
 )
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
 from replay.camera_logs.options import Align, CameraOptions
@@ -314,16 +313,15 @@ class ForeignSource(LoggedSource):
             rows = by_time(self._times, start, stop, self._fps)
             gaps = [gaps_by_time(t, start, len(rows[0]), self._fps) for t in self._times]
             return start, rows, gaps
-        rows = by_index(self._times)
-        if align == "index" and len(rows) > 1:
-            return int(first[0]), rows, [[] for _ in rows]
-        self._refuse_unequal()
+        as_asked = align == "index" and len(self._times) > 1
+        if not as_asked:
+            self._refuse_unequal()
         try:
-            rows, shared = with_gaps(rows, first, self._fps)
+            shows, shared = by_index(self._times, self._fps, gaps=not as_asked)
         except UsageError as error:
             one = self._streams[0]
             raise UsageError(f"{one.path}: {one.topic}: {error}") from None
-        return int(first[0]), rows, [shared for _ in rows]
+        return int(first[0]), [shows] * len(self._times), [shared] * len(self._times)
 
     def _refuse_unequal(self) -> None:
         """Refuse streams that are not on one clock, or not of the rate asked for."""
