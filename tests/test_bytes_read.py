@@ -34,7 +34,7 @@ def noise(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = np.random.default_rng(0).integers(0, 256, (FRAMES, 96, 128), np.uint8)
     log.write(Block(0, 0, frames, np.zeros((FRAMES, 1))))
     log.finish()
-    return log.file.path
+    return folder / "left.mcap"
 
 
 def share_read(path: Path, work: str) -> float:

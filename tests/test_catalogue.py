@@ -134,7 +134,8 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
 
 
 @pytest.mark.skipif(bool(missing_driver()), reason=missing_driver())
-def test_the_table_of_a_sweep_is_drawn(sweep, tmp_path):
+def test_the_table_of_a_sweep_is_drawn(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr("replay.viewer.headless.SETTLE", 1.0)
     draw_table(sweep, tmp_path / "table.png", window="800x500")
     with Image.open(tmp_path / "table.png") as picture:
         assert picture.size in ((800, 500), (1600, 1000))

@@ -13,9 +13,9 @@ from test_overlay import three
 from replay.runs.compare import side_by_side
 from replay.runs.run import read_outline
 from replay.view import overlay
-from replay.view.layouts.of_run import run_layout
-from replay.view.recording import recording_layout
-from replay.view.world.first import First
+from replay.view.build import recording_layout
+from replay.view.layouts import WorldTab
+from replay.view.panels import run_layout
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 
@@ -36,7 +36,7 @@ def drawn(code: dict[str, Any], *sources: str) -> set[str]:
 
 
 def test_every_tab_of_a_run_is_drawn(code: dict[str, Any], tmp_path: Path) -> None:
-    nothing = First(scene=False, wall=None)
+    nothing = WorldTab()
     for algorithm, sources in {
         "2.0": ("icub", "seed0"),
         "progress": ("progress", "cameras", "icub", "seed0"),

@@ -25,9 +25,9 @@ from replay.runs.compare import first_difference
 from replay.runs.log import read_header
 from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
-from replay.view.layouts import panels
-from replay.view.layouts.of_run import run_layout
-from replay.view.world.first import First
+from replay.view import panels
+from replay.view.layouts import WorldTab
+from replay.view.panels import run_layout
 
 OLD = Path(__file__).parent / "data" / "signals_v1"
 SIGNALS_SHA256 = "b86ab92af6b8ba255cb239dd54c187a1adbdccc9b43f096a348ad4f83bd85a2f"
@@ -168,7 +168,7 @@ def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Titles in the gate's tab of a run's layout."""
     tabs: list[Any] = []
     monkeypatch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
-    run_layout(read_outline(run), First(scene=False, wall=None))
+    run_layout(read_outline(run), WorldTab())
     (gate,) = [tab for tab in tabs if tab.name == "Gate"]
     return [view.name for view in gate.contents]
 

@@ -71,8 +71,6 @@ FORBIDDEN = {
     "replay.runs": ("replay.recordings.source", "replay.view.columns", "cdmisfa.agents.learner"),
     "replay.storage": ("replay.runs.log", "recorder.config", "rerun"),
     "replay.view": ("replay.viewer.program", "replay.export.frames", "pybullet"),
-    "replay.view.layouts": ("replay.viewer.window", "replay.export.figures", "recorder.recording"),
-    "replay.view.world": ("replay.viewer.window", "replay.export.figures", "recorder.world.scenes"),
     "replay.viewer": ("cdmisfa.experiments.session", "recorder.world.icub.world"),
 }
 """Imports that each room must not have, of which the rules must catch every single one."""

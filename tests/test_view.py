@@ -24,9 +24,9 @@ from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view import run as run_view
 from replay.view.build import build_view
-from replay.view.columns import ImageBatch, ImageColumn, TensorBatch, tensors
-from replay.view.layouts.panels import Panels
-from replay.view.layouts.paper import feels
+from replay.view.columns import image_column, images, named_tensors, tensors
+from replay.view.layouts import WorldTab
+from replay.view.panels import run_layout
 from replay.view.summary import summary_text
 
 REPLAY = Path(__file__).parents[1] / "replay"
@@ -59,6 +59,14 @@ def rows_of(path):
             columns = {name: [c[i] for i in order] for name, c in columns.items()}
         entities[entity] = columns
     return entities
+
+
+def views_of(layout):
+    """The views of a layout or a container, in order."""
+    root = getattr(layout, "root_container", layout)
+    if not hasattr(root, "contents") or not hasattr(root, "kind"):
+        return [root]
+    return [view for part in root.contents for view in views_of(part)]
 
 
 def statics_of(path):
@@ -236,8 +244,10 @@ def test_the_overview_of_the_first_version_shows_its_clustering_error(tmp_path):
         run.mkdir()
         table = {"algorithm": algorithm, "roc_error": 0.25}
         write_run(run / "run.mcap", VECTOR, 3, learner=table)
-        (view,) = feels(Panels(read_outline(run)))
-        names[algorithm] = view.name
+        layout = run_layout(read_outline(run), WorldTab())
+        (names[algorithm],) = (
+            v.name for v in views_of(layout) if v.name.startswith("What it feels")
+        )
     assert "clustering error's mean is below 0.25" in names["1.0"]
     assert "below δ" in names["2.0"]
 
@@ -275,8 +285,8 @@ def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
 def test_tensors_are_encoded_as_rerun_does():
     block = np.arange(24.0).reshape(2, 3, 2, 2)
     names = ("stream", "action", "next stream")
-    found = TensorBatch(block, names).as_arrow_array()
-    for row, tensor in zip(found.to_pylist(), block, strict=True):
+    (found,) = named_tensors(block, names)
+    for row, tensor in zip(found.as_arrow_array().to_pylist(), block, strict=True):
         batch = rr.Tensor(tensor, dim_names=names).as_component_batches()[0]
         assert row == batch.as_arrow_array().to_pylist()
     bars = [
@@ -287,9 +297,9 @@ def test_tensors_are_encoded_as_rerun_does():
 
 
 def test_images_are_encoded_as_rerun_does():
-    images = np.arange(24, dtype=np.uint8).reshape(4, 6)
-    (theirs,) = rr.Image.columns(buffer=images)
-    found = ImageBatch(images)
+    pixels = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    (theirs,) = rr.Image.columns(buffer=pixels)
+    (found,) = images(pixels)
     assert found.component_descriptor() == theirs.component_descriptor()
     assert found.as_arrow_array().equals(theirs.as_arrow_array())
 
@@ -301,15 +311,15 @@ def test_many_images_are_handed_over_in_pieces(monkeypatch):
     def keep(self, times, values):
         sent.append(([column.as_arrow_array().to_pylist() for column in times], values.copy()))
 
-    monkeypatch.setattr("replay.view.columns.ImageColumn.send", keep)
+    monkeypatch.setattr("replay.view.columns.Column.send", keep)
     monkeypatch.setattr("replay.view.columns.MAX_BYTES", 3 * math.prod(IMAGE.frame_shape))
-    images = np.random.default_rng(0).integers(0, 256, (8, *IMAGE.frame_shape), np.uint8)
+    pixels = np.random.default_rng(0).integers(0, 256, (8, *IMAGE.frame_shape), np.uint8)
     frames, iterations = np.arange(8) * 10, np.arange(8) // 2
     with rr.RecordingStream("test") as recording:
-        column = ImageColumn(recording, IMAGE, "world/watched")
-        column.add(frames, iterations, images)
+        column = image_column(recording, IMAGE, "world/watched")
+        column.add(frames, iterations, pixels)
     assert [len(values) for _, values in sent] == [3, 3, 2]
-    np.testing.assert_array_equal(np.concatenate([values for _, values in sent]), images)
+    np.testing.assert_array_equal(np.concatenate([values for _, values in sent]), pixels)
     for place, expected in ((0, frames), (2, iterations)):
         assert [t for times, _ in sent for t in times[place]] == expected.tolist()
 

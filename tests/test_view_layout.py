@@ -20,11 +20,11 @@ from replay.palette import CYCLE, packed
 from replay.runs.run import read_outline
 from replay.view import lanes
 from replay.view.build import build_view
-from replay.view.layouts.of_run import run_layout
-from replay.view.world.first import First
+from replay.view.layouts import WorldTab
+from replay.view.panels import run_layout
 
 ITERATIONS, TAU = 420, 40
-NOTHING = First(scene=False, wall=None)
+NOTHING = WorldTab()
 MIN_MAX = rr.components.AggregationPolicy.MinMax.value
 
 LEARNERS = {

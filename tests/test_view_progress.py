@@ -16,11 +16,11 @@ from test_view_layout import Built
 
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from replay.runs.run import read_outline
+from replay.view import panels
 from replay.view.build import build_view
-from replay.view.layouts import panels
-from replay.view.layouts.of_run import run_layout
+from replay.view.layouts import WorldTab
+from replay.view.panels import run_layout
 from replay.view.summary import summary_text
-from replay.view.world.first import First
 
 ITERATIONS = 30
 TAU = 40
@@ -176,7 +176,7 @@ def tabs_of(run, patch):
     """Each tab of a run's layout."""
     tabs = []
     patch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
-    run_layout(read_outline(run), First(scene=False, wall=None))
+    run_layout(read_outline(run), WorldTab())
     return {tab.name: tab for tab in tabs}
 
 

@@ -27,8 +27,8 @@ from replay.palette import colour, packed
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.view.build import build_view
-from replay.view.world.known import PRESET, world_of_run
-from replay.view.world.wall import places
+from replay.view.wall import places_of
+from replay.view.world import PRESET, world_of_run
 
 CONFIG = section_table(IcubConfig())
 SCENE = SourceSpec(("left", "center", "right"), (12, 32), "uint8", TRUTH, 50.0, IMAGE.start_ns)
@@ -200,7 +200,7 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
     build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
     rows = rows_of(tmp_path / "run.rrd")
     height, width = IMAGE.frame_shape
-    hang = places(3, width, height)
+    hang = places_of(3, width, height)
     for s, name in enumerate(IMAGE.streams):
         own = [r for r in records if r.stream == s]
         pictures = rows[f"/wall/{s + 1}_{name}"]
@@ -229,7 +229,7 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
 
 def test_a_wall_is_wider_than_high_and_no_picture_hangs_over_another():
     for count in (1, 2, 5, 16):
-        hang = places(count, 128, 48)
+        hang = places_of(count, 128, 48)
         assert len(set(hang)) == count
         for i, (x, y) in enumerate(hang):
             assert all(abs(x - a) >= 128 or abs(y - b) >= 48 for a, b in hang[:i])

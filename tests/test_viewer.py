@@ -18,9 +18,9 @@ from PIL import Image
 from run_data import IMAGE, VECTOR, read_signals, run_of, write_run
 
 from cdmisfa.core.errors import CdmisfaError, UsageError
+from replay.view import panels
 from replay.view.bindings import viewer_program
 from replay.view.build import build_view, view_of
-from replay.view.layouts import panels
 from replay.viewer import headless, program, window
 from replay.viewer.headless import frame_at
 from replay.viewer.program import (
@@ -116,7 +116,8 @@ def shows(client, view, grey):
 
 
 @needs_driver
-def test_a_screenshot_is_a_picture(tmp_path):
+def test_a_screenshot_is_a_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(headless, "SETTLE", 0.5)
     write_run(tmp_path / "run.mcap", VECTOR, 6)
     headless.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
     with Image.open(tmp_path / "s.png") as picture:

@@ -5,10 +5,9 @@ from cdmisfa.core.exports import exports
 __getattr__, __dir__, __all__ = exports(
     __name__,
     {
-        "replay.integrity.info": "LogInfo describe",
+        "replay.integrity.info": "LogInfo describe kind_of",
         "replay.integrity.verify": "LogCheck check_log",
         "replay.integrity.recover": "Recovery recover_log",
-        "replay.integrity.survey": "kind_of",
         "recorder.mcap.records": "Problem",
     },
 )

@@ -4,25 +4,57 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
+from recorder.log.messages import RECORDING_METADATA
 from recorder.mcap.reader import Check, LogReader
-from recorder.mcap.records import Channel, Problem
+from recorder.mcap.records import Channel, MalformedRecord, Problem, Segment
+from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import channels_of, only_foreign
 from replay.inputs import locations
-from replay.integrity.survey import SCHEMA, Crc, Kind, survey
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
 from replay.storage.location import Location
 from replay.storage.opening import log_files, open_store
 
+SCHEMA: Final = 1
+"""Rises whenever a key of the JSON of info, verify or recover changes its meaning."""
 CHECK_BYTES: Final = 1024 * 1024 * 1024
 """Logs with more bytes, decompressed or not, are described by their index, not decoded."""
+
+Kind = Literal["recording", "run", "foreign"]
+Crc = Literal["ok", "absent", "bad", "unchecked"]
+Times = NDArray[np.uint64]
+
+
+@dataclass(slots=True)
+class ChannelCount:
+    """How many messages of a channel there are, from when to when (log time, nanoseconds)."""
+
+    messages: int = 0
+    start: int | None = None
+    end: int | None = None
+
+    def add(self, times: Times) -> None:
+        """Take more messages in, by their log times, (n,) nanoseconds."""
+        self.messages += len(times)
+        self.widen(times)
+
+    def widen(self, times: Times) -> None:
+        """Take log times in of messages that are counted otherwise, (n,) nanoseconds."""
+        if len(times):
+            low, high = int(times.min()), int(times.max())
+            self.start = low if self.start is None else min(self.start, low)
+            self.end = high if self.end is None else max(self.end, high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,41 +158,130 @@ def _describe_place(place: Location) -> list[LogInfo]:
 
 
 def _describe_file(path: Location) -> LogInfo:
-    with LogReader(open_store(path), salvage=True, check=_check(path)) as reader:
+    check: Check = "chunks"
+    if isinstance(path, Path) and path.stat().st_size <= CHECK_BYTES:
+        check = "pass"
+    with LogReader(open_store(path), salvage=True, check=check) as reader:
         decode = not reader.by_index and sum(s.size for s in reader.segments) <= CHECK_BYTES
-        surveyed, channels = survey(reader, decode=decode), []
-        for number, found in sorted(surveyed.channels.items()):
+        counts, channels = count_messages(reader, decode=decode), []
+        for number, found in sorted(counts.items()):
             undefined = Channel(number, 0, f"(channel {number}, never defined)", "", {})
             channel = reader.channels.get(number, undefined)
             schema = reader.schemas.get(channel.schema_id)
-            channels.append(
-                ChannelInfo(
-                    topic=channel.topic,
-                    encoding=channel.encoding,
-                    schema=schema.name if schema else "",
-                    messages=found.messages,
-                    start_ns=found.start,
-                    end_ns=found.end,
-                    file=path.name,
-                )
-            )
+            name, times = schema.name if schema else "", (found.start, found.end)
+            entry = (channel.topic, channel.encoding, name, found.messages, *times, path.name)
+            channels.append(ChannelInfo(*entry))
         metadata = {m.name: m.values for m in reader.metadata}
         version = record_version(metadata.get(RUN_METADATA, {}))
         return LogInfo(
             path=str(path),
-            kind=surveyed.kind,
+            kind=kind_of(reader),
             channels=tuple(channels),
             chunks=sum(s.chunked for s in reader.segments),
             complete=reader.complete,
-            crc=surveyed.crc,
-            problems=surveyed.problems,
+            crc=crc_of(reader) if decode else "unchecked",
+            problems=problems_of(reader),
             metadata={path.name: metadata},
             signals=RecordInfo(version, missing_signals(version)) if version else None,
         )
 
 
-def _check(path: Location) -> Check:
-    return "pass" if isinstance(path, Path) and path.stat().st_size <= CHECK_BYTES else "chunks"
+def kind_of(reader: LogReader) -> Kind:
+    """Tell a recording and a run from other logs by their metadata."""
+    names = {m.name for m in reader.metadata}
+    if RECORDING_METADATA in names:
+        return "recording"
+    return "run" if RUN_METADATA in names else "foreign"
+
+
+def crc_of(reader: LogReader) -> Crc:
+    """What the checksums of a log that was decoded amount to."""
+    if any("CRC" in problem.what for problem in reader.problems):
+        return "bad"
+    return "absent" if reader.crc_absent() else "ok"
+
+
+def moved(problem: Problem, copy: Path, place: Location) -> Problem:
+    """A problem with what was copied called by its own name."""
+    return Problem(problem.where.replace(str(copy), str(place)), problem.what)
+
+
+def as_problem(path: Location, error: CdmisfaError) -> Problem:
+    """An error as a problem of the file that it names."""
+    return Problem(str(path), str(error).removeprefix(f"{path}: "))
+
+
+def problems_of(reader: LogReader) -> tuple[Problem, ...]:
+    """What was found to be wrong so far, and what is missing at the end."""
+    found = [Problem(f"{reader.path}: {p.where}", p.what) for p in reader.problems]
+    return (*found, *([Problem(str(reader.path), reader.missing)] if reader.missing else ()))
+
+
+def count_messages(
+    reader: LogReader, *, decode: bool, told: Callable[[Segment], None] = lambda _: None
+) -> dict[int, ChannelCount]:
+    """Count the messages of each channel.
+
+    Args:
+        reader: of a log; of one behind a URL the summary and few message indexes are read.
+        decode: decode every chunk, which finds all damage. The file is read in one pass.
+        told: of every chunk that is decoded, in file order.
+
+    Raises:
+        LogDamagedError: a message index is damaged.
+    """
+    found = {number: ChannelCount() for number in reader.channels}
+    if not decode:
+        _count_by_index(reader, found)
+        return found
+    for segment, table in reader.one_pass():
+        told(segment)
+        for number in () if table is None else np.unique(table.channel).tolist():
+            times = _times_in(table, number)
+            found.setdefault(number, ChannelCount()).add(times)
+    return found
+
+
+def _count_by_index(reader: LogReader, found: dict[int, ChannelCount]) -> None:
+    """Count by the indexes of chunks.
+
+    A channel begins in one of the chunks that begin before any message of it that is known.
+    """
+    chunks: dict[int, list[Segment]] = {}
+    for segment in reader.segments:
+        counts = segment.channel_counts()
+        if counts is None:
+            table = reader.table(segment)
+            counts = {} if table is None else Counter(table.channel.tolist())
+        for number, count in counts.items():
+            if count:
+                chunks.setdefault(number, []).append(segment)
+                found.setdefault(number, ChannelCount()).messages += count
+    for number, segments in chunks.items():
+        channel = found[number]
+        for segment in sorted(segments, key=lambda s: s.start):
+            if channel.start is not None and segment.start >= channel.start:
+                break
+            channel.widen(_times_of(reader, segment, number))
+        for segment in sorted(segments, key=lambda s: s.end, reverse=True):
+            if channel.end is not None and segment.end <= channel.end:
+                break
+            channel.widen(_times_of(reader, segment, number))
+
+
+def _times_of(reader: LogReader, segment: Segment, number: int) -> Times:
+    """Log times of a channel's messages in a chunk, by its message index if it has one."""
+    if not segment.indexes:
+        return _times_in(reader.table(segment), number)
+    try:
+        pairs = reader.index(segment)
+    except MalformedRecord as error:
+        raise LogDamagedError(f"{reader.path}: {segment.name}: {error}") from None
+    return np.concatenate([own[:, 0] for channel, own in pairs if channel == number])
+
+
+def _times_in(table: MessageTable | None, number: int) -> Times:
+    return np.empty(0, np.uint64) if table is None else table.log_time[table.channel == number]
 
 
 def _seed(records: Sequence[Mapping[str, str]]) -> int | None:

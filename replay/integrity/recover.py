@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import struct
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,20 +20,13 @@ from recorder.mcap.mending import mended
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem
 from recorder.mcap.store import PARTIAL
-from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import only_foreign
-from replay.integrity.survey import SCHEMA, ChannelSurvey, moved, problems_of
+from replay.integrity.info import SCHEMA, ChannelCount, moved, problems_of
 from replay.storage.location import Location, location
 from replay.storage.opening import fetched, log_files, open_store
 
-
-@dataclass(slots=True)
-class _Tally:
-    """What became of one channel; `digest` is over times and payloads in file order."""
-
-    kept: ChannelSurvey = field(default_factory=ChannelSurvey)
-    lost: int | None = 0
-    digest: Any = field(default_factory=hashlib.sha256)
+_HASHED: Final = struct.Struct("<HIQQ")
+"""Of a message, before its payload: channel, sequence, log time, publish time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,19 +126,13 @@ def _recover_file(src: Path, dst: Path, force: bool, alone: bool) -> Recovery:
             raise LogDamagedError(f"{src}: nothing in it can be saved, and nothing was written")
         library = f"cdmisfa recover ({reader.library})" if reader.library else "cdmisfa recover"
         with LogFile(dst, force=force, library=library, profile=reader.profile) as log:
-            tallies, unverified = _copy(reader, log)
-        _compare(dst, reader, tallies)
-        channels = [
-            ChannelRecovery(
-                topic=reader.channels[number].topic,
-                kept=tally.kept.messages,
-                lost=tally.lost,
-                start_ns=tally.kept.start,
-                end_ns=tally.kept.end,
-                file=dst.name,
-            )
-            for number, tally in sorted(tallies.items())
-        ]
+            digest, kept, unverified = _copy(reader, log)
+        _compare(dst, len(reader.metadata), digest)
+        channels, lost = [], _lost_messages(reader, kept)
+        for number, channel in sorted(reader.channels.items()):
+            count = kept[number]
+            counts = count.messages, lost[number], count.start, count.end
+            channels.append(ChannelRecovery(channel.topic, *counts, dst.name))
         return Recovery(str(dst), tuple(channels), _lost(reader), right, unverified)
 
 
@@ -174,7 +162,13 @@ def _lost(reader: LogReader) -> tuple[Problem, ...]:
     return tuple(found)
 
 
-def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:
+def _copy(reader: LogReader, log: LogFile) -> tuple[str, dict[int, ChannelCount], int]:
+    """Write what is readable.
+
+    Returns:
+        A digest of all messages, what is kept of each channel, and how many messages no checksum
+        proves.
+    """
     for record in reader.metadata:
         log.add_metadata(record.name, record.values)
     for attachment in reader.attachments:
@@ -186,64 +180,49 @@ def _copy(reader: LogReader, log: LogFile) -> tuple[dict[int, _Tally], int]:
             create_time=attachment.create_time,
         )
     channels, schemas = reader.channels, reader.schemas
-    tallies = {number: _Tally() for number in channels}
-    known: dict[int, int] = {}
+    kept = {number: ChannelCount() for number in channels}
+    written: dict[int, int] = {}
     for number, channel in sorted(channels.items()):
         schema = schemas.get(channel.schema_id)
-        known[number] = log.add_channel(
+        written[number] = log.add_channel(
             channel.topic,
             log.add_schema(schema.name, schema.encoding, schema.data) if schema else 0,
             encoding=channel.encoding,
             metadata=channel.metadata,
         )
-    unverified = 0
+    digest, unverified = hashlib.sha256(), 0
     for segment, table in reader.tables(ordered=False):
         unverified += len(table) if segment.cut and segment.crc else 0
-        for row, number in enumerate(table.channel.tolist()):
-            if number in known:
-                log.write(
-                    known[number],
-                    int(table.log_time[row]),
-                    table.payload(row),
-                    int(table.records["sequence"][row]),
-                    int(table.records["publish_time"][row]),
-                )
-        _tally(tallies, table)
-    _count_lost(reader, tallies)
-    return tallies, unverified
+        for number, sequence, log_time, published, data in table.rows():
+            if number in written:
+                log.write(written[number], log_time, data, sequence, published)
+                digest.update(_HASHED.pack(written[number], sequence, log_time, published))
+                digest.update(data)
+        for number in kept.keys() & np.unique(table.channel).tolist():
+            kept[number].add(table.log_time[table.channel == number])
+    return digest.hexdigest(), kept, unverified
 
 
-def _tally(tallies: dict[int, _Tally], table: MessageTable) -> None:
-    for number in tallies.keys() & np.unique(table.channel).tolist():
-        rows = table.select(table.channel == number)
-        tally = tallies[number]
-        tally.kept.add(rows.log_time)
-        for row in range(len(rows)):
-            tally.digest.update(rows.log_time[row].tobytes())
-            tally.digest.update(rows.payload(row))
-
-
-def _count_lost(reader: LogReader, tallies: dict[int, _Tally]) -> None:
+def _lost_messages(reader: LogReader, kept: dict[int, ChannelCount]) -> dict[int, int | None]:
     """How many messages are gone: by the writer's statistics, else by the index of each chunk."""
     stated = reader.statistics
+    if stated is not None:
+        return {n: max(stated.per_channel.get(n, 0) - kept[n].messages, 0) for n in kept}
     counts = [s.channel_counts() for s in reader.segments if reader.table(s) is None]
-    for number, tally in tallies.items():
-        if stated is not None:
-            tally.lost = max(stated.per_channel.get(number, 0) - tally.kept.messages, 0)
-        elif not reader.data_complete or None in counts:
-            tally.lost = None
-        else:
-            tally.lost = sum(c.get(number, 0) for c in counts if c is not None)
+    if not reader.data_complete or None in counts:
+        return dict.fromkeys(kept)
+    return {n: sum(c.get(n, 0) for c in counts if c is not None) for n in kept}
 
 
-def _compare(dst: Path, source: LogReader, tallies: dict[int, _Tally]) -> None:
+def _compare(path: Path, metadata: int, digest: str) -> None:
     """Read the new log with every checksum and compare it with what was written."""
-    with LogReader(dst) as reader:
-        found = {number: _Tally() for number in reader.channels}
+    found = hashlib.sha256()
+    with LogReader(path) as reader:
         for _, table in reader.tables(ordered=False):
-            _tally(found, table)
-        if reader.missing or reader.problems or len(reader.metadata) != len(source.metadata):
-            raise LogDamagedError(f"{dst}: the recovered log is not whole; check the disk")
-    read, written = ([one[n].digest.digest() for n in sorted(one)] for one in (found, tallies))
-    if read != written:
-        raise LogDamagedError(f"{dst}: differs from what was recovered; check the disk")
+            for number, sequence, log_time, published, data in table.rows():
+                found.update(_HASHED.pack(number, sequence, log_time, published))
+                found.update(data)
+        if reader.missing or reader.problems or len(reader.metadata) != metadata:
+            raise LogDamagedError(f"{path}: the recovered log is not whole; check the disk")
+    if found.hexdigest() != digest:
+        raise LogDamagedError(f"{path}: differs from what was recovered; check the disk")

@@ -13,7 +13,7 @@ from cdmisfa.core.errors import CdmisfaError
 from cdmisfa.core.signals import SCHEMA_VERSION, SignalsHash
 from recorder.mcap.reader import LogReader
 from recorder.mcap.records import Problem, Segment
-from replay.integrity.survey import said
+from replay.integrity.info import as_problem
 from replay.runs.folders import FINAL_METADATA, MODULES_FILE, RUN_JSON, VIEW_FILE, read_run_json
 from replay.runs.log import SIGNALS_TOPIC, Batch, BatchReader, read_header
 from replay.runs.modules import load_modules
@@ -104,7 +104,7 @@ class RunPass:
         try:
             yield
         except CdmisfaError as error:
-            self._found.append(said(self._log, error))
+            self._found.append(as_problem(self._log, error))
             self._batches = None
 
 
@@ -123,4 +123,4 @@ def _check_modules(path: Path, stated: str | None) -> Iterator[Problem]:
         else:
             load_modules(path)
     except CdmisfaError as error:
-        yield said(path, error)
+        yield as_problem(path, error)

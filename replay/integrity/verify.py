@@ -16,8 +16,17 @@ from replay.camera_logs.opening import channels_of, log_format, only_foreign, op
 from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
 from replay.inputs import locations
+from replay.integrity.info import (
+    SCHEMA,
+    Crc,
+    as_problem,
+    count_messages,
+    crc_of,
+    kind_of,
+    moved,
+    problems_of,
+)
 from replay.integrity.run_files import RunPass
-from replay.integrity.survey import SCHEMA, Crc, kind_of, moved, said, survey
 from replay.recordings.source import RecordedSource
 from replay.recordings.view_file import ViewFile
 from replay.storage.location import Location, location
@@ -112,7 +121,7 @@ def _check_images(path: Path) -> LogCheck:
                     problems += _broken(images)
                     notes |= dict.fromkeys(images.warnings)
     except LogDamagedError as error:
-        problems.append(said(path, error))
+        problems.append(as_problem(path, error))
     return LogCheck(tuple(problems), (FileCheck(str(path), "absent"),), tuple(notes))
 
 
@@ -158,21 +167,22 @@ def _check_file(
     try:
         with LogReader(open_store(path), salvage=True, check="pass") as reader:
             passed = _pass_of(path, reader, beside)
-            found = survey(reader, decode=True, told=passed.add if passed else lambda _: None)
+            told = passed.add if passed else lambda _: None
+            counts = count_messages(reader, decode=True, told=told)
             if passed:
                 passed.finish()
             wrong = [
                 f"holds messages of channel {number}, never defined"
-                for number in found.channels.keys() - reader.channels.keys()
+                for number in counts.keys() - reader.channels.keys()
             ]
-            there = sum(channel.messages for channel in found.channels.values())
+            there = sum(channel.messages for channel in counts.values())
             stated = reader.statistics.messages if reader.statistics else there
             if stated != there and not reader.problems:
                 wrong.append(f"its summary states {stated} messages, there are {there}")
             problems = [Problem(str(path), what) for what in wrong]
-            return found.crc, [*problems, *found.problems], passed
+            return crc_of(reader), [*problems, *problems_of(reader)], passed
     except LogDamagedError as error:
-        return "bad", [said(path, error)], None
+        return "bad", [as_problem(path, error)], None
 
 
 def _pass_of(path: Location, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:
@@ -201,7 +211,7 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
                 if start > end and not facts.gaps:
                     yield Problem(str(checked.path), f"frames {end} to {start - 1} are missing")
         if checked.error is not None:
-            yield said(checked.path, checked.error)
+            yield as_problem(checked.path, checked.error)
     for name in () if alone else sorted(streams - names):
         yield Problem(folder, f"the view {name!r} of the recording has no file")
     if absent := set() if alone else set(range(count)) - numbers:
@@ -213,7 +223,7 @@ def _check_views(passes: list[_ViewPass], *, alone: bool) -> Iterator[Problem]:
     try:
         source = RecordedSource([v.path for v in views], salvage=True, opened=views)
     except LogDamagedError as error:
-        yield replace(said(passes[0].path, error), where=folder)
+        yield replace(as_problem(passes[0].path, error), where=folder)
         return
     with contextlib.closing(source):
         if source.gaps:

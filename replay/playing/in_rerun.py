@@ -13,10 +13,10 @@ import numpy as np
 import rerun as rr
 
 from replay.playing.feed import Playback, Played, frames_feed, opened_source, paced
+from replay.view.build import recording_layout, view_entities
 from replay.view.columns import frames_column, line_column
 from replay.view.labels import label
 from replay.view.properties import APPLICATION
-from replay.view.recording import recording_layout, view_entities
 from replay.viewer.broadcast import Broadcast
 
 NAME: Final = "played.rrd"

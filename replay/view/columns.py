@@ -6,7 +6,7 @@ after the call: so an array is copied, but for images that nobody may write to.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.clock import times_of
 from replay.palette import Rgb, packed_all, pale
@@ -31,6 +32,9 @@ LOG_TIME = "message_log_time"
 TIMELINE_SIGNALS = ("iteration", "t", "log_time")
 """Signals that are not lines but the timelines themselves."""
 
+MOST_STREAMS = 16
+"""Streams with lines and lanes of their own: the most watched ones."""
+
 AGGREGATION = rr.components.AggregationPolicy.MinMax
 """How a line of more values than the screen has columns is drawn: from the least to the most.
 
@@ -46,11 +50,12 @@ MAX_BYTES = 4 * 1024 * 1024
 Of 12 MB of images at once Rerun's threads take twice as long, of .5 MB we do.
 """
 
-Frames = NDArray[np.int64]
+Encode = Callable[[NDArray[Any]], Any]
+"""Makes Rerun's component columns of (n, ...) values."""
 
 
 def time_columns(
-    spec: SourceSpec, frames: Frames, iterations: Frames | None = None
+    spec: SourceSpec, frames: IntArray, iterations: IntArray | None = None
 ) -> list[rr.TimeColumn]:
     """Where rows at these frames stand on each timeline."""
     times = times_of(frames, spec.fps, spec.start_ns)
@@ -63,22 +68,28 @@ def time_columns(
     return found
 
 
-def power_of_ten(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def power_of_ten(values: FloatArray) -> FloatArray:
     """Logarithms of values, of any shape, to the base of ten; NaN of what has none."""
     return np.log10(np.where(values > 0, values, np.nan))
+
+
+def scalars(values: NDArray[Any]) -> Any:
+    """(n, ...) values as n rows of scalars."""
+    return rr.Scalars.columns(scalars=np.array(values, dtype=np.float64).reshape(len(values), -1))
 
 
 class Column:
     """One entity's rows of numbers, waiting to be handed over.
 
     Until there is a number that is not NaN, rows do not wait longer than others, and are then
-    dropped: of what a run does not tell there is no entity.
+    dropped: a signal that the run never has gets no entity.
 
     Args:
         recording: where they go.
         spec: of the source, for the log time of a frame.
         path: the entity.
         style: what is said of it once.
+        encode: how values are handed over.
         every_frame: its rows are of every frame that there is, so that where frames are missing
             there is a gap; a row of NaN there ends lines, which would lead across.
     """
@@ -89,28 +100,28 @@ class Column:
         spec: SourceSpec,
         path: str,
         style: Any = None,
+        encode: Encode = scalars,
         *,
         every_frame: bool = False,
     ) -> None:
         self.path = path
-        self._style, self._begun = style, False
-        self._every_frame = every_frame
-        self._last: tuple[Frames, Frames | None] | None = None
-        self._recording = recording
-        self._spec = spec
-        self._frames: list[Frames] = []
-        self._iterations: list[Frames] = []
-        self._values: list[NDArray[Any]] = []
-        self._waiting = 0
-        self._bytes = 0
+        self._recording, self._spec = recording, spec
+        self._style, self._encode, self._every_frame = style, encode, every_frame
+        self._begun = False
+        self._last: tuple[IntArray, IntArray | None] | None = None
+        self._clear()
 
-    def add(
-        self, frames: Frames, iterations: NDArray[np.int64] | int | None, values: NDArray[Any]
-    ) -> None:
-        """Take values of n rows, (n, ...), at n frames of one iteration or of n."""
+    def _clear(self) -> None:
+        self._frames: list[IntArray] = []
+        self._iterations: list[IntArray] = []
+        self._values: list[NDArray[Any]] = []
+        self._waiting = self._bytes = 0
+
+    def add(self, frames: IntArray, iterations: IntArray | None, values: NDArray[Any]) -> None:
+        """Take values of n rows, (n, ...), at n frames."""
         self._frames.append(frames)
         if iterations is not None:
-            self._iterations.append(np.broadcast_to(iterations, (len(frames),)))
+            self._iterations.append(iterations)
         self._values.append(values)
         self._waiting += len(frames)
         self._bytes += values.nbytes
@@ -119,8 +130,11 @@ class Column:
 
     def flush(self) -> None:
         """Hand over what waits."""
-        values = _joined(self._values) if self._waiting else np.empty(0)
-        if self._waiting and (self._begun or not _missing(values)):
+        if not self._waiting:
+            return
+        values = _joined(self._values)
+        missing = values.dtype.kind == "f" and bool(np.isnan(values).all())
+        if self._begun or not missing:
             if self._style is not None and not self._begun:
                 self._recording.log(self.path, self._style, static=True)
             self._begun = True
@@ -132,12 +146,11 @@ class Column:
             for part in (slice(i, i + rows) for i in range(0, len(values), rows)):
                 those = None if iterations is None else iterations[part]
                 self.send(time_columns(self._spec, frames[part], those), values[part])
-        self._frames, self._iterations, self._values = [], [], []
-        self._waiting = self._bytes = 0
+        self._clear()
 
     def _ended_at_gaps(
-        self, frames: Frames, iterations: Frames | None, values: NDArray[Any]
-    ) -> tuple[Frames, Frames | None, NDArray[Any]]:
+        self, frames: IntArray, iterations: IntArray | None, values: NDArray[Any]
+    ) -> tuple[IntArray, IntArray | None, NDArray[Any]]:
         """Rows with one more of NaN where each gap begins, at the iteration before."""
         last, last_iteration = self._last or (frames[:1], iterations)
         self._last = frames[-1:], None if iterations is None else iterations[-1:]
@@ -152,13 +165,8 @@ class Column:
         return np.insert(frames, gaps, before[gaps] + 1), iterations, values
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand (n, ...) values over as rows of scalars."""
-        table = np.array(values, dtype=np.float64).reshape(len(values), -1)
-        self._recording.send_columns(self.path, times, rr.Scalars.columns(scalars=table))
-
-
-def _missing(values: NDArray[Any]) -> bool:
-    return values.dtype.kind == "f" and bool(np.isnan(values).all())
+        """Hand (n, ...) values over as rows."""
+        self._recording.send_columns(self.path, times, self._encode(values))
 
 
 def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
@@ -204,86 +212,60 @@ def frames_column(
 ) -> Column:
     """A column of a source's frames: images, or lines of values."""
     if spec.images:
-        return ImageColumn(recording, spec, path)
+        return image_column(recording, spec, path)
     names = [f"value {i + 1}" for i in range(int(np.prod(spec.frame_shape)))]
     return line_column(recording, spec, path, names, width=width, every_frame=True)
 
 
-class ImageColumn(Column):
-    """Images of a source, (n, height, width) grey."""
-
-    def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, path: str) -> None:
-        height, width = spec.frame_shape
-        form = rr.components.ImageFormat(
-            width=width, height=height, color_model="L", channel_datatype="U8"
-        )
-        super().__init__(recording, spec, path, rr.Image.from_fields(format=form))
-
-    def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand n images over, (n, height, width) uint8."""
-        batch: Any = ImageBatch(values.reshape(len(values), -1))
-        self._recording.send_columns(self.path, times, [batch])
+def image_column(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column:
+    """A column of images of a source, (n, height, width) grey."""
+    height, width = spec.frame_shape
+    form = rr.components.ImageFormat(
+        width=width, height=height, color_model="L", channel_datatype="U8"
+    )
+    return Column(recording, spec, path, rr.Image.from_fields(format=form), images)
 
 
-class ImageBatch:
-    """(n, size) bytes as n rows of images; `rr.Image.columns` copies them three times.
+def tensor_column(
+    recording: rr.RecordingStream, spec: SourceSpec, path: str, names: Sequence[str]
+) -> Column:
+    """A column of tensors of one shape, with a name for each dimension."""
+    return Column(recording, spec, path, None, lambda values: named_tensors(values, names))
 
-    They are copied once where they may be written to.
 
-    A test holds this encoding against `rr.Image`.
-    """
+class _Batch:
+    """An Arrow array of n rows of the component that another batch has one of."""
 
-    def __init__(self, values: NDArray[np.uint8]) -> None:
-        self._values = values
-        self._one = rr.Image.from_fields(buffer=b"\0").as_component_batches()[0]
+    def __init__(self, one: Any, rows: pa.Array) -> None:
+        self._one, self._rows = one, rows
 
     def component_descriptor(self) -> Any:
-        """What the rows are to Rerun."""
         return self._one.component_descriptor()
 
     def as_arrow_array(self) -> pa.Array:
-        """The rows in Rerun's type of an image's bytes."""
-        count, size = self._values.shape
-        kind = self._one.as_arrow_array().type
-        values = self._values.reshape(-1)
-        blobs = _lists(
-            count, size, pa.array(values.copy() if values.flags.writeable else values), kind
-        )
-        return _lists(count, 1, blobs)
+        return self._rows
 
 
-class TensorColumn(Column):
-    """Tensors of one shape, with a name for each dimension."""
+def images(values: NDArray[np.uint8]) -> Any:
+    """(n, ...) bytes as n rows of images; `rr.Image.columns` copies them three times.
 
-    def __init__(
-        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, names: Sequence[str]
-    ) -> None:
-        super().__init__(recording, spec, path)
-        self._names = names
-
-    def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
-        """Hand n tensors over, (n, *shape)."""
-        batch: Any = TensorBatch(np.asarray(values, dtype=np.float64), self._names)
-        self._recording.send_columns(self.path, times, [batch])
+    They are copied once where they may be written to. A test holds this against `rr.Image`.
+    """
+    one = rr.Image.from_fields(buffer=b"\0").as_component_batches()[0]
+    count, pixels = len(values), values.reshape(-1)
+    blobs = pa.array(pixels.copy() if values.flags.writeable else pixels)
+    kind = one.as_arrow_array().type
+    return [_Batch(one, _lists(count, 1, _lists(count, values[0].size, blobs, kind)))]
 
 
-class TensorBatch:
+def named_tensors(values: NDArray[Any], names: Sequence[str]) -> Any:
     """(n, *shape) values as n rows of tensors; `rr.Tensor.columns` takes one at a time.
 
     A test holds this encoding against `rr.Tensor`.
     """
-
-    def __init__(self, values: NDArray[np.float64], names: Sequence[str]) -> None:
-        self._tensors = tensors(values, names)
-
-    def component_descriptor(self) -> Any:
-        """What the rows are to Rerun."""
-        one = rr.Tensor.from_fields(data=self._tensors[:1]).as_component_batches()[0]
-        return one.component_descriptor()
-
-    def as_arrow_array(self) -> pa.Array:
-        """The rows in Rerun's type of a tensor."""
-        return _lists(len(self._tensors), 1, self._tensors)
+    made = tensors(np.asarray(values, dtype=np.float64), names)
+    one = rr.Tensor.from_fields(data=made[:1]).as_component_batches()[0]
+    return [_Batch(one, _lists(len(made), 1, made))]
 
 
 def tensors(values: NDArray[np.float64], names: Sequence[str] = ()) -> pa.Array:

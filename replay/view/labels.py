@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
+from cdmisfa.core.signals import Signal
 from replay.view.bindings import escape_entity_path_part
 
 _DRAWN = (
@@ -19,6 +20,9 @@ _DRAWN = (
     (0x400, 0x45F),  # Cyrillic
 )
 _LEFT_OUT = "⟨⟩"
+
+SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
+"""Signals whose name is their symbol, spelled out."""
 
 
 @lru_cache(maxsize=4096)
@@ -35,3 +39,17 @@ def part(names: Sequence[str], index: int) -> str:
 
 def _is_drawn(code: int) -> bool:
     return any(low <= code <= high for low, high in _DRAWN)
+
+
+def line_labels(signal: Signal, module: int, outputs: int) -> list[str]:
+    """Names of a signal's lines: its symbol and unit, its module from 1, its outputs."""
+    name = signal.name.replace("_", " ")
+    symbol = signal.symbol.replace("_i", f"_{module}") if module else signal.symbol
+    if signal.name in SPELLED or (not module and symbol == name):
+        text = symbol
+    else:
+        text = f"{symbol} {name}{f' module {module}' if module else ''}".strip()
+    unit = "" if signal.unit in ("", "1") else f" [{signal.unit}]"
+    if "J" not in signal.dims or outputs == 1:
+        return [f"{text}{unit}"]
+    return [f"{text} output {j + 1}{unit}" for j in range(outputs)]

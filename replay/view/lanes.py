@@ -1,9 +1,8 @@
 """Lanes: what was the case when, as labelled bars of colour.
 
-A lane's label is its entity, and lanes stand in the order of the alphabet: so they have the names
-that they have. What changes with many blocks has two lanes. `/attends` holds every change;
-`/mostly/attends` what was the case in most of the blocks around, which reads when all of a run
-is in view.
+A lane's label is its entity, and lanes stand in alphabetical order: so they have the names that
+they have. A state that changes with many blocks has two lanes: `/attends` holds every change,
+`/mostly/attends` the state of most of the blocks around, which reads when all of a run is in view.
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from functools import partial
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import IntArray
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay import palette
@@ -23,19 +22,20 @@ from replay.runs.columns import SignalColumns
 from replay.view.columns import time_columns
 from replay.view.labels import label, part
 
-NameOf = Callable[[int], tuple[str, Rgb]]
-"""The state that a code stands for, and its colour."""
+Names = Callable[[int], tuple[str, Rgb]]
+"""Gives the state that a code stands for, and its colour."""
 
-Codes = NDArray[np.int64]
+Codes = Callable[[SignalColumns], IntArray]
+"""Gives the code of each block's state, (n,)."""
 
 ATTENDS, LEARNS, NOVELTY, DOES, EXPLORES = "attends", "learns", "novelty", "does", "explores"
 """Entities of lanes."""
 
 MOSTLY = "mostly"
-"""Where the lanes are that say what was mostly the case."""
+"""Where the lanes of the state of most blocks are."""
 
 PIECES = 80
-"""Pieces of a run of which such a lane says one thing each."""
+"""Pieces of a run for each of which such a lane has one state."""
 
 MOST_OF = 2 / 3
 """Share of the blocks of a piece that is most of them."""
@@ -55,8 +55,8 @@ class Lanes:
         spec: of the source.
         shown: the streams that get a lane of their own: of the policy, or of the stream's state.
         by_progress: the run is one of the progress learner, which has no gate.
-        piece: blocks of which one thing is said in lanes of what was mostly the case; by default
-            so many that they are told once all blocks are known.
+        piece: blocks for which lanes of most blocks have one state; by default so many that they
+            are written once all blocks are known.
     """
 
     def __init__(
@@ -68,159 +68,92 @@ class Lanes:
         by_progress: bool = False,
         piece: int | None = None,
     ) -> None:
+        self._lanes: list[tuple[Codes, Lane]] = []
+        count = len(spec.streams)
+        self._known_by = np.zeros(count, dtype=np.int64)
+
         def attended(stream: int) -> tuple[str, Rgb]:
             return label(spec.streams[stream]), colour(stream)
 
-        names: dict[str, NameOf] = {ATTENDS: attended}
-        self._known_by = np.zeros(len(spec.streams), dtype=np.int64)
-        kind = "state" if by_progress else "policy"
-        self._of_stream = {s: f"{kind}/{part(spec.streams, s)}" for s in shown}
-        mostly: dict[str, NameOf] = {ATTENDS: partial(_or_mixed, name=attended, mixed="switches")}
-        if by_progress:
-            self._codes = self._became
-            names |= dict.fromkeys(self._of_stream.values(), _became)
-        else:
-            self._codes = self._decided
-            names |= {LEARNS: _learned, NOVELTY: _verdict, EXPLORES: _chosen}
-            names[DOES] = partial(_done, streams=[label(name) for name in spec.streams])
-            names |= {path: partial(_planned, stream=s) for s, path in self._of_stream.items()}
-            mostly[NOVELTY] = partial(_or_mixed, name=_verdict, mixed="both")
-        self._lanes = {p: Lane(recording, spec, p, name) for p, name in names.items()}
-        self._mostly = {
-            path: MostlyLane(Lane(recording, spec, f"{MOSTLY}/{path}", name), piece)
-            for path, name in mostly.items()
-        }
-        self._iteration = 0
+        def done(code: int) -> tuple[str, Rgb]:
+            name = f"{STAY} on {label(spec.streams[code % count])}"
+            return (name, colour(code)) if code < count else (SWITCH, palette.GREY)
+
+        def lane(path: str, codes: Codes, names: Names, mixed: str = "") -> None:
+            self._lanes.append((codes, Lane(recording, spec, path, names)))
+            if mixed:
+                place = f"{MOSTLY}/{path}"
+                mostly = MostlyLane(recording, spec, place, _or_mixed(names, mixed), piece)
+                self._lanes.append((codes, mostly))
+
+        lane(ATTENDS, lambda c: c["stream"], attended, "switches")
+        if not by_progress:
+            lane(LEARNS, lambda c: c["module"], _learned)
+            lane(NOVELTY, _verdicts, _verdict, "both")
+            lane(DOES, lambda c: c["stream"] + count * c["action"], done)
+            lane(EXPLORES, lambda c: c["explored"], _explored)
+        for s in shown:
+            place = part(spec.streams, s)
+            if by_progress:
+                lane(f"state/{place}", partial(self._states, s), _state)
+            else:
+                lane(f"policy/{place}", partial(_policy, s), partial(_planned, s))
 
     def add(self, columns: SignalColumns) -> None:
         """Take the states of consecutive iterations in."""
-        self._iteration = int(columns.iterations[-1])
-        codes = {ATTENDS: columns["stream"]} | self._codes(columns)
-        for path, lane in self._lanes.items():
-            lane.add(columns.frames, columns.iterations, codes[path], columns.tau)
-        for path, mostly in self._mostly.items():
-            mostly.add(columns.frames, columns.iterations, codes[path], columns.tau)
+        for codes, lane in self._lanes:
+            lane.add(columns.frames, columns.iterations, codes(columns), columns.tau)
 
-    def _decided(self, columns: SignalColumns) -> dict[str, Codes]:
-        """What CD-MISFA does and decides."""
-        codes = {
-            LEARNS: columns["module"],
-            NOVELTY: np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0)),
-            DOES: columns["stream"] + len(self._known_by) * columns["action"],
-            EXPLORES: columns["explored"],
-        }
-        return codes | {path: columns["policy"][:, s] for s, path in self._of_stream.items()}
+    def _states(self, s: int, columns: SignalColumns) -> IntArray:
+        """What became of a stream; where it is known, by which module."""
+        known = columns["state"][:, s] == _KNOWN
+        told = known & (columns["stream"] == s) & (columns["known_by"] > 0)
+        last = np.maximum.accumulate(np.where(told, np.arange(len(told)), -1))
+        module = np.where(last < 0, self._known_by[s], columns["known_by"][last])
+        self._known_by[s] = module[-1]
+        return np.where(known, len(STATES) + module, columns["state"][:, s])
 
-    def _became(self, columns: SignalColumns) -> dict[str, Codes]:
-        """What became of each stream; where it is known, by which module."""
-        codes: dict[str, Codes] = {}
-        for s, path in self._of_stream.items():
-            known = columns["state"][:, s] == _KNOWN
-            told = known & (columns["stream"] == s) & (columns["known_by"] > 0)
-            last = np.maximum.accumulate(np.where(told, np.arange(len(told)), -1))
-            module = np.where(last < 0, self._known_by[s], columns["known_by"][last])
-            self._known_by[s] = module[-1]
-            codes[path] = np.where(known, len(STATES) + module, columns["state"][:, s])
-        return codes
-
-    def end(self, frames: int) -> None:
-        """Write what is left; all lanes end with the run.
-
-        Args:
-            frames: where the run ended.
-        """
-        for mostly in self._mostly.values():
-            mostly.end()
-        for lane in self._every():
-            lane.end(frames, self._iteration)
+    def end(self, frames: int, iteration: int) -> None:
+        """Write what is left; all lanes end with the run, at so many frames."""
+        for _, lane in self._lanes:
+            lane.end(frames, iteration)
         self.flush()
 
     def flush(self) -> None:
         """Hand over the changes since the last time."""
-        for lane in self._every():
+        for _, lane in self._lanes:
             lane.flush()
-
-    def _every(self) -> list[Lane]:
-        return [*self._lanes.values(), *(mostly.lane for mostly in self._mostly.values())]
-
-
-class MostlyLane:
-    """A lane that says of each piece of a run what was the case in most of its blocks.
-
-    Args:
-        lane: where it is said.
-        piece: blocks of a piece; by default a run has `PIECES`, known at its end.
-    """
-
-    def __init__(self, lane: Lane, piece: int | None) -> None:
-        self.lane, self._piece = lane, piece
-        self._tau = 0
-        self._waiting: list[tuple[Codes, Codes, Codes]] = []
-
-    def add(self, frames: Codes, iterations: Codes, codes: Codes, tau: int) -> None:
-        """Take what was the case in consecutive blocks of `tau` frames."""
-        self._tau = tau
-        self._waiting.append((frames, iterations, codes))
-        if self._piece is not None:
-            self._say(self._piece, last=False)
-
-    def end(self) -> None:
-        """Say what is left."""
-        blocks = sum(len(codes) for *_, codes in self._waiting)
-        self._say(self._piece or max(blocks // PIECES, 1), last=True)
-
-    def _say(self, piece: int, *, last: bool) -> None:
-        if not self._waiting:
-            return
-        frames, iterations, codes = (np.concatenate(p) for p in zip(*self._waiting, strict=True))
-        stop = len(codes) if last else len(codes) // piece * piece
-        starts = np.arange(0, stop, piece)
-        said = np.array([_most(codes[i : i + piece]) for i in starts], dtype=np.int64)
-        if len(starts):
-            every = np.repeat(said, piece)[:stop]
-            self.lane.add(frames[:stop], iterations[:stop], every, self._tau)
-        self._waiting = [(frames[stop:], iterations[stop:], codes[stop:])]
-
-
-def _most(codes: Codes) -> int:
-    """The code that most of these are, `_MIXED` where there is none."""
-    values, counts = np.unique(codes, return_counts=True)
-    place = int(counts.argmax())
-    return int(values[place]) if counts[place] >= MOST_OF * len(codes) else _MIXED
 
 
 class Lane:
     """A row of the view: changes of state, waiting to be handed over.
 
-    Where nothing was watched, nothing is the case: a bar ends where a gap begins.
+    Between blocks there is no state: a bar ends where a gap begins.
 
     Args:
         recording: where they go.
         spec: of the source.
         path: the entity.
-        name: what the codes stand for.
+        names: the states of the codes.
     """
 
     def __init__(
-        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, name: NameOf
+        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, names: Names
     ) -> None:
-        self._recording = recording
-        self._spec = spec
-        self._path = path
-        self._name = name
+        self._recording, self._spec, self._path, self._names = recording, spec, path, names
         self._state: str | None = None
         self._stop: int | None = None
         self._changes: list[tuple[int, int, str]] = []
         self._colours: dict[str, Rgb] = {}
         self._declared = 0
 
-    def add(self, frames: Codes, iterations: Codes, codes: Codes, tau: int) -> None:
-        """Keep the places where what the codes of blocks of `tau` frames stand for changes."""
+    def add(self, frames: IntArray, iterations: IntArray, codes: IntArray, tau: int) -> None:
+        """Keep the places where the state of blocks of `tau` frames changes."""
         stops = np.concatenate([frames[:1] if self._stop is None else [self._stop], frames + tau])
         begins = np.diff(codes.astype(np.int64), prepend=int(codes[0]) + 1) != 0
         gaps, self._stop = frames != stops[:-1], int(stops[-1])
         for i in np.flatnonzero(begins | gaps).tolist():
-            state, rgb = self._name(int(codes[i]))
+            state, rgb = self._names(int(codes[i]))
             self._colours.setdefault(state, rgb)
             if gaps[i]:
                 self._changes.append((int(stops[i]), int(iterations[i]), ""))
@@ -229,12 +162,12 @@ class Lane:
                 self._changes.append((int(frames[i]), int(iterations[i]), state))
 
     def end(self, frames: int, iteration: int) -> None:
-        """Nothing is the case any longer."""
+        """There is no state any longer."""
         if self._state is not None:
             self._changes.append((frames, iteration, ""))
 
     def flush(self) -> None:
-        """Hand over what waits, and say which states there are, where there are new ones."""
+        """Hand over what waits, and declare the states where there are new ones."""
         if not self._changes:
             return
         if self._declared < len(self._colours):
@@ -243,18 +176,77 @@ class Lane:
             known = rr.StateConfiguration(values=states, labels=states, colors=colours)
             self._recording.log(self._path, known, static=True)
         frames, iterations = (np.array([row[i] for row in self._changes]) for i in (0, 1))
-        changes = rr.StateChange.columns(state=[state for _, _, state in self._changes])
         times = time_columns(self._spec, frames, iterations)
+        changes = rr.StateChange.columns(state=[state for *_, state in self._changes])
         self._recording.send_columns(self._path, times, changes)
         self._changes = []
 
 
-def _or_mixed(code: int, name: NameOf, mixed: str) -> tuple[str, Rgb]:
-    return (mixed, palette.GREY) if code == _MIXED else name(code)
+class MostlyLane(Lane):
+    """A lane with the state of most of the blocks of each piece of a run.
+
+    Args:
+        recording: where they go.
+        spec: of the source.
+        path: the entity.
+        names: the states of the codes.
+        piece: blocks of a piece; by default a run has `PIECES`, known at its end.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        spec: SourceSpec,
+        path: str,
+        names: Names,
+        piece: int | None,
+    ) -> None:
+        super().__init__(recording, spec, path, names)
+        self._piece, self._tau = piece, 0
+        self._waiting: list[tuple[IntArray, IntArray, IntArray]] = []
+
+    def add(self, frames: IntArray, iterations: IntArray, codes: IntArray, tau: int) -> None:
+        """Take the codes of consecutive blocks of `tau` frames."""
+        self._tau = tau
+        self._waiting.append((frames, iterations, codes))
+        if self._piece is not None:
+            self._summarise(self._piece, last=False)
+
+    def end(self, frames: int, iteration: int) -> None:
+        """Add what is left; there is no state any longer."""
+        blocks = sum(len(codes) for *_, codes in self._waiting)
+        self._summarise(self._piece or max(blocks // PIECES, 1), last=True)
+        super().end(frames, iteration)
+
+    def _summarise(self, piece: int, *, last: bool) -> None:
+        if not self._waiting:
+            return
+        frames, iterations, codes = (np.concatenate(p) for p in zip(*self._waiting, strict=True))
+        stop = len(codes) if last else len(codes) // piece * piece
+        if stop:
+            most = [_most(codes[i : min(i + piece, stop)]) for i in range(0, stop, piece)]
+            every = np.repeat(np.array(most, dtype=np.int64), piece)[:stop]
+            super().add(frames[:stop], iterations[:stop], every, self._tau)
+        self._waiting = [(frames[stop:], iterations[stop:], codes[stop:])]
+
+
+def _most(codes: IntArray) -> int:
+    """The code that most of these are, `_MIXED` where there is none."""
+    values, counts = np.unique(codes, return_counts=True)
+    place = int(counts.argmax())
+    return int(values[place]) if counts[place] >= MOST_OF * len(codes) else _MIXED
+
+
+def _or_mixed(names: Names, mixed: str) -> Names:
+    return lambda code: (mixed, palette.GREY) if code == _MIXED else names(code)
 
 
 def _learned(module: int) -> tuple[str, Rgb]:
     return f"module {module}", palette.SAND if module % 2 else palette.KHAKI
+
+
+def _verdicts(columns: SignalColumns) -> IntArray:
+    return np.where(columns["novel"], _NOVEL, np.maximum(columns["known_by"], 0))
 
 
 def _verdict(code: int) -> tuple[str, Rgb]:
@@ -263,21 +255,19 @@ def _verdict(code: int) -> tuple[str, Rgb]:
     return (f"known by {code}", palette.MIST) if code else ("constant", palette.BROWN)
 
 
-def _done(code: int, streams: Sequence[str]) -> tuple[str, Rgb]:
-    if code >= len(streams):
-        return SWITCH, palette.GREY
-    return f"{STAY} on {streams[code]}", colour(code)
-
-
-def _chosen(explored: int) -> tuple[str, Rgb]:
+def _explored(explored: int) -> tuple[str, Rgb]:
     return ("explored", palette.ROSE) if explored else ("greedy", palette.MOSS)
 
 
-def _planned(action: int, stream: int) -> tuple[str, Rgb]:
+def _policy(s: int, columns: SignalColumns) -> IntArray:
+    return columns["policy"][:, s]
+
+
+def _planned(stream: int, action: int) -> tuple[str, Rgb]:
     return (SWITCH, palette.GREY) if action else (STAY, colour(stream))
 
 
-def _became(code: int) -> tuple[str, Rgb]:
+def _state(code: int) -> tuple[str, Rgb]:
     """A stream's state by its code in `STATES`; beyond them stand the modules that know it."""
     if code >= len(STATES):
         module = code - len(STATES)

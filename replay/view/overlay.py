@@ -15,10 +15,9 @@ from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
-from replay.view.columns import ITERATION, Column, line_column, power_of_ten
+from replay.view.columns import ITERATION, MOST_STREAMS, Column, line_column, power_of_ten
 from replay.view.labels import label, part
-from replay.view.layouts.panels import MOST_STREAMS
-from replay.view.layouts.plots import blueprint, lines, time_axis
+from replay.view.layouts import blueprint, lines, time_axis
 
 CURVES = {
     "eta_dot": "Change of slowness η̇, as powers of ten: a module is saved when it is below δ",

@@ -1,24 +1,24 @@
-"""A run as rows of a Rerun recording: every signal as it is, and what eyes need besides.
+"""A run as rows of a Rerun recording: every signal as it is, and curves and lanes for people.
 
-`/signals/<name>` holds each signal's values for every iteration, read back they are
-those of run.mcap; of a signal that the run never tells there is nothing. Where frames are missing,
-lines of values a frame have a row of NaN. `/world`, `/lanes`,
-`/decision`, `/gate`, `/abstraction`, `/streams` and `/modules` show the same for a person.
+`/signals/<name>` holds each signal's values for every iteration, those of run.mcap; a signal that
+the run never has gets no entity. Where frames are missing, lines with a value per frame have a row
+of NaN.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from cdmisfa.core.blocks import SourceSpec
+from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.modules import Module
-from cdmisfa.core.signals import SIGNALS, Signal
+from cdmisfa.core.signals import SIGNALS
 from replay.palette import BRICK, GREY, MIST, Rgb, colour, darker, packed, packed_all, pale, shade
 from replay.runs.columns import Blocks, SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader
@@ -29,32 +29,39 @@ from replay.view.columns import (
     LOG_TIME,
     TIMELINE_SIGNALS,
     Column,
-    TensorColumn,
     frames_column,
     line_column,
     power_of_ten,
+    tensor_column,
     tensors,
     time_columns,
 )
-from replay.view.labels import label, part
+from replay.view.labels import label, line_labels, part
 from replay.view.lanes import Lanes
-from replay.view.streams import add_streams, thresholds
 from replay.view.summary import decision_text
 
 AXES = {"S": "stream", "A": "action", "J": "output"}
 """Names of tensors' dimensions; the second S of a tensor is the next stream."""
 
 BESIDE = {"expert": 1, "reward": 2, "gate_mean": 1, "gate_sd": 2, "roc_error": 1}
-"""Colours of signals that are drawn beside another one."""
+"""Number of the first colour of signals that are drawn beside another one."""
 
 POWERS = {"eta_dot": "abstraction/log_eta_dot", "xi": "abstraction/log_xi"}
 """Entities of signals drawn as powers of ten: they fall through several."""
 
-MILLI = 1000.0
-"""Of rewards and values: they are small numbers."""
+OF_STREAM = {
+    "learning_error": "streams/learning_error",
+    "tested": "streams/tested",
+    "fitted": "streams/fitted",
+    "change": "streams/log_change",
+}
+"""Signals of the watched stream, and where each stream has its line through its own blocks.
 
-SPELLED = ("y", "y_frozen", "eta", "eta_dot", "eta_inst", "eta_inst_frozen", "xi", "xi_dot")
-"""Signals whose name is their symbol, spelled out."""
+Those at a `log_` entity are drawn as powers of ten.
+"""
+
+HARDLY_WATCHED = 1000.0
+"""Interest from which on a stream promises most because it was hardly watched: it has no line."""
 
 RECENT = 50
 """Blocks over which the share of each stream is taken."""
@@ -68,8 +75,28 @@ MOST_IN_TABLE = 6
 WATCHED_NAME = "world/watched/name"
 DECISION_TABLE = "decision/table"
 
-WIDTH = 1.5
-"""Of lines."""
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Values of an entity that is drawn as lines.
+
+    Attributes:
+        path: the entity.
+        labels: of the lines.
+        values: (n, ...) for the n rows.
+        rgbs: colours of the lines; by default pale ones from `number` on.
+        rows: which records the values are of; by default all.
+        every_frame: there is a row for each frame of a record.
+    """
+
+    path: str
+    labels: Sequence[str]
+    values: NDArray[Any]
+    rgbs: Sequence[Rgb] = ()
+    number: int = 0
+    width: float = 1.5
+    rows: NDArray[Any] | None = None
+    every_frame: bool = False
 
 
 class RunView:
@@ -77,7 +104,7 @@ class RunView:
 
     Args:
         recording: the recording.
-        header: what stands at the beginning of the run's log.
+        header: of the run's log.
         streams: those that get lines and lanes of their own.
         every: show images of every this many frames.
         piece: see `Lanes`.
@@ -92,15 +119,10 @@ class RunView:
         *,
         piece: int | None = None,
     ) -> None:
-        self._recording = recording
-        self._by_progress = header.by_progress
-        self._thresholds = thresholds(header) if header.by_progress else {}
-        if header.delta is not None and header.delta > 0:
-            self._thresholds["abstraction/delta"] = "δ", math.log10(header.delta)
-        self._every = every
-        self._spec = header.spec
+        self._recording, self._spec, self._every = recording, header.spec, every
+        self._streams, self._by_progress = list(streams), header.by_progress
+        self._thresholds = _thresholds(header)
         self._columns: dict[str, Column] = {}
-        self._streams = streams
         self._blocks = Blocks.concatenated(())
         self._recent = np.zeros((0, len(streams)), dtype=bool)
         self._stream_of: dict[int, int] = {}
@@ -116,8 +138,9 @@ class RunView:
             self._add(columns)
         for frames, watched in batch.watched:
             self._watched(frames, watched)
-        for frames, truth in batch.truth:
-            self._truth(frames, truth)
+        for frames, truth in batch.truth if self._spec.truth else ():
+            curve = Curve("world/truth", self._spec.truth, truth, every_frame=True)
+            self._draw(curve, frames, batch.blocks.iteration(frames))
         for t, phi in batch.phi:
             (iteration,) = batch.blocks.iteration(np.array([t])).tolist()
             self.weights("abstraction/phi", t, iteration, phi)
@@ -125,54 +148,65 @@ class RunView:
             self.event(event.t, event.iteration, event.text, event.level)
 
     def finish(self, outline: Outline, modules: Sequence[Module]) -> None:
-        """Write what is known at the end, and hand over everything that waits.
-
-        Args:
-            outline: the run in short.
-            modules: the frozen modules, for their weights.
-        """
-        starts = {save.module: save.t for save in outline.saved}
+        """Write weights of the frozen modules and thresholds, and hand over what waits."""
+        saved = {save.module: save.t for save in outline.saved}
         for module in modules:
-            t = starts.get(module.index, outline.end)
+            t = saved.get(module.index, outline.end)
             self.weights(f"modules/{module.index}/weights", t, module.iteration, module.phi)
+        starts, iterations = outline.blocks.starts, outline.blocks.iterations
         if outline.iterations:
-            self.threshold(outline.blocks.starts[[0, -1]], outline.blocks.iterations[[0, -1]])
-        self._lanes.end(outline.end)
+            self.threshold(starts[[0, -1]], iterations[[0, -1]])
+            self._lanes.end(outline.end, int(iterations[-1]))
         self.flush()
 
     def _add(self, columns: SignalColumns) -> None:
         """Take the records of consecutive iterations."""
-        self._signals(columns)
-        self._attention(columns)
-        self._decision(columns)
-        self._gate(columns)
-        self._saved(columns)
-        self._powers(columns)
+        saved = np.flatnonzero(columns["saved"])
+        modules, streams = columns["module"][saved].tolist(), columns["stream"][saved].tolist()
+        self._stream_of |= zip(modules, streams, strict=True)
+        curves = [self._signals, self._powers, self._decision, self._gate, self._attention]
+        for made in [*curves, self._of_streams] if self._by_progress else curves:
+            for curve in made(columns):
+                rows = slice(None) if curve.rows is None else curve.rows
+                self._draw(curve, *(times[rows] for times in columns.times(curve.every_frame)))
+        self._tensors(columns)
+        self._table(columns)
         self._name(columns)
-        if self._by_progress:
-            add_streams(columns, self._spec.streams, self._streams, self._line)
+        if len(saved):
+            self._saved(columns, saved)
         self._lanes.add(columns)
 
-    def _watched(self, at: NDArray[np.int64], frames: NDArray[Any]) -> None:
+    def _draw(self, curve: Curve, frames: IntArray, iterations: IntArray) -> None:
+        rgbs = curve.rgbs
+        if not rgbs:
+            one = len(set(curve.labels)) == 1
+            rgbs = [pale(curve.number + (0 if one else i)) for i in range(len(curve.labels))]
+        how = curve.labels, rgbs, curve.width
+        line = self._column(curve.path, line_column, *how, every_frame=curve.every_frame)
+        line.add(frames, iterations, curve.values.reshape(len(frames), -1))
+
+    def _watched(self, at: IntArray, frames: NDArray[Any]) -> None:
         """Take (n, *frame_shape) of what the learner saw at n frames."""
         if self._spec.images:
             kept = at % self._every == 0
             if not kept.all():
                 at, frames = at[kept], frames[kept]
         if len(at):
-            column = self._column("world/watched", frames_column, WIDTH)
+            column = self._column("world/watched", frames_column, 1.5)
             column.add(at, self._blocks.iteration(at), frames)
 
-    def _truth(self, at: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-        """Take (n, D) of what the world knows at n frames, and the learner does not."""
-        if self._spec.truth:
-            line = self._line("world/truth", self._spec.truth, every_frame=True)
-            line.add(at, self._blocks.iteration(at), values)
-
-    def weights(self, path: str, t: int, iteration: int, phi: NDArray[np.float64]) -> None:
-        """Show (J, I) weights at an entity."""
+    def weights(self, path: str, t: int, iteration: int, phi: FloatArray) -> None:
+        """Show (J, I) weights at an entity: as images below one another, bars, or a tensor."""
+        shape = self._spec.frame_shape
+        shown: Any
+        if self._spec.images and phi.shape[1] == shape[0] * shape[1]:
+            shown = rr.Image(shade(phi.reshape(-1, shape[1])))
+        elif phi.size <= 256:
+            shown = rr.BarChart(tensors(phi.reshape(1, -1)), color=packed(MIST))
+        else:
+            shown = rr.Tensor(phi.copy(), dim_names=("output", "input"))
         self._set_time(t, iteration)
-        self._recording.log(path, self._picture(phi))
+        self._recording.log(path, shown)
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Say in words what happened."""
@@ -180,11 +214,11 @@ class RunView:
         level = "WARN" if level == "WARNING" else level
         self._recording.log("events", rr.TextLog(label(text), level=level))
 
-    def threshold(self, frames: NDArray[np.int64], iterations: NDArray[np.int64]) -> None:
+    def threshold(self, frames: IntArray, iterations: IntArray) -> None:
         """Draw the lines below which something is learned, through frames, (n,)."""
         for path, (name, value) in self._thresholds.items():
-            line = self._line(path, [name], rgbs=[GREY])
-            line.add(frames, iterations, np.full((len(frames), 1), value))
+            curve = Curve(path, [name], np.full(len(frames), value), [GREY])
+            self._draw(curve, frames, iterations)
 
     def flush(self) -> None:
         """Hand over everything that waits."""
@@ -192,53 +226,121 @@ class RunView:
             column.flush()
         self._lanes.flush()
 
-    def _signals(self, columns: SignalColumns) -> None:
-        """Every signal's values as they are."""
+    def _signals(self, columns: SignalColumns) -> Iterator[Curve]:
+        """Every signal's values as they are, but for tensors."""
         outputs = columns["y"].shape[2]
         for signal in SIGNALS.values():
-            if signal.name in TIMELINE_SIGNALS:
-                continue
             value, path = columns[signal.name], f"signals/{signal.name}"
+            if signal.name in TIMELINE_SIGNALS or signal.show == "heat":
+                continue
             if value.dtype.kind == "i" and not has_values(signal.name, value):
                 continue
             every_frame = "T" in signal.dims
-            frames, iterations = columns.times(every_frame)
-            if signal.show == "heat":
-                self._tensor(signal, path, columns, value)
-            elif signal.dims == "S":
-                names = self._spec.streams
-                rgbs = [colour(s) for s in range(len(names))]
-                self._line(path, names, rgbs=rgbs).add(frames, iterations, value)
+            if signal.dims == "S":
+                rgbs = [colour(s) for s in range(len(self._spec.streams))]
+                yield Curve(path, self._spec.streams, value, rgbs)
             elif signal.dims.startswith("M"):
                 for i in range(value.shape[1]):
-                    labels = _labels(signal, i + 1, outputs)
-                    own, place = self._of_module(i + 1, labels), f"{path}/{i + 1}"
-                    line = self._line(place, labels, rgbs=own, every_frame=every_frame)
-                    line.add(frames, iterations, value[:, i].reshape(len(frames), -1))
+                    labels = line_labels(signal, i + 1, outputs)
+                    rgbs, place = self._of_module(i + 1, labels), f"{path}/{i + 1}"
+                    yield Curve(place, labels, value[:, i], rgbs, every_frame=every_frame)
             else:
-                labels, number = _labels(signal, 0, outputs), BESIDE.get(signal.name, 0)
-                line = self._line(path, labels, number, every_frame=every_frame)
-                line.add(frames, iterations, value.reshape(len(frames), -1))
+                labels, number = line_labels(signal, 0, outputs), BESIDE.get(signal.name, 0)
+                yield Curve(path, labels, value, number=number, every_frame=every_frame)
 
-    def _tensor(
-        self, signal: Signal, path: str, columns: SignalColumns, value: NDArray[Any]
-    ) -> None:
-        crowded = len(self._spec.streams) > len(self._streams)
-        kept = columns.iterations % SPARSE == 0 if crowded else np.ones(len(value), dtype=bool)
-        if value.size and kept.any():
-            names = [AXES[d] for d in signal.dims]
-            if names.count("stream") > 1:
-                names[-1] = "next stream"
-            column = self._column(path, TensorColumn, names)
-            column.add(columns.frames[kept], columns.iterations[kept], value[kept])
+    def _of_module(self, module: int, labels: Sequence[str]) -> list[Rgb]:
+        """The colours of a module's lines: that of its stream, of further outputs darker."""
+        if module not in self._stream_of:
+            return []
+        rgb = colour(self._stream_of[module])
+        one = len(set(labels)) == 1
+        return [rgb if one or i == 0 else darker(rgb) for i in range(len(labels))]
 
-    def _powers(self, columns: SignalColumns) -> None:
+    def _powers(self, columns: SignalColumns) -> Iterator[Curve]:
         """Signals that fall through several powers of ten."""
         outputs = columns["y"].shape[2]
         for name, path in POWERS.items():
-            labels = _labels(SIGNALS[name], 0, outputs)
-            values = columns[name].astype(np.float64).reshape(len(columns), -1)
-            self._line(path, labels[: values.shape[1]]).add(*columns.times(), power_of_ten(values))
+            values = power_of_ten(columns[name].astype(np.float64).reshape(len(columns), -1))
+            yield Curve(path, line_labels(SIGNALS[name], 0, outputs)[: values.shape[1]], values)
+
+    def _decision(self, columns: SignalColumns) -> Iterator[Curve]:
+        """Reward and value of each shown stream."""
+        reward, value = columns["R"], columns["Q"]
+        for s in self._streams:
+            place, names, rgbs = part(self._spec.streams, s), [self._spec.streams[s]], [colour(s)]
+            if reward.size:
+                stay = 1000 * reward[:, s, 0, s]
+                yield Curve(f"decision/R_stay/{place}", names, stay, rgbs)
+            advantage = 1000 * (value[:, s, 0] - value[:, s, 1])
+            yield Curve(f"decision/advantage/{place}", names, advantage, rgbs)
+
+    def _gate(self, columns: SignalColumns) -> Iterator[Curve]:
+        """Each frozen module's band of 2 SD, whose blocks it knows."""
+        mean, width = columns["band_mean"], 2 * columns["band_sd"]
+        edges = np.concatenate([mean - width, mean + width], axis=2)
+        for i in range(edges.shape[1]):
+            labels = [f"band of module {i + 1}"] * edges.shape[2]
+            yield Curve(f"gate/band/{i + 1}", labels, edges[:, i], [GREY] * len(labels), width=1.0)
+
+    def _attention(self, columns: SignalColumns) -> Iterator[Curve]:
+        """How much of the recent blocks each shown stream was watched."""
+        watched = columns["stream"][:, None] == np.array(self._streams)
+        all_of_them = np.concatenate([self._recent, watched])
+        sums = np.cumsum(all_of_them, axis=0)
+        end = np.arange(len(self._recent), len(all_of_them))
+        before = end - RECENT
+        shares = sums[end] - np.where(before[:, None] < 0, 0, sums[np.maximum(before, 0)])
+        self._recent = all_of_them[-RECENT:]
+        names = [self._spec.streams[s] for s in self._streams]
+        values = shares / np.minimum(end + 1, RECENT)[:, None]
+        yield Curve("decision/attention", names, values, [colour(s) for s in self._streams])
+
+    def _of_streams(self, columns: SignalColumns) -> Iterator[Curve]:
+        """Of each shown stream its signals in its own blocks, and its interest in all.
+
+        Signals are NaN where the stream's candidate was not tested yet, so that no line leads from
+        one candidate to the next; interest is where the stream was hardly watched.
+        """
+        for s in self._streams:
+            own, name = columns["stream"] == s, self._spec.streams[s]
+            place, rgb = part(self._spec.streams, s), colour(s)
+            untested = np.isnan(columns["tested"][own])
+            for signal, path in OF_STREAM.items() if own.any() else ():
+                values = np.where(untested, np.nan, columns[signal][own])
+                values = power_of_ten(values) if "log_" in path else values
+                rgbs = [darker(rgb) if signal == "fitted" else rgb]
+                labels = [f"{SIGNALS[signal].symbol} {name}"]
+                yield Curve(f"{path}/{place}", labels, values, rgbs, rows=own)
+            interest = columns["interest"][:, s]
+            promised = np.where(interest < HARDLY_WATCHED, interest, np.nan)
+            yield Curve(f"streams/interest/{place}", [name], promised, [rgb])
+
+    def _tensors(self, columns: SignalColumns) -> None:
+        kept = np.ones(len(columns), dtype=bool)
+        if len(self._spec.streams) > len(self._streams):
+            kept = columns.iterations % SPARSE == 0
+        for signal in SIGNALS.values():
+            value = columns[signal.name]
+            if signal.show == "heat" and value.size and kept.any():
+                names = [AXES[d] for d in signal.dims]
+                if names.count("stream") > 1:
+                    names[-1] = "next stream"
+                column = self._column(f"signals/{signal.name}", tensor_column, names)
+                column.add(columns.frames[kept], columns.iterations[kept], value[kept])
+
+    def _table(self, columns: SignalColumns) -> None:
+        """R and Q as tables, now and then."""
+        kept = np.flatnonzero(columns.iterations % SPARSE == 0)
+        reward, value = columns["R"], columns["Q"]
+        if not reward.size or not len(kept):
+            return
+        shown = self._streams[:MOST_IN_TABLE]
+        names = [label(self._spec.streams[s]) for s in shown]
+        texts = [decision_text(names, reward[i][shown][:, :, shown], value[i][shown]) for i in kept]
+        kinds = [rr.MediaType.MARKDOWN] * len(texts)
+        self._send(
+            columns, kept, DECISION_TABLE, rr.TextDocument.columns(text=texts, media_type=kinds)
+        )
 
     def _name(self, columns: SignalColumns) -> None:
         """Put a frame around what is watched, in the colour and with the name of its stream."""
@@ -251,114 +353,31 @@ class RunView:
             self._recording.log(WATCHED_NAME, frame, static=True)
         streams = columns["stream"][turns].tolist()
         self._named = streams[-1]
-        names = rr.Boxes2D.columns(
-            labels=[label(self._spec.streams[s]) for s in streams],
-            colors=packed_all([colour(s) for s in streams]),
-        )
-        times = time_columns(self._spec, columns.frames[turns], columns.iterations[turns])
-        self._recording.send_columns(WATCHED_NAME, times, names)
+        labels = [label(self._spec.streams[s]) for s in streams]
+        colours = packed_all([colour(s) for s in streams])
+        names = rr.Boxes2D.columns(labels=labels, colors=colours)
+        self._send(columns, turns, WATCHED_NAME, names)
 
-    def _of_module(self, module: int, labels: Sequence[str]) -> list[Rgb] | None:
-        """The colours of a module's lines: that of its stream, of further outputs dimmer."""
-        if module not in self._stream_of:
-            return None
-        rgb = colour(self._stream_of[module])
-        one = len(set(labels)) == 1
-        return [rgb if one or i == 0 else darker(rgb) for i in range(len(labels))]
-
-    def _attention(self, columns: SignalColumns) -> None:
-        """How much of the recent blocks each shown stream was watched."""
-        watched = columns["stream"][:, None] == np.array(self._streams)
-        all_of_them = np.concatenate([self._recent, watched])
-        sums = np.cumsum(all_of_them, axis=0)
-        end = np.arange(len(self._recent), len(all_of_them))
-        before = end - RECENT
-        shares = sums[end] - np.where(before[:, None] < 0, 0, sums[np.maximum(before, 0)])
-        self._recent = all_of_them[-RECENT:]
-        names = [self._spec.streams[s] for s in self._streams]
-        line = self._line("decision/attention", names, rgbs=[colour(s) for s in self._streams])
-        line.add(*columns.times(), shares / np.minimum(end + 1, RECENT)[:, None])
-
-    def _decision(self, columns: SignalColumns) -> None:
-        """Reward and value of each shown stream, as lines in the streams' colours."""
-        reward, value = columns["R"], columns["Q"]
-        for s in self._streams:
-            place, rgbs = part(self._spec.streams, s), [colour(s)]
-            names = [self._spec.streams[s]]
-            if reward.size:
-                line = self._line(f"decision/R_stay/{place}", names, rgbs=rgbs)
-                line.add(*columns.times(), MILLI * reward[:, s, 0, s])
-            line = self._line(f"decision/advantage/{place}", names, rgbs=rgbs)
-            line.add(*columns.times(), MILLI * (value[:, s, 0] - value[:, s, 1]))
-        kept = np.flatnonzero(columns.iterations % SPARSE == 0)
-        if reward.size and len(kept):
-            names = [label(self._spec.streams[s]) for s in self._streams[:MOST_IN_TABLE]]
-            shown = list(self._streams[:MOST_IN_TABLE])
-            texts = [
-                decision_text(names, reward[i][shown][:, :, shown], value[i][shown]) for i in kept
-            ]
-            times = time_columns(self._spec, columns.frames[kept], columns.iterations[kept])
-            self._recording.send_columns(
-                DECISION_TABLE,
-                times,
-                rr.TextDocument.columns(
-                    text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts)
-                ),
-            )
-
-    def _gate(self, columns: SignalColumns) -> None:
-        """Each frozen module's band of 2 SD, whose blocks it knows."""
-        mean, width = columns["band_mean"], 2 * columns["band_sd"]
-        edges = np.concatenate([mean - width, mean + width], axis=2)
-        for i in range(edges.shape[1]):
-            labels = [f"band of module {i + 1}"] * edges.shape[2]
-            self._line(f"gate/band/{i + 1}", labels, rgbs=[GREY] * len(labels), width=1.0).add(
-                *columns.times(), edges[:, i]
-            )
-
-    def _saved(self, columns: SignalColumns) -> None:
-        """Where that which must come down stood when a module was saved."""
-        saved = columns["saved"]
-        self._stream_of |= zip(
-            columns["module"][saved].tolist(), columns["stream"][saved].tolist(), strict=True
-        )
-        path, name = "abstraction/saved", "eta_dot"
+    def _saved(self, columns: SignalColumns, saved: IntArray) -> None:
+        """Mark the value of the signal that must come down where a module was saved."""
+        path, values = "abstraction/saved", power_of_ten(columns["eta_dot"])
         if self._by_progress:
-            path, name = "streams/saved", "learning_error"
-        if saved.any():
-            stood = columns[name][saved].reshape(int(saved.sum()), -1)[:, :1]
-            if name in POWERS:
-                stood = power_of_ten(stood)
-            self._column(path, _marks).add(columns.frames[saved], columns.iterations[saved], stood)
+            path, values = "streams/saved", columns["learning_error"]
+        stood = values.reshape(len(columns), -1)[saved, :1]
+        style = rr.SeriesPoints(
+            colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
+        )
+        column = self._column(path, Column, style)
+        column.add(columns.frames[saved], columns.iterations[saved], stood)
 
-    def _picture(self, phi: NDArray[np.float64]) -> Any:
-        """(J, I) weights as images below one another, as bars, or as a tensor."""
-        shape = self._spec.frame_shape
-        if self._spec.images and phi.shape[1] == shape[0] * shape[1]:
-            return rr.Image(shade(phi.reshape(-1, shape[1])))
-        if phi.size <= 256:
-            return rr.BarChart(tensors(phi.reshape(1, -1)), color=packed(MIST))
-        return rr.Tensor(phi.copy(), dim_names=("output", "input"))
+    def _send(self, columns: SignalColumns, rows: IntArray, path: str, values: Any) -> None:
+        times = time_columns(self._spec, columns.frames[rows], columns.iterations[rows])
+        self._recording.send_columns(path, times, values)
 
     def _set_time(self, t: int, iteration: int) -> None:
         self._recording.set_time(FRAME, sequence=t)
         self._recording.set_time(ITERATION, sequence=max(iteration, 0))
         self._recording.set_time(LOG_TIME, timestamp=np.datetime64(self._spec.time_ns(t), "ns"))
-
-    def _line(
-        self,
-        path: str,
-        labels: Sequence[str],
-        number: int = 0,
-        *,
-        rgbs: Sequence[Rgb] | None = None,
-        width: float = WIDTH,
-        every_frame: bool = False,
-    ) -> Column:
-        """The column of a line or several, in the colours from `number` on."""
-        one = len(set(labels)) == 1
-        rgbs = rgbs or [pale(number + (0 if one else i)) for i in range(len(labels))]
-        return self._column(path, line_column, labels, rgbs, width, every_frame=every_frame)
 
     def _column(self, path: str, make: Callable[..., Column], *how: Any, **more: bool) -> Column:
         """The column of an entity, made when it is first needed."""
@@ -367,25 +386,13 @@ class RunView:
         return self._columns[path]
 
 
-def _marks(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column:
-    """A column that is drawn as marks where a module was saved."""
-    style = rr.SeriesPoints(
-        colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
-    )
-    return Column(recording, spec, path, style)
-
-
-def _labels(signal: Signal, module: int, outputs: int) -> list[str]:
-    """Names of a signal's lines: its symbol and unit, its module, its outputs."""
-    name = signal.name.replace("_", " ")
-    if module:
-        symbol = signal.symbol.replace("_i", f"_{module}")
-        text = symbol if signal.name in SPELLED else f"{symbol} {name} module {module}".strip()
-    elif signal.name in SPELLED or signal.symbol == name:
-        text = signal.symbol
-    else:
-        text = f"{signal.symbol} {name}".strip()
-    unit = "" if signal.unit in ("", "1") else f" [{signal.unit}]"
-    if "J" not in signal.dims or outputs == 1:
-        return [f"{text}{unit}"]
-    return [f"{text} output {j + 1}{unit}" for j in range(outputs)]
+def _thresholds(header: RunHeader) -> dict[str, tuple[str, float]]:
+    """Label and value of the lines below which something is learned, by entity."""
+    found = {}
+    if header.by_progress and header.settled is not None:
+        change, error = header.settled
+        found["streams/settled"] = "settled below", math.log10(change)
+        found["streams/threshold"] = "learned below", error
+    if header.delta is not None and header.delta > 0:
+        found["abstraction/delta"] = "δ", math.log10(header.delta)
+    return found

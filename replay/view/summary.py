@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.run import Outline
-from replay.view.layouts.panels import MOST_STREAMS
+from replay.view.columns import MOST_STREAMS
 
 ENDED = "ended:"
 """How the event begins that says why a run ended."""

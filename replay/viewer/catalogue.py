@@ -213,12 +213,11 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         LogDamagedError: that run cannot be read.
     """
     from replay.runs.run import read_outline
+    from replay.view.columns import MOST_STREAMS
 
     # These take half a second: only once the table is there.
-    from replay.view.layouts.of_run import run_layout
-    from replay.view.layouts.panels import MOST_STREAMS
-    from replay.view.world.first import first_of
-    from replay.view.world.known import world_of_run
+    from replay.view.panels import run_layout
+    from replay.view.world import world_of_run, world_tab
 
     results = [read_properties(run)["result"] for run in runs]
     most = max(range(len(runs)), key=lambda i: int(results[i]["modules"]))
@@ -230,7 +229,7 @@ def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None 
         lines={name: values[:0] for name, values in outline.lines.items()},
     )
     streams, file = outline.streams(MOST_STREAMS), place / "layout.rbl"
-    shown = first_of(outline.header, world_of_run(outline.header, runs[most])[0], streams)
+    shown = world_tab(outline.header, world_of_run(outline.header, runs[most])[0], streams)
     run_layout(outline, shown, tab=tab).save(APPLICATION, str(file))
     layouts = dataset.blueprint_dataset()
     (segment,) = layouts.register([file.as_uri()], [ROWS], "replace").wait(REGISTER_SECONDS)
@@ -283,8 +282,10 @@ def _register(dataset: Any, files: Sequence[Path], layer: str) -> dict[Path, str
 
 def _as_layer(view: Path, out: Path) -> Path:
     """A copy of a view that leaves a run's properties to its row, and the robot's body out."""
-    from replay.view.world.body import BODY  # imports the package, as the layout did
-    from replay.view.world.scene import SCENE
+    from replay.view.scene import (
+        BODY,  # imports the package, as the layout did
+        SCENE,
+    )
 
     reader = RrdReader(str(view))
     (store,) = (s for s in reader.store_entries() if s.kind == "recording")

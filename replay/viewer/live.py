@@ -24,11 +24,11 @@ from cdmisfa.core.signals import NO_STATE, SCHEMA_VERSION, SIGNALS, BlockSignals
 from replay.runs.columns import Blocks, columns_of_records
 from replay.runs.log import Batch, Frames, RunHeader, read_batches
 from replay.runs.run import LINES, Outline
-from replay.view.layouts.of_run import run_layout
-from replay.view.layouts.panels import MOST_MODULES, MOST_STREAMS
+from replay.view.columns import MOST_STREAMS
+from replay.view.panels import MOST_MODULES, run_layout
 from replay.view.properties import APPLICATION
 from replay.view.run import RunView
-from replay.view.world.first import WorldView
+from replay.view.world import WorldView
 from replay.viewer.broadcast import Broadcast
 
 EVERY_SECONDS = 1.5
@@ -84,7 +84,7 @@ class LiveView(Sink):
         self._world = WorldView(
             self._recording, outline.header, run or Path(), streams, EVERY_FRAMES
         )
-        self._recording.send_blueprint(run_layout(outline, self._world.first()))
+        self._recording.send_blueprint(run_layout(outline, self._world.tab()))
         # No image is left out here: of each block only the first is taken.
         self._view = RunView(self._recording, outline.header, streams, every=1, piece=PIECE)
         for note in self._world.notes:

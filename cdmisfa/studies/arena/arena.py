@@ -122,8 +122,16 @@ def plan_arena(
             config = configure(preset, settings=(*CONTESTANTS[learner], *settings)).learner
             point = {"set": name, "learner": learner, **more}
             for seed in each:
-                number = identity(shown, section_table(config), seed, version)
-                trials.append(ArenaTrial(number, point, seed, entry, config, library, version))
+                trial = ArenaTrial(
+                    id=identity(shown, section_table(config), seed, version),
+                    point=point,
+                    seed=seed,
+                    code=version,
+                    streams=entry,
+                    learner=config,
+                    library=library,
+                )
+                trials.append(trial)
     return trials
 
 

@@ -1,16 +1,28 @@
-"""Plots and lanes over time, and the frame around all tabs: axes that hold the data, and align."""
+"""Parts of layouts: the tables of layouts.toml, plots and axes, the frame around all tabs."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray
 from cdmisfa.core.errors import UsageError
 from replay.view.columns import FRAME
+
+Span = tuple[float, float]
+"""Least and most value of an axis."""
+
+Bounds = tuple[Span, Span]
+"""Ranges of x and y."""
+
 
 ROOM = 0.14
 """Part of a time axis, beyond its end, that is left to the legend: so it covers no data."""
@@ -27,7 +39,115 @@ LANE = 35
 MOST_LANES = 9
 """Lanes that get their full height; more are scrolled."""
 
-Span = tuple[float, float]
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """An axis that holds every value of some signals.
+
+    Attributes:
+        signals: their names.
+        low: where it begins, whatever they are.
+        powers: they are drawn as powers of ten.
+        tested: of their values those where the candidate was tested are drawn.
+        watched: of their values those of streams that were hardly watched are not drawn.
+        also: the threshold that it holds too.
+    """
+
+    signals: tuple[str, ...]
+    low: float | None = None
+    powers: bool = False
+    tested: bool = False
+    watched: bool = False
+    also: Literal["", "delta", "settled"] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A view in a column of views.
+
+    Attributes:
+        title: with facts of the run in braces, see `Panels`.
+        entities: what it shows; curves that the run does not have are left out.
+        kind: curves, or lanes; of all of the run, or of the last blocks.
+        height: of curves, beside other panels; lanes have what they need.
+        lanes: how many there are; `per_stream` besides one for each stream.
+        span: of the values; `few` only where there are few streams.
+        range: holds the values instead.
+        legend: there may be one.
+        each_module: there is one for each module, whose number is {i}.
+        when: the run has it where its gate has bands or clusters, or with several outputs.
+    """
+
+    title: str
+    entities: tuple[str, ...]
+    kind: Literal["lines", "lanes", "near lanes"] = "lines"
+    height: float = 130
+    lanes: int = 0
+    per_stream: bool = False
+    span: Span | None = None
+    few: bool = False
+    range: Range | None = None
+    legend: bool = True
+    each_module: bool = False
+    when: Literal["", "bands", "clusters", "outputs"] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Tab:
+    """Panels below one another, with what stands beside them.
+
+    Attributes:
+        left: what it sees and looks for, or input, output and weights.
+        table: tables of R and Q stand on the right.
+    """
+
+    name: str
+    panels: tuple[Panel, ...]
+    left: Literal["", "sees", "now"] = ""
+    table: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """What a module has learned.
+
+    Attributes:
+        title: of its panel.
+        entities: of the panel: what is followed, and the output.
+        span: the least and the most of both.
+    """
+
+    title: str
+    entities: tuple[str, ...]
+    span: Span
+
+
+@dataclass(frozen=True, slots=True)
+class WorldTab:
+    """What the first tab shows of the world.
+
+    Attributes:
+        scene: there is a world in 3D.
+        wall: ranges of x and y of a wall of images, where there is one.
+        lessons: what each module has learned.
+    """
+
+    scene: bool = False
+    wall: Bounds | None = None
+    lessons: Sequence[Lesson] = ()
+
+
+@cache
+def tabs_of(learner: Literal["paper", "progress"]) -> tuple[Tab, ...]:
+    """The tabs of a learner's runs."""
+    tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
+    return tuple(
+        Tab(**tab | {"panels": tuple(map(_panel, tab["panels"]))}) for tab in tables[learner]
+    )
+
+
+def _panel(table: dict[str, Any]) -> Panel:
+    return Panel(**table | ({"range": Range(**table["range"])} if "range" in table else {}))
 
 
 def blueprint(
@@ -105,7 +225,11 @@ def near(frames: int) -> list[rr.VisibleTimeRange]:
 
 
 def holding(
-    values: NDArray[np.float64], low: float | None = None, *, also: Sequence[float] = ()
+    values: FloatArray,
+    low: float | None = None,
+    *,
+    also: Sequence[float] = (),
+    margin: float = 0.05,
 ) -> Span | None:
     """A range that holds every one of these values that is a number.
 
@@ -113,6 +237,7 @@ def holding(
         values: of lines.
         low: where the range begins, whatever they are.
         also: what it shall hold besides.
+        margin: share of the range that is added on either side.
 
     Returns:
         None where there are none: the viewer shows what comes.
@@ -122,8 +247,8 @@ def holding(
         return None
     least, most = float(min([*also, finite.min()])), float(max([*also, finite.max()]))
     least = least if low is None else low
-    margin = 0.05 * (most - least) or 0.1 * abs(most) or 1.0
-    return (least - margin if low is None else least), most + margin
+    room = margin * (most - least) or 0.1 * abs(most) or 1.0
+    return (least - room if low is None else least), most + room
 
 
 def lines(
@@ -155,13 +280,6 @@ def lines(
         plot_legend=rrb.PlotLegend(corner, visible=legend),
         time_ranges=within,
     )
-
-
-def stacked(*rows: tuple[Sequence[rrb.View], float], name: str | None = None) -> rrb.Container:
-    """Views below one another with the height of each; a row without a view takes no room."""
-    views = [(view, height) for row, height in rows for view in row]
-    shares = [height for _, height in views]
-    return rrb.Vertical(*(v for v, _ in views), row_shares=shares, name=name)
 
 
 def heights(lanes: int) -> int:

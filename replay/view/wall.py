@@ -12,10 +12,9 @@ from cdmisfa.core.signals import STATES
 from replay.palette import colour, packed_all
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch, RunHeader
-from replay.view.columns import ImageColumn, time_columns
+from replay.view.columns import Column, image_column, time_columns
 from replay.view.labels import label, part
-
-Bounds = tuple[tuple[float, float], tuple[float, float]]
+from replay.view.layouts import Bounds
 
 WALL = "wall"
 FRAME = f"{WALL}/frame"
@@ -45,13 +44,13 @@ class WallView:
         self._recording, self._spec, self._streams = recording, header.spec, list(streams)
         self._by_progress = header.by_progress
         height, width = self._spec.frame_shape
-        self._places = places(len(self._streams), width, height)
-        self._pictures: dict[int, ImageColumn] = {}
+        self._places = places_of(len(self._streams), width, height)
+        self._pictures: dict[int, Column] = {}
         self._last, self._said = -1, dict.fromkeys(self._streams, "")
         for s, (x, y) in zip(self._streams, self._places, strict=True):
             path = f"{WALL}/{part(self._spec.streams, s)}"
             recording.log(path, rr.Transform3D(translation=[x, y, 0.0]), static=True)
-            self._pictures[s] = ImageColumn(recording, self._spec, path)
+            self._pictures[s] = image_column(recording, self._spec, path)
 
     def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
@@ -132,12 +131,12 @@ class WallView:
 
 def bounds(count: int, height: int, width: int) -> Bounds:
     """Ranges of x and y that hold a wall of so many pictures of a size."""
-    x, y = (max(place[i] for place in places(count, width, height)) for i in (0, 1))
+    x, y = (max(place[i] for place in places_of(count, width, height)) for i in (0, 1))
     margin = BETWEEN * height
     return (-margin, x + width + margin), (-margin, y + height * (1 + ROOM))
 
 
-def places(count: int, width: int, height: int) -> list[tuple[float, float]]:
+def places_of(count: int, width: int, height: int) -> list[tuple[float, float]]:
     """Where on a wall so many pictures of a size hang, in rows: x and y of their corners."""
     across, down = width + BETWEEN * height, (1 + ROOM) * height
 

@@ -1,0 +1,325 @@
+"""The iCub scene in 3D: the robot, the table, the objects, and where the head looks.
+
+Poses are in the robot's root frame: x to the back, y to the right, z up. The robot's body is a
+model of the package icub-models, shown by Rerun's own loader.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+from rerun.urdf import UrdfTree
+
+from cdmisfa.core.arrays import FloatArray, IntArray
+from cdmisfa.core.blocks import HeadPose, SourceSpec
+from cdmisfa.core.errors import CdmisfaError
+from recorder.log.scenery import Eye, Gaze, Scenery, Thing
+from replay.palette import Rgb, colour, packed_all, pale
+from replay.recordings.poses import yaw_of
+from replay.runs.columns import SignalColumns
+from replay.runs.run import Outline
+from replay.view.columns import Column, line_column, time_columns
+from replay.view.labels import label, part
+
+SCENE = "scene"
+"""The entity whose frame is the robot's root frame."""
+
+WATCHING = f"{SCENE}/watching"
+
+REACH = 0.6
+"""How far the pyramid of a view reaches, metres."""
+
+THIN, THICK = 0.0015, 0.005
+"""Radii of the edges of a view's pyramid, and of that of the watched one."""
+
+LIGHT = 0.25
+"""What is added to the greys of objects: the viewer's background is as dark as they are."""
+
+
+def _places(values: NDArray[Any]) -> Any:
+    """(n, 3) places in their parent's frame."""
+    return rr.Transform3D.columns(translation=np.array(values, dtype=np.float32))
+
+
+class SceneView:
+    """Writes the world of a run, or of a recording, into a Rerun recording.
+
+    Args:
+        recording: where it goes.
+        spec: what the source delivers.
+        scenery: what stands where.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, scenery: Scenery) -> None:
+        self._recording, self._spec, self._scenery = recording, spec, scenery
+        self._watched, self._turned = -1, False
+        self._neck: Any = None
+        recording.log(SCENE, rr.ViewCoordinates.BRU, static=True)
+        _write_thing(recording, f"{SCENE}/table", scenery.table, at_rest=True)
+        self._objects = [
+            (thing, Column(recording, spec, f"{SCENE}/{thing.name}", encode=_places))
+            for thing in scenery.objects
+            if set(thing.truth) <= set(spec.truth)
+        ]
+        for thing, column in self._objects:
+            _write_thing(recording, column.path, thing)
+        self._gazes = [scenery.gaze(name) for name in spec.streams]
+        for s, gaze in enumerate(self._gazes):
+            if gaze is not None:
+                _write_pyramid(recording, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
+
+    def stand(self) -> str | None:
+        """Show the robot's body, and return what to say where that cannot be."""
+        try:
+            self._neck = write_body(self._recording, SCENE, self._scenery.robot)
+        except CdmisfaError as error:
+            return str(error)
+        return None
+
+    def move(self, at: IntArray, truth: FloatArray) -> None:
+        """Put the objects where (n, D) truth says they are at n frames."""
+        for thing, column in self._objects:
+            column.add(at, None, thing.places(self._spec.truth, truth))
+
+    def turn(self, columns: SignalColumns) -> None:
+        """Turn the head to what is watched."""
+        streams = columns["stream"].astype(np.int64)
+        turns = np.flatnonzero(np.diff(streams, prepend=self._watched))
+        self._watched = int(streams[-1])
+        places = [(i, gaze) for i in turns if (gaze := self._gazes[streams[i]]) is not None]
+        if not places:
+            return
+        at = np.array([i for i, _ in places])
+        gazes = [gaze for _, gaze in places]
+        if not self._turned:  # the eyes are the same in every view
+            self._turned = True
+            thick = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
+            self._recording.log(f"{WATCHING}/edges", thick, static=True)
+        times = time_columns(self._spec, columns.frames[at], columns.iterations[at])
+        rgbs = [colour(int(s)) for s in streams[at]]
+        self._recording.send_columns(WATCHING, times, _poses(gazes))
+        self._recording.send_columns(
+            f"{WATCHING}/edges", times, rr.LineStrips3D.columns(colors=packed_all(rgbs))
+        )
+        if self._neck is not None:
+            turned = self._neck.compute_transform_columns([math.radians(g.yaw) for g in gazes])
+            self._recording.send_columns(f"{SCENE}/neck", times, turned)
+
+    def flush(self) -> None:
+        """Hand over what waits."""
+        for _, column in self._objects:
+            column.flush()
+
+
+EDGES = 5
+"""Edges of a pyramid: four along its sides, one around its end."""
+
+
+def pyramid(eye: Eye) -> list[list[list[float]]]:
+    """The edges of what an eye sees, in its own frame."""
+    x, y = (REACH * pixels / 2 / eye.focal for pixels in (eye.width, eye.height))
+    corners = [[sx * x, sy * y, REACH] for sx, sy in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return [*([[0.0, 0.0, 0.0], corner] for corner in corners), [*corners, corners[0]]]
+
+
+def _write_pyramid(recording: rr.RecordingStream, path: str, gaze: Gaze, rgb: Rgb) -> None:
+    eye = gaze.middle
+    placed = rr.Transform3D(translation=eye.place, quaternion=rr.Quaternion(xyzw=eye.turn))
+    recording.log(path, placed, static=True)
+    edges = pyramid(eye)
+    rgbs = packed_all([rgb] * EDGES)
+    recording.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]), static=True)
+    end = np.mean(edges[-1][2:4], axis=0)
+    name = rr.Points3D(
+        [end], labels=[label(gaze.name)], colors=rgbs[:1], radii=[THICK], show_labels=True
+    )
+    recording.log(f"{path}/name", name, static=True)
+
+
+def _write_thing(
+    recording: rr.RecordingStream, path: str, thing: Thing, *, at_rest: bool = False
+) -> None:
+    """Show what a thing looks like; where it is, only of one that stands still."""
+    if at_rest:
+        recording.log(path, rr.Transform3D(translation=thing.place), static=True)
+    light = 0.0 if at_rest else LIGHT
+    rgb = [round(255 * min(part + light, 1.0)) for part in thing.colour]
+    solid = rr.components.FillMode.Solid
+    half = [size / 2 for size in thing.size]
+    shape: Any
+    if thing.shape == "cylinder":
+        shape = rr.Cylinders3D(
+            lengths=[thing.size[2]], radii=[half[0]], colors=[rgb], fill_mode=solid
+        )
+    elif thing.shape == "sphere":
+        shape = rr.Ellipsoids3D(half_sizes=[half], colors=[rgb], fill_mode=solid)
+    else:
+        shape = rr.Boxes3D(half_sizes=[half], colors=[rgb], fill_mode=solid)
+    recording.log(path, shape, static=True)
+
+
+def _poses(gazes: Sequence[Gaze]) -> Any:
+    return rr.Transform3D.columns(
+        translation=[gaze.middle.place for gaze in gazes],
+        quaternion=[gaze.middle.turn for gaze in gazes],
+    )
+
+
+NECK = "neck_yaw"
+"""The joint that turns the head to the left."""
+
+BODY = "body"
+"""The entity of all that it looks like, in that of the scene."""
+
+PACKAGE = "package://iCub/"
+"""How the models name their meshes."""
+
+
+def write_body(recording: rr.RecordingStream, root: str, robot: str) -> Any:
+    """Show a robot that stands upright in the frame of the entity `root`.
+
+    Args:
+        recording: where it goes.
+        root: the entity, whose frame is the robot's root frame.
+        robot: its name in icub-models.
+
+    Returns:
+        Its neck's joint, a `rerun.urdf.UrdfJoint`.
+
+    Raises:
+        CdmisfaError: the package or the model is not there, or it cannot be read.
+    """
+    model = _model(robot)
+    with tempfile.TemporaryDirectory(prefix="cdmisfa-robot-") as folder:
+        seen = Path(folder) / model.name
+        try:
+            _as_seen(model).write(seen)
+            tree = UrdfTree.from_file_path(
+                seen,
+                entity_path_prefix=root,
+                static_transform_entity_path=f"{root}/joints",
+            )
+            tree.log_urdf_to_recording(recording)
+        except (OSError, RuntimeError, ValueError, ElementTree.ParseError) as error:
+            raise CdmisfaError(f"{model} cannot be shown: {error}") from error
+    neck = tree.get_joint_by_name(NECK)
+    if neck is None:
+        raise CdmisfaError(f"{model} has no joint {NECK}")
+    stands = rr.Transform3D(parent_frame=f"tf#/{root}", child_frame=tree.root_link().name)
+    recording.log(f"{root}/stands", stands, static=True)
+    return neck
+
+
+def _model(robot: str) -> Path:
+    try:
+        import icub_models
+    except ImportError as error:
+        raise CdmisfaError(
+            "the robot's body is not shown: `pip install icub-models` for it"
+        ) from error
+    if robot not in icub_models.get_robot_names():
+        raise CdmisfaError(f"the robot's body is not shown: icub-models has no {robot[:60]!r}")
+    return Path(icub_models.get_model_file(robot))
+
+
+def _as_seen(model: Path) -> Any:
+    """The model as `BODY`, its meshes where they are, and without the shapes that collide."""
+    tree: Any = ElementTree.parse(model)
+    tree.getroot().set("name", BODY)
+    share = next(folder for folder in model.parents if (folder / "robots").is_dir())
+    for link in tree.iter("link"):
+        for shape in link.findall("collision"):
+            link.remove(shape)
+    for mesh in tree.iter("mesh"):
+        mesh.set("filename", mesh.get("filename", "").replace(PACKAGE, f"{share}/"))
+    return tree
+
+
+POSES = "head/poses"
+GAZE = "head/poses/watching"
+YAW = "head/yaw"
+
+ARROW = 0.25
+"""Length of the arrow along a gaze, in metres."""
+
+
+def write_heads(
+    recording: rr.RecordingStream, names: Sequence[str], poses: Mapping[str, HeadPose]
+) -> bool:
+    """Show in 3D where the head looks for each view: an arrow along its gaze.
+
+    Poses are in the robot's root frame: x to the back, y to the right, z up.
+
+    Returns:
+        Whether there is a pose for every view; otherwise nothing is shown.
+    """
+    if not set(poses) >= set(names):
+        return False
+    recording.log(POSES, rr.ViewCoordinates.BRU, static=True)
+    for s, name in enumerate(names):
+        place, pose = f"{POSES}/{part(names, s)}", poses[name]
+        turn = rr.Quaternion(xyzw=pose.quaternion)
+        recording.log(
+            place, rr.Transform3D(translation=pose.position, quaternion=turn), static=True
+        )
+        arrow = rr.Arrows3D(
+            vectors=[[-ARROW, 0, 0]],
+            radii=[0.005],
+            colors=packed_all([colour(s)]),
+            labels=[label(name)],
+        )
+        recording.log(place, arrow, static=True)
+    return True
+
+
+def write_gaze(
+    recording: rr.RecordingStream, outline: Outline, poses: Mapping[str, HeadPose]
+) -> None:
+    """Show where a run turned the head: `/head/yaw` in degrees, and an arrow in 3D."""
+    spec, blocks = outline.header.spec, outline.blocks
+    watched = [poses[name] for name in spec.streams]
+    yaws = np.array([yaw_of(pose) for pose in watched])
+    names = ["head turned to the left [degrees]"]
+    column = line_column(recording, spec, YAW, names, [pale(0)], steps=True)
+    column.add(blocks.starts, blocks.iterations, yaws[blocks.streams][:, None])
+    turns = np.flatnonzero(np.diff(blocks.streams, prepend=-1))
+    if len(turns):
+        turned = rr.Transform3D.columns(
+            translation=[watched[s].position for s in blocks.streams[turns]],
+            quaternion=[watched[s].quaternion for s in blocks.streams[turns]],
+        )
+        times = time_columns(spec, blocks.starts[turns], blocks.iterations[turns])
+        recording.send_columns(GAZE, times, turned)
+    column.flush()
+    white = packed_all([(255, 255, 255)])
+    arrow = rr.Arrows3D(vectors=[[-1.4 * ARROW, 0, 0]], radii=[0.003], colors=white)
+    recording.log(GAZE, arrow, static=True)
+
+
+def scene_view() -> rrb.View:
+    """The world in 3D, seen from in front of the robot."""
+    place, target = (-1.5, -0.85, 0.72), (-0.38, 0.0, 0.0)
+    return _view_3d(SCENE, "The world, and where it looks", place, target)
+
+
+def gaze_view(name: str) -> rrb.View:
+    """The head's poses, seen from above and behind."""
+    return _view_3d(POSES, name, (0.45, 0.0, 0.75), (-0.12, 0.0, 0.24))
+
+
+def _view_3d(origin: str, name: str, place: Any, target: Any) -> rrb.View:
+    return rrb.Spatial3DView(
+        origin=f"/{origin}",
+        name=name,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(position=place, look_target=target, eye_up=(0.0, 0.0, 1.0)),
+    )

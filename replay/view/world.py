@@ -1,0 +1,273 @@
+"""The world of a run as the first tab of its view shows it, and what was learned of it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from cdmisfa.core.arrays import FloatArray, IntArray
+from cdmisfa.core.errors import CdmisfaError, LogDamagedError
+from cdmisfa.core.untrusted import parse_json
+from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
+from recorder.log.viewlog import CONFIG_NAME
+from recorder.mcap.reader import LogReader
+from replay.following import Fit, read_outputs
+from replay.palette import GREY, colour
+from replay.recordings.poses import first_pose
+from replay.runs.log import Batch, Frames, RunHeader
+from replay.runs.run import Outline
+from replay.storage.opening import log_files, open_store
+from replay.view.columns import line_column
+from replay.view.labels import label
+from replay.view.layouts import Lesson, WorldTab
+from replay.view.scene import SceneView
+from replay.view.wall import WallView, bounds
+
+PRESET = (
+    "the recording that it learned from is not where it was: the table, the eyes and the sizes of "
+    "the objects are those of the scene's preset"
+)
+
+
+def world_of_run(
+    header: RunHeader, run: Path, recording: Path | None = None
+) -> tuple[Scenery | None, str | None]:
+    """What stood where in a run, and what is not sure about it.
+
+    Args:
+        header: of its log.
+        run: its folder.
+        recording: which it learned from, where that is known.
+
+    Returns:
+        No world where the run was in none that is described here.
+    """
+    source = _table(header.manifest.get("source"))
+    if source.get("kind") == KIND:
+        return _told(_table(source.get("scene")))
+    if source.get("scene") != KIND:
+        return None, None
+    for place in _places(header, run, recording):
+        with contextlib.suppress(CdmisfaError, OSError):
+            found = world_of_recording(place, sha256=str(source.get("config_sha256")))
+            if found is not None:
+                return found, None
+    scenery, _ = _told(_table(_table(header.manifest.get("config")).get("scene")))
+    return scenery, PRESET if scenery is not None else None
+
+
+def world_of_recording(path: Path, sha256: str | None = None) -> Scenery | None:
+    """What stood where in a recording.
+
+    Args:
+        path: of the recording.
+        sha256: the checksum that its configuration must have.
+
+    Returns:
+        None of other scenes and recordings.
+
+    Raises:
+        UsageError: there is no such recording.
+        LogDamagedError: it cannot be read.
+    """
+    data, pose = b"{}", None
+    for file in log_files(path):  # the first has it, unless they are many
+        with LogReader(open_store(file)) as reader:
+            if own := [entry for entry in reader.attachments if entry.name == CONFIG_NAME]:
+                data, pose = bytes(reader.attachment_data(own[0])), first_pose(reader)
+                break
+    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
+        return None
+    try:
+        config = _table(_table(parse_json(data)).get("scene"))
+    except ValueError as error:
+        raise LogDamagedError(f"{file}: its {CONFIG_NAME} is broken ({error})") from error
+    return scenery_of(config, NECK if pose is None else pose.position)
+
+
+def _places(header: RunHeader, run: Path, recording: Path | None) -> Iterator[Path]:
+    """Where the recording may be that a run learned from."""
+    if recording is not None:
+        yield recording
+    named = _table(header.manifest.get("command")).get("source")
+    for name in named if isinstance(named, list) else []:
+        with contextlib.suppress(OSError, ValueError):
+            if (place := run / str(name)).exists():
+                yield place
+
+
+def _told(config: Mapping[str, Any]) -> tuple[Scenery | None, str | None]:
+    try:
+        return scenery_of(config), None
+    except LogDamagedError as error:
+        return None, str(error)
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def world_tab(
+    header: RunHeader,
+    scenery: Scenery | None,
+    streams: Sequence[int],
+    lessons: Sequence[Lesson] = (),
+) -> WorldTab:
+    """What the first tab of a run shows of its world.
+
+    Args:
+        header: of its log.
+        scenery: what stood where, as far as that is known.
+        streams: those that are shown.
+        lessons: what its modules have learned.
+    """
+    wall = None
+    if header.spec.images and scenery is None:
+        wall = bounds(len(streams), *header.spec.frame_shape)
+    return WorldTab(scenery is not None, wall, lessons)
+
+
+class WorldView:
+    """Writes the world of a run.
+
+    Args:
+        recording: where it goes.
+        header: of the run's log.
+        run: its folder.
+        streams: those that are shown.
+        every: where things are is shown at every so many frames, as pictures are.
+        learned_from: the recording that the run learned from, where that is known.
+        body: of the robot, too.
+
+    Attributes:
+        notes: what a person should know of it.
+    """
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        header: RunHeader,
+        run: Path,
+        streams: Sequence[int],
+        every: int,
+        learned_from: Path | None = None,
+        *,
+        body: bool = True,
+    ) -> None:
+        self._header, self._streams, self._every = header, streams, every
+        self._scene: SceneView | None = None
+        self._wall: WallView | None = None
+        self._scenery, unsure = world_of_run(header, run, learned_from)
+        self.notes: list[str] = [] if unsure is None else [unsure]
+        if self._scenery is not None:
+            self._scene = SceneView(recording, header.spec, self._scenery)
+            missing = self._scene.stand() if body else None
+            self.notes += [] if missing is None else [missing]
+        elif header.spec.images:
+            self._wall = WallView(recording, header, streams)
+
+    def take(self, batch: Batch) -> None:
+        """Take what a log holds of some iterations."""
+        if self._wall is not None:
+            self._wall.take(batch)
+        if self._scene is not None:
+            for columns in batch.signals:
+                self._scene.turn(columns)
+            for frames, truth in batch.truth:
+                kept = frames % self._every == 0
+                self._scene.move(frames[kept], truth[kept])
+
+    def flush(self) -> None:
+        """Hand over everything that waits."""
+        for view in (self._scene, self._wall):
+            if view is not None:
+                view.flush()
+
+    def tab(self, lessons: Sequence[Lesson] = ()) -> WorldTab:
+        """What the first tab shows of it, and of what was learned of it."""
+        return world_tab(self._header, self._scenery, self._streams, lessons)
+
+
+LEARNED = "learned"
+
+MOST = 6
+"""Modules that are shown: the first."""
+
+MOST_FRAMES = 1_000_000
+"""Last frames of a run for which it is shown."""
+
+BROAD, NARROW = 4.0, 1.5
+"""Widths of the line that is followed, and of the one that follows."""
+
+
+def write_learned(
+    recording: rr.RecordingStream,
+    log: Path,
+    outline: Outline,
+    truth: Sequence[Frames],
+) -> list[Lesson]:
+    """Write each module's output where its stream was watched, and what it follows, everywhere.
+
+    Args:
+        recording: where it goes.
+        log: of the run.
+        outline: the run in short.
+        truth: what the world knew at each frame, piece after piece.
+    """
+    names, spec = outline.names(), outline.header.spec
+    if not truth or not outline.saved:
+        return []
+    frames, values = (np.concatenate(part)[-MOST_FRAMES:] for part in zip(*truth, strict=True))
+    iterations, lessons = outline.blocks.iteration(frames), []
+    for output in read_outputs(log, outline, MOST, MOST_FRAMES, truth=(frames, values)):
+        found = output.best_fit(spec.truth)
+        if found is None:
+            continue
+        followed = found(values[:, found.column])
+        said = _everywhere(frames, output.t, output.y)
+        root = f"{LEARNED}/{output.module}"
+        shown = (
+            (f"{root}/followed", found.function, GREY, BROAD, followed),
+            (
+                f"{root}/output",
+                f"module {output.module} on {names[output.stream]}",
+                colour(output.stream),
+                NARROW,
+                said,
+            ),
+        )
+        for path, name, rgb, width, line in shown:
+            column = line_column(recording, spec, path, [name], [rgb], width, every_frame=True)
+            column.add(frames, iterations, line)
+            column.flush()
+        both = np.concatenate([followed, output.y])
+        lessons.append(
+            Lesson(
+                _title(output.module, names[output.stream], found),
+                tuple(f"/{path}" for path, *_ in shown),
+                (float(both.min()), float(both.max())),
+            )
+        )
+    return lessons
+
+
+def _title(module: int, stream: str, found: Fit) -> str:
+    return (
+        f"What module {module} has learned: where {label(stream)} is watched, "
+        f"its output over {label(found.function)}, |r| = {found.r:.2f}"
+    )
+
+
+def _everywhere(frames: IntArray, t: IntArray, y: FloatArray) -> FloatArray:
+    """An output at all frames: NaN where its stream was not watched."""
+    line = np.full(len(frames), np.nan)
+    at = np.searchsorted(frames, t)
+    there = (at < len(frames)) & (frames[np.minimum(at, len(frames) - 1)] == t)
+    line[at[there]] = y[there]
+    return line
