@@ -22,7 +22,7 @@ from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import MAX_LIST, read_json
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
-from cdmisfa.experiments.store import StoredTrial, answer, code, identity, read_rows, run_trials
+from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.pages import Page
 from cdmisfa.studies.paper.difficulty import Difficulty
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Settings, Trial
@@ -79,7 +79,7 @@ def reproduce(
     version = code()
     tasks = [
         PaperTrial(
-            id=identity(name, settings, version),
+            id=trial_id(name, settings, version),
             point=settings,
             seed=int(settings["seed"]),
             code=version,
