@@ -100,15 +100,11 @@ def test_noise_is_as_strong_as_it_says(sd: float) -> None:
         assert frames.mean() == pytest.approx(127.5, abs=0.1)
 
 
-def test_a_jumping_picture_stands_still_for_ten_frames() -> None:
-    frames = pictures.jumping(np.random.default_rng(0), 35).frames
-    changed = np.flatnonzero((frames[1:] != frames[:-1]).any(axis=(1, 2))) + 1
-    assert changed.tolist() == [10, 20, 30]
-
-
 def test_bad_cameras_do_what_they_say() -> None:
     rng = np.random.default_rng(0)
-    frames = np.repeat(pictures.jumping(rng, 20).frames, 20, axis=0)
+    jumping = pictures.jumping(rng, 20).frames
+    assert np.flatnonzero((jumping[1:] != jumping[:-1]).any(axis=(1, 2))).tolist() == [9]
+    frames = np.repeat(jumping, 20, axis=0)
     exposure = pictures.flicker(rng, frames).mean(axis=(1, 2)) / frames.mean(axis=(1, 2))
     assert exposure.std() == pytest.approx(0.1, rel=0.15)
     shaken = pictures.shake(rng, frames)
@@ -128,18 +124,15 @@ def test_bad_cameras_do_what_they_say() -> None:
 def test_a_stream_is_made_once_and_again_only_where_it_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = library(tmp_path, "sway")
-    frames = made.stream("sway", 0).frames
+    frames = library(tmp_path, "sway").stream("sway", 0).frames
     assert len(frames) == LEARNED_FROM + HELD_OUT
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["sway-0"]
-    kept = sorted(p.name for p in (tmp_path / "sway-0").iterdir())
-    assert kept == ["8-none.npz", "about.json", "frames.npy", "state.npy"]
-    stamp = (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns
+    kept = tmp_path / "sway-0" / "frames.npy"
+    stamp = kept.stat().st_mtime_ns
     library(tmp_path, "sway")
-    assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns == stamp
+    assert kept.stat().st_mtime_ns == stamp
     monkeypatch.setattr("cdmisfa.studies.arena.library.RECIPE", 0)
     again = library(tmp_path, "sway").stream("sway", 0).frames
-    assert (tmp_path / "sway-0" / "frames.npy").stat().st_mtime_ns > stamp
+    assert kept.stat().st_mtime_ns > stamp
     np.testing.assert_array_equal(again, frames)
 
 
@@ -199,24 +192,18 @@ def test_the_reference_is_the_slowest_output_there_is(tmp_path: Path) -> None:
     np.testing.assert_allclose(variance, largest, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["cartpole", "mountaincar"])
-def test_simulated_tasks_are_seen_and_known(name: str) -> None:
-    pytest.importorskip("gymnasium")
-    one, again = (STREAMS[name].make(np.random.default_rng(1), 40) for _ in range(2))
-    assert one.frames.shape == (40, 48, 64)
-    assert one.state.shape == (40, len(one.names))
+@pytest.mark.parametrize(
+    ("name", "package", "n"), [("cartpole", "gymnasium", 40), ("pong", "ale_py", 150)]
+)
+def test_what_is_played_is_seen_and_known(name: str, package: str, n: int) -> None:
+    pytest.importorskip(package)
+    one, again = (STREAMS[name].make(np.random.default_rng(1), n) for _ in range(2))
+    assert one.frames.shape == (n, 48, 64)
+    assert one.state.shape == (n, len(one.names))
     np.testing.assert_array_equal(one.frames, again.frames)
     np.testing.assert_array_equal(one.state, again.state)
-    still = (one.frames[1:] == one.frames[:-1]).all(axis=(1, 2))
-    assert still.mean() < 0.9
-
-
-def test_games_are_seen_and_known() -> None:
-    pytest.importorskip("ale_py")
-    one, again = (STREAMS["pong"].make(np.random.default_rng(1), 150) for _ in range(2))
-    np.testing.assert_array_equal(one.frames, again.frames)
-    assert one.names == ("player", "enemy", "ball x", "ball y")
     assert (one.state.std(axis=0) > 0).all()
+    assert (one.frames[1:] != one.frames[:-1]).any(axis=(1, 2)).mean() > 0.1
 
 
 def test_clips_are_there() -> None:

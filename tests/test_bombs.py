@@ -23,7 +23,7 @@ from cdmisfa.core.untrusted import BUDGET, budget
 from cdmisfa.experiments.results import results
 from cdmisfa.experiments.store import ROWS
 from cdmisfa.experiments.sweep import sweep
-from recorder.cameras.video import video_camera
+from recorder.cameras.video import VideoCamera
 from recorder.images.videos import most_pixels
 from recorder.log.files import RECORDING
 from recorder.log.logfile import LogFile
@@ -109,7 +109,7 @@ def test_live_video(kind: str, bombs: dict[str, Path]) -> None:
 
     def watch() -> None:
         try:
-            for _, image in video_camera(f"av:{bombs[kind]}", "cam", timeout=5).pictures():
+            for _, image in VideoCamera(f"av:{bombs[kind]}", "cam", timeout=5).pictures():
                 shapes.append(image.shape)
         except CdmisfaError as error:
             said.append(str(error))
@@ -135,7 +135,7 @@ def test_pictures_of_live_video_fit_into_the_budget(form: str, codec: str, most:
 
 
 def test_live_pictures_that_are_too_large_are_refused() -> None:
-    camera = video_camera("av:lavfi:color=size=8000x5000:rate=25", "cam", timeout=5)
+    camera = VideoCamera("av:lavfi:color=size=8000x5000:rate=25", "cam", timeout=5)
     with pytest.raises(CdmisfaError, match="cam: images of"):
         next(camera.pictures())
 
@@ -153,7 +153,7 @@ def test_live_pictures_of_just_the_limit_are_shown(
         written.mux(stream.encode())
     monkeypatch.setattr("recorder.cameras.video.MAX_PIXELS", width * height)
     monkeypatch.setattr("recorder.cameras.video.most_pixels", lambda *_: width * height)
-    _, image = next(video_camera(f"av:{film}", "cam", timeout=5).pictures())
+    _, image = next(VideoCamera(f"av:{film}", "cam", timeout=5).pictures())
     assert image.shape == (height, width)
 
 

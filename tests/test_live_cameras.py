@@ -317,52 +317,45 @@ def test_real_cameras_are_recorded_and_learned_from(tmp_path: Path) -> None:
     assert {count["lost"] for count in live.alignment.values()} == {0}
 
 
-def test_a_camera_that_goes_away_is_connected_to_anew(tmp_path: Path) -> None:
-    cameras = Cameras()
-    source = cameras.source()
-    join = cameras.show(100, 0)
-    cameras.hands[1].give(OSError("unplugged"))
-    wait_for(lambda: cameras.hands[1].opened == 2, seconds=20)
-    cameras.hands[1].give(*[flat(7)] * 3)
+GONE, HANGS = "right is gone: unplugged", "right: no picture for 0.3 s"
+
+
+@pytest.mark.parametrize(
+    ("on_loss", "why", "then"),
+    [
+        ("reconnect", GONE, ": connecting to it anew"),
+        ("reconnect", HANGS, ": connecting to it anew"),
+        ("wait", GONE, ": the others go on without it"),
+        ("wait", HANGS, ": waiting"),
+    ],
+)
+def test_a_camera_that_is_lost_is_a_gap(on_loss: Any, why: str, then: str) -> None:
+    cameras = Cameras(stall=0.3, on_loss=on_loss)
+    source, right = cameras.source(), cameras.hands[1]
+    join = cameras.show(60, 0)
+    if why == GONE:
+        right.give(OSError("unplugged"))
     source.take_all(40)
+    if on_loss == "reconnect":
+        wait_for(lambda: right.opened >= 2, seconds=20)
+    if (on_loss, why) != ("wait", GONE):
+        right.give(*[flat(7)] * 3)
+    if why == HANGS:
+        wait_for(lambda: "right shows pictures again" in cameras.said, seconds=20)
     join()
     cameras.close(source)
-    assert cameras.said == ["right is gone: unplugged: connecting to it anew"]
+    assert cameras.said[0] == why + then
+    assert right.opened > 1 if on_loss == "reconnect" else right.opened == 1
     assert source.alignment["right"]["missing"] > 0
 
 
-def test_a_camera_that_hangs_is_connected_to_anew() -> None:
-    cameras = Cameras(stall=0.3)
-    source = cameras.source()
-    join = cameras.show(60, 0)
-    source.take_all(30)
-    assert cameras.hands[1].opened >= 2
-    cameras.hands[1].give(flat(1), flat(2))
-    join()
-    assert cameras.said[0] == "right: no picture for 0.3 s: connecting to it anew"
-    wait_for(lambda: "right shows pictures again" in cameras.said, seconds=20)
-    cameras.close(source)
-
-
-def test_a_camera_that_stalls_is_waited_for() -> None:
-    cameras = Cameras(stall=0.3, on_loss="wait")
-    source = cameras.source()
-    join = cameras.show(60, 0)
-    source.take_all(40)
-    join()
-    assert cameras.hands[1].opened == 1
-    assert cameras.said == ["right: no picture for 0.3 s: waiting"]
-    cameras.close(source)
-
-
-@pytest.mark.parametrize("lost", ["stalls", "goes"])
-def test_a_camera_that_is_lost_ends_the_source_where_that_is_asked_for(lost: str) -> None:
+@pytest.mark.parametrize("why", [GONE, HANGS])
+def test_a_camera_that_is_lost_ends_the_source_where_that_is_asked_for(why: str) -> None:
     cameras = Cameras(stall=0.3, on_loss="end")
     source = cameras.source()
     join = cameras.show(40, 0)
-    if lost == "goes":
+    if why == GONE:
         cameras.hands[1].give(OSError("unplugged"))
-    why = {"stalls": "right: no picture for 0.3 s", "goes": "right is gone: unplugged"}[lost]
     with pytest.raises(LogExhaustedError, match=why):
         source.take_all(200)
     join()

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
 from cdmisfa.testing.sources import ForwardContract
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.video import video_camera
+from recorder.cameras.video import VideoCamera
 from recorder.cameras.words import is_live, live_names, open_live
 from replay.recordings.source import RecordedSource
 from replay.runs.log import read_header
@@ -137,33 +137,38 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         source.take(0, 2)
 
 
+def learned_twice(cdmisfa: Cdmisfa, place: Path, *words: str) -> dict[str, Any]:
+    """What a run says of itself that learned from live streams, and again from their recording."""
+    options = ["--set", "learner.tau=20", "--max-iterations", "3", "--json"]
+    live = cdmisfa("learn", *words, "--record", place / "rec", "-o", place / "run", *options)
+    assert live.code == 0, live.err
+    again = cdmisfa("learn", place / "rec", *options).json
+    assert again["signals_sha256"] == live.json["signals_sha256"]
+    return {**live.json, "said": live.err}
+
+
 def test_a_task_is_recorded_and_learned_from_alike(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = ["gym:CartPole-v1", "gym:Pendulum-v1"]
-    options = ["--size", "32x24", "--max-iterations", "4", "--json"]
-    run = cdmisfa("learn", *words, "--record", str(tmp_path / "rec"), *options).json
-    again = cdmisfa("learn", str(tmp_path / "rec"), *options).json
-    assert again["signals_sha256"] == run["signals_sha256"]
-    cdmisfa("record", *words, "-o", str(tmp_path / "two"), "--size", "32x24", "--frames", "160")
-    for name in ("CartPole-v1.mcap", "Pendulum-v1.mcap"):
-        one, two = (tmp_path / folder / name for folder in ("rec", "two"))
-        assert one.stat().st_size == two.stat().st_size
+    words = ["gym:CartPole-v1", "gym:Pendulum-v1", "--size", "32x24"]
+    learned_twice(cdmisfa, tmp_path, *words)
+    views = cdmisfa("record", *words, "-o", tmp_path / "two", "--json", "--frames", 160).json[
+        "views"
+    ]
+    assert [(view["name"], view["frames"]) for view in views] == [
+        ("CartPole-v1", 160),
+        ("Pendulum-v1", 160),
+    ]
     refused = cdmisfa("record", "gym:Nothing-v0", "-o", str(tmp_path / "x"))
     assert refused.code == 2
     assert "gym:Nothing-v0 cannot be made" in refused.err
 
 
 def test_pictures_of_ffmpeg_are_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    words = [TEST, TEST.replace("testsrc", "testsrc2")]
-    rec = str(tmp_path / "rec")
-    options = ["--size", "32x24", "--set", "learner.tau=15", "--max-iterations", "3", "--json"]
-    run = cdmisfa("learn", *words, "--record", rec, "-o", str(tmp_path / "run"), *options)
-    assert "lavfi_testsrc: " in run.err
-    again = cdmisfa("learn", rec, *options).json
-    assert again["signals_sha256"] == run.json["signals_sha256"]
-    gone = cdmisfa("check", str(tmp_path / "run"))
+    words = [TEST, TEST.replace("testsrc", "testsrc2"), "--size", "32x24"]
+    assert "lavfi_testsrc: " in learned_twice(cdmisfa, tmp_path, *words)["said"]
+    gone = cdmisfa("check", tmp_path / "run")
     assert gone.code == 2
     assert f"{TEST} was live: name what learn --record wrote of it" in gone.err
-    assert cdmisfa("check", str(tmp_path / "run"), "--source", rec).code == 0
+    assert cdmisfa("check", tmp_path / "run", "--source", tmp_path / "rec").code == 0
 
 
 def write_clip(clip: Path) -> Path:
@@ -181,7 +186,7 @@ def write_clip(clip: Path) -> Path:
 def test_a_video_plays_at_its_own_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr("recorder.cameras.video.time", clock)
-    camera = video_camera(f"av:{write_clip(tmp_path / 'clip.mkv')}", "clip", timeout=5)
+    camera = VideoCamera(f"av:{write_clip(tmp_path / 'clip.mkv')}", "clip", timeout=5)
     shown = [(clock.now, age, int(image[0, 0])) for age, image in camera.pictures()]
     assert [grey for _, _, grey in shown] == list(range(20))
     assert [age for _, age, _ in shown] == [0] * 20
@@ -350,6 +355,24 @@ class Robot:
             self.other.log({"k": k})
             k += 1
 
+    @contextlib.contextmanager
+    def showing(self, topic: str, image: RawImage, after: Sized = "at once") -> Iterator[None]:
+        """Show an image on a further topic, again and again, once something is in `after`."""
+        over = threading.Event()
+
+        def show() -> None:
+            while not after:
+                time.sleep(0.02)
+            channel = RawImageChannel(topic, context=self.context)
+            while not over.wait(0.02):
+                channel.log(image)
+
+        thread = threading.Thread(target=show)
+        thread.start()
+        yield
+        over.set()
+        thread.join()
+
     def close(self) -> None:
         self._over.set()
         self._thread.join()
@@ -366,13 +389,10 @@ def robot() -> Iterator[Robot]:
 def test_images_of_a_running_robot_are_recorded_and_learned_from(
     cdmisfa: Cdmisfa, tmp_path: Path, robot: Robot
 ) -> None:
-    words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right"]
-    rec = str(tmp_path / "rec")
-    options = ["--size", "64x48", "--set", "learner.tau=20", "--max-iterations", "2", "--json"]
-    run = cdmisfa("learn", *words, "--record", rec, *options).json
+    words = [f"{robot.address}/cam/left", f"{robot.address}/cam/right", "--size", "64x48"]
+    run = learned_twice(cdmisfa, tmp_path, *words)
     assert run["source"]["rate"] == pytest.approx(50, rel=0.3)
-    assert cdmisfa("learn", rec, *options).json["signals_sha256"] == run["signals_sha256"]
-    with contextlib.closing(RecordedSource(rec)) as source:
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
         assert source.spec.streams == ("cam_left", "cam_right")
         shown = source.take(0, 20).frames
         assert (shown == shown[:, :1, :1]).all()
@@ -380,27 +400,15 @@ def test_images_of_a_running_robot_are_recorded_and_learned_from(
 
 
 def test_distances_of_a_running_robot_are_shown_as_asked_for(robot: Robot) -> None:
-    channel = RawImageChannel("/depth", context=robot.context)
     data = np.tile(np.array([0, 1, 2, 3, 9], "<f4"), (4, 1)).tobytes()
     image = RawImage(width=5, height=4, encoding="32FC1", step=20, data=data)
-    over = threading.Event()
-
-    def show() -> None:
-        while not over.wait(0.02):
-            channel.log(image)
-
-    thread = threading.Thread(target=show)
-    thread.start()
-    try:
-        words = [f"{robot.address}/depth"]
+    words = [f"{robot.address}/depth"]
+    with robot.showing("/depth", image):
         with contextlib.closing(open_live(words, LiveOptions(depth=(1, 3)))) as source:
             assert source.take(0, 2).frames[1, 0].tolist() == [0, 0, 128, 255, 255]
             assert source.describe()["range_metres"] == [1, 3]
         with pytest.raises(UsageError, match="say which to show, as --range"):
             open_live(words, LiveOptions())
-    finally:
-        over.set()
-        thread.join()
 
 
 def test_a_range_for_images_of_a_running_robot_without_distances_is_refused(robot: Robot) -> None:
@@ -413,15 +421,10 @@ def test_a_range_for_images_of_a_running_robot_without_distances_is_refused(robo
 def test_numbers_of_a_running_robot_are_recorded_and_learned_from(
     cdmisfa: Cdmisfa, tmp_path: Path, robot: Robot
 ) -> None:
-    rec = str(tmp_path / "rec")
-    options = ["--set", "learner.tau=20", "--max-iterations", "2", "--json"]
-    words = [f"{robot.address}/words", "--field", "k"]
-    learned = cdmisfa("learn", *words, "--record", rec, *options)
-    assert (" messages;" in learned.err, "pictures" in learned.err) == (True, False)
-    run = learned.json
+    run = learned_twice(cdmisfa, tmp_path, f"{robot.address}/words", "--field", "k")
+    assert (" messages;" in run["said"], "pictures" in run["said"]) == (True, False)
     assert run["source"]["fields"] == ["k"]
-    assert cdmisfa("learn", rec, *options).json["signals_sha256"] == run["signals_sha256"]
-    with contextlib.closing(RecordedSource(rec)) as source:
+    with contextlib.closing(RecordedSource(tmp_path / "rec")) as source:
         assert (source.spec.frame_shape, source.spec.dtype) == ((1,), "float64")
         assert (np.diff(source.take(0, 20).frames[:, 0]) <= 3).all()
     with pytest.raises(UsageError, match="there is no z, it has k"):
@@ -452,25 +455,13 @@ def test_a_topic_that_is_no_image_is_refused(
 
 def test_a_topic_that_comes_later_is_waited_for(robot: Robot) -> None:
     said: list[str] = []
-
-    def show() -> None:
-        while not said:
-            time.sleep(0.02)
-        late = RawImageChannel("/cam/late", context=robot.context)
-        image = RawImage(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
-        while not over.wait(0.02):
-            late.log(image)
-
-    over = threading.Event()
-    thread = threading.Thread(target=show)
-    thread.start()
-    try:
-        words = [f"{robot.address}/cam/late"]
-        with contextlib.closing(open_live(words, LiveOptions(), say=said.append)) as source:
-            assert source.take(0, 2).frames.shape == (2, 4, 5)
-    finally:
-        over.set()
-        thread.join()
+    image = RawImage(width=5, height=4, encoding="mono8", step=5, data=bytes(20))
+    words = [f"{robot.address}/cam/late"]
+    with (
+        robot.showing("/cam/late", image, after=said),
+        contextlib.closing(open_live(words, LiveOptions(), say=said.append)) as source,
+    ):
+        assert source.take(0, 2).frames.shape == (2, 4, 5)
 
 
 def test_a_topic_that_the_server_does_not_know_yet_is_subscribed_to_again() -> None:

@@ -1,7 +1,6 @@
 """Log files: whole when they have their name, readable whatever happens before."""
 
-import errno
-import os
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -132,53 +131,21 @@ def test_a_folder_that_is_missing_is_named(tmp_path):
         LogFile(tmp_path / "nowhere" / "a.mcap")
 
 
-class FullDisk:
-    """A file on a disk that has room for so many bytes, and gets more later."""
-
-    def __init__(self, path: Path, room: int) -> None:
-        self.file = path.open("wb", buffering=0)
-        self.room = room
-        self.closed = False
-
-    def write(self, data: bytes) -> int:
-        if len(data) > self.room:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        self.room -= len(data)
-        return self.file.write(data)
-
-    def tell(self) -> int:
-        return self.file.tell()
-
-    def seek(self, offset: int) -> int:
-        return self.file.seek(offset)
-
-    def truncate(self) -> int:
-        return self.file.truncate()
-
-    def flush(self) -> None:
-        pass
-
-    def fileno(self) -> int:
-        return self.file.fileno()
-
-    def close(self) -> None:
-        self.closed = True
-        self.file.close()
-
-
 @pytest.mark.parametrize("aside", [False, True])
-def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch, aside):
-    disk = FullDisk(tmp_path / "a.mcap.partial", 40_000)
-    monkeypatch.setattr("recorder.log.logfile.open", lambda *_: disk, raising=False)
-    log, channel = open_log(tmp_path / "a.mcap", force=True, compression="none", aside=aside)
+def test_a_write_that_failed_is_named_once_and_for_all(tmp_path, aside):
+    log, channel = open_log(tmp_path / "a.mcap", compression="none", aside=aside)
 
     def fill() -> None:
         for i in range(1000):
             log.write(channel, i * SECOND // 50, b"x" * 200, i)
 
-    with pytest.raises(LogWriteError, match=r"a\.mcap\.partial.*No space left.*free") as first:
-        fill()
-    disk.room = 10**9
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, hard))
+    try:
+        with pytest.raises(LogWriteError, match=r"a\.mcap\.partial.*File too large.*free") as first:
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     for attempt in (lambda: log.write(channel, 10**12, b"", 5000), log.flush, log.finish):
         with pytest.raises(LogWriteError) as again:
             attempt()
@@ -190,7 +157,7 @@ def test_a_full_disk_is_named_once_and_for_all(tmp_path, monkeypatch, aside):
     assert not log.path.exists()
 
 
-def test_a_real_full_device_is_an_error_not_a_loss(tmp_path, monkeypatch):
+def test_a_full_disk_is_an_error_and_not_a_loss(tmp_path, monkeypatch):
     monkeypatch.setattr("recorder.log.logfile.refuse_special", lambda _: None)
     (tmp_path / "a.mcap.partial").symlink_to("/dev/full")
     log = LogFile(tmp_path / "a.mcap", force=True)

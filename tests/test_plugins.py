@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -14,12 +15,14 @@ from pathlib import Path
 
 import pytest
 from conftest import Cdmisfa, Outcome
+from folders import contents
 from PIL import Image
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
 from cdmisfa.experiments.sweep import plan
+from recorder import RecordConfig, open_scene, record, record_scene
 from recorder.cameras.words import CAMERAS
 from recorder.world.scenes import SCENES
 from replay.export.forms import FORMS
@@ -80,13 +83,66 @@ def test_nothing_of_a_plugin_is_imported_before_it_is_asked_for(cdmisfa: Cdmisfa
 
 @pytest.mark.usefixtures("environment")
 def test_a_plugins_scene_is_recorded_and_learned_from(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
-    rec, words = tmp_path / "rec", ("--max-iterations", 6, "--seed", 2, "--no-rerun", "--json")
-    done = cdmisfa("record", "swings", "-o", rec, "--frames", 200, "--seed", 2, "--json")
+    rec, words = tmp_path / "rec", ("--max-iterations", 6, "--no-rerun", "--json")
+    scene = ("--seed", 2, "--set", "scene.period=120")
+    done = cdmisfa("record", "swings", "-o", rec, "--frames", 200, *scene, "--json")
     assert [view["name"] for view in done.json["views"]] == ["quick", "slow"], done.err
-    live = cdmisfa("learn", "swings", *words, "-o", tmp_path / "live")
-    recorded = cdmisfa("learn", rec, *words)
+    assert b"version_cdmisfa-toy" in (rec / "quick.mcap").read_bytes()
+    live = cdmisfa("learn", "swings", *scene, *words, "-o", tmp_path / "live")
+    recorded = cdmisfa("learn", rec, "--seed", 2, *words)
     assert live.json["signals_sha256"] == recorded.json["signals_sha256"]
-    assert '"cdmisfa-toy": "1.2"' in (tmp_path / "live" / "run.json").read_text()
+    manifest = json.loads((tmp_path / "live" / "run.json").read_text())
+    assert manifest["versions"]["cdmisfa-toy"] == "1.2"
+    assert manifest["config"]["scene"] == {"kind": "swings", "seed": 2, "period": 120.0}
+
+
+@pytest.mark.usefixtures("environment")
+def test_processes_change_no_byte_of_a_plugins_scene(tmp_path: Path) -> None:
+    config = SCENES["swings"].config(seed=1)
+    for jobs in (1, 2):
+        record_scene("swings", tmp_path / f"{jobs}", config, frames=300, jobs=jobs)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+
+
+@pytest.mark.usefixtures("environment")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("learn", "swings", "--set", "scene.perod=3"), "did you mean scene.period?"),
+        (("learn", "swings", "--set", "scene.streams=x1"), "means nothing to the scene swings"),
+        (("learn", "icub", "--set", "scene.period=3"), "means nothing to the scene icub"),
+        (("learn", "swings", "--set", "scene.seed=-1"), "scene.seed is -1"),
+        (("record", "swing", "-o", "x"), "no scene 'swing': did you mean swings?"),
+        (("record", "swings", "--scene-picture", "x.png"), "--scene-picture is for icub"),
+    ],
+)
+def test_keys_of_a_plugins_scene_are_its_own(
+    cdmisfa: Cdmisfa, words: tuple[str, ...], said: str
+) -> None:
+    assert SCENES["swings"].config().kind == "swings"  # loaded, so that its keys are known
+    refused = cdmisfa(*words)
+    assert (refused.code, said in refused.err) == (2, True), refused.err
+
+
+@pytest.mark.usefixtures("environment")
+@pytest.mark.parametrize("name", ["oscillatory", "icub", "swings"])
+def test_a_source_that_was_opened_by_name_is_recorded_as_by_name(name: str, tmp_path: Path) -> None:
+    if name == "icub":
+        pytest.importorskip("pybullet")
+    clock = RecordConfig(fps=25.0, compression="lz4")
+    config = SCENES[name].config(seed=3)
+    record_scene(name, tmp_path / "name", config, clock, frames=20)
+    with contextlib.closing(open_scene(name, config, clock)) as source:
+        record(source, tmp_path / "source", frames=20)
+    assert contents(tmp_path / "name") == contents(tmp_path / "source")
+
+
+@pytest.mark.usefixtures("environment")
+def test_a_scene_is_told_by_its_own_configuration_and_added_once(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="oscillatory takes OscillatoryConfig, not Swing"):
+        record_scene("oscillatory", tmp_path / "rec", SCENES["swings"].config())
+    with pytest.raises(ValueError, match="there is a scene 'icub' already"):
+        SCENES.add("icub", SCENES["oscillatory"])
 
 
 def test_a_run_whose_plugin_is_gone_names_it(

@@ -89,7 +89,9 @@ def test_the_truth_is_where_the_objects_are(seen):
     block = source.take(0, FRAMES)
     source.close()
     assert source.spec.truth == TRUTH
-    np.testing.assert_array_equal(block.truth, Motions(SCENE, 1).take(FRAMES).reshape(FRAMES, 6))
+    np.testing.assert_array_equal(
+        block.truth, Motions(SCENE, 1).positions(0, FRAMES).reshape(FRAMES, 6)
+    )
     # The box stands farther left in the left view when its y is larger.
     columns = np.array([np.nonzero(f[:, :64] != f[0, 0])[1].mean() for f in seen[0]])
     y = block.truth[:, TRUTH.index("object1_y")]
@@ -102,7 +104,7 @@ def test_drawing_over_the_table_is_drawing_the_table(seen):
     lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
     differing = 0
     with contextlib.closing(World(SCENE)) as world:
-        for t, places in enumerate(motions.take(30)):
+        for t, places in enumerate(motions.positions(0, 30)):
             world.place(places)
             for view, yaw in enumerate(eyes.yaw):
                 pair = [
@@ -117,7 +119,7 @@ def test_the_robot_does_not_see_itself(seen):
     eyes = SCENE.eyes
     lens = perspective(eyes.vertical_fov, eyes.width / eyes.height, eyes.near, eyes.far)
     with contextlib.closing(World(SCENE, robot_seen=True)) as world:
-        world.place(Motions(SCENE, 1).take(1)[0])
+        world.place(Motions(SCENE, 1).positions(0, 1)[0])
         for view, yaw in enumerate(eyes.yaw):
             world.turn_head(yaw)
             matrix = eye_matrix(eyes, world.neck, yaw, 1)

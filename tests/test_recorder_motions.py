@@ -10,28 +10,18 @@ from recorder.world.icub.config import BoxConfig, IcubConfig, SphereConfig
 from recorder.world.icub.motions import CHUNK, Motions, reflect
 
 SCENE = IcubConfig()
-WHOLE = Motions(SCENE, 3).take(2 * CHUNK + 100)
+WHOLE = Motions(SCENE, 3).positions(0, 2 * CHUNK + 100)
 
 
-@given(st.lists(st.integers(1, 3000), min_size=1, max_size=8))
+@given(st.lists(st.tuples(st.integers(0, 2 * CHUNK), st.integers(1, 3000)), max_size=6))
 @settings(max_examples=25, deadline=None)
-def test_positions_do_not_depend_on_how_blocks_are_cut(sizes):
-    motions, start = Motions(SCENE, 3), 0
-    for n in sizes:
-        got = motions.take(n)
+def test_positions_depend_on_the_frame_alone(blocks):
+    motions = Motions(SCENE, 3)
+    for start, n in blocks:
+        got = motions.positions(start, n)
+        assert got.shape == (n, 3, 2)
         expected = WHOLE[start : start + n]
         np.testing.assert_array_equal(got[: len(expected)], expected)
-        start += n
-        assert motions.t == start
-
-
-@given(st.lists(st.integers(0, 2 * CHUNK), min_size=1, max_size=6))
-@settings(max_examples=25, deadline=None)
-def test_any_frame_can_be_sought(frames):
-    motions = Motions(SCENE, 3)
-    for t in frames:
-        motions.seek(t)
-        np.testing.assert_array_equal(motions.take(5), WHOLE[t : t + 5])
 
 
 def test_object_1_toggles_y_and_is_uniform_in_x():
@@ -63,7 +53,7 @@ def test_object_3_walks_within_its_limits_y_slower_than_x():
 
 def test_one_object_never_changes_another():
     other = IcubConfig(object1=BoxConfig(toggle_every=7), object3=SphereConfig(step_x=0.01))
-    np.testing.assert_array_equal(Motions(other, 3).take(200)[:, 1], WHOLE[:200, 1])
+    np.testing.assert_array_equal(Motions(other, 3).positions(0, 200)[:, 1], WHOLE[:200, 1])
 
 
 def test_the_motions_share_no_random_numbers_with_who_spawns_from_the_same_seed():

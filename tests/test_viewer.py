@@ -116,7 +116,8 @@ def shows(client, view, grey):
 
 
 @needs_driver
-def test_a_screenshot_is_a_picture(tmp_path):
+def test_a_screenshot_is_a_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(headless, "SETTLE", 0.5)
     write_run(tmp_path / "run.mcap", VECTOR, 6)
     headless.screenshot(tmp_path, tmp_path / "s.png", at=80, window="800x500")
     with Image.open(tmp_path / "s.png") as picture:

@@ -33,7 +33,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "verify": ("logs", "Check that a log is whole: structure, checksums, nothing lost."),
     "recover": ("logs", "Save what can be read of a damaged log as a whole one."),
     "convert": ("record", "Write camera logs of others as a recording."),
-    "compare": ("runs", "Check that runs' signals are the same bits, and show their curves."),
+    "compare": ("logs", "Check that runs' signals are the same bits, and show their curves."),
     "check": (
         "moments",
         "Learn a run again from its source, and compare every signal bit for bit.",
@@ -43,9 +43,9 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "moments",
         "Go on from some iteration of a run with other settings, as a run of its own.",
     ),
-    "plot": ("runs", "Draw the figures of a run."),
+    "plot": ("logs", "Draw the figures of a run."),
     "export": (
-        "runs",
+        "logs",
         "Write a run's signals as a table or arrays, a recording as images, videos or a dataset.",
     ),
     "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
@@ -54,13 +54,13 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "sweep",
         "Print mean and standard deviation over seeds at each point of a sweep.",
     ),
-    "signals": ("runs", "List every signal that a run records."),
+    "signals": ("logs", "List every signal that a run records."),
     "reproduce": (
-        "reproduce",
+        "studies",
         "Reproduce an experiment of the paper: numbers, tables and figures.",
     ),
-    "arena": ("arena", "Compare learners on sets of streams: what they learn, and how soon."),
-    "demo": ("demo", "Record, learn, check and show: the whole story in minutes."),
+    "arena": ("studies", "Compare learners on sets of streams: what they learn, and how soon."),
+    "demo": ("studies", "Record, learn, check and show: the whole story in minutes."),
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }
 """Each command with its module in this package and its line of help."""

@@ -7,7 +7,7 @@ import functools
 import re
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, TypeVar, cast
 
 import click
@@ -67,6 +67,32 @@ def grouped(name: str, common: Sequence[str]) -> Callable[[Callable[..., Any]], 
 def option(*names: str, **how: Any) -> Callable[[Command], Command]:
     """`click.option`, with a `group`: the heading of --help that it stands below."""
     return click.option(*names, cls=Option, **how)
+
+
+def flag(name: str, about: str, **how: Any) -> Callable[[Command], Command]:
+    """An option that is given or not."""
+    return option(name, is_flag=True, help=about, **how)
+
+
+def number(
+    name: str, about: str, least: float, most: float | None = None, unit: str = "", **how: Any
+) -> Callable[[Command], Command]:
+    """An option that is a number; a whole one where the least that it may be is."""
+    kind = click.FloatRange if isinstance(least, float) else click.IntRange
+    shown = how.get("default") is not None
+    told: dict[str, Any] = {"metavar": unit or None, "help": about, "show_default": shown, **how}
+    return option(name, type=kind(least, most), **told)
+
+
+def choice(name: str, about: str, values: Sequence[str]) -> Callable[[Command], Command]:
+    """An option that is one of some words, by default the first."""
+    kind = click.Choice(list(values))
+    return option(name, type=kind, default=values[0], show_default=True, help=about)
+
+
+def word(name: str, unit: str, about: str, **how: Any) -> Callable[[Command], Command]:
+    """An option that is a text."""
+    return option(name, metavar=unit, help=about, **how)
 
 
 def together(*each: Callable[[Command], Command]) -> Callable[[Command], Command]:
@@ -170,7 +196,7 @@ def option_of(
         field: of it, with the metadata of `setting`.
         how: more for `option`.
     """
-    told: Mapping[str, Any] = field.metadata
+    told = field.metadata
     kind = typing.get_type_hints(settings)[field.name]
     if types.NoneType in typing.get_args(kind):
         kind = next(each for each in typing.get_args(kind) if each is not types.NoneType)

@@ -10,7 +10,17 @@ from typing import Any, cast
 
 import click
 
-from cdmisfa.cli.making import Command, option, option_of, options_of, together
+from cdmisfa.cli.making import (
+    Command,
+    choice,
+    flag,
+    number,
+    option,
+    option_of,
+    options_of,
+    together,
+    word,
+)
 from cdmisfa.core.errors import CdmisfaError
 from recorder.cameras.options import LiveOptions
 from recorder.images.options import ImageOptions
@@ -49,97 +59,77 @@ look_options = options_of(CameraOptions, "cameras", "topics", "fields", "time", 
 live_options = options_of(LiveOptions, "live", "hold", "on_loss", "stall")
 """How live streams are put on one clock."""
 
-dry_run = option(
-    "--dry-run",
-    is_flag=True,
-    help="Say what would be read from camera logs, and write nothing.",
-    group="Source",
+dry_run = flag(
+    "--dry-run", "Say what would be read from camera logs, and write nothing.", group="Source"
 )
-
+loop = flag("--loop", "Start a recording or log again at its end.", group="Source")
+salvage = flag("--salvage", "Pass over damaged parts and images of a log.", group="Source")
+force = flag("--force", "Overwrite what is already there.")
+no_rerun = flag("--no-rerun", "Do not build the Rerun view run.rrd.")
+retry_failed = flag("--retry-failed", "Compute trials again that failed before.")
 as_json = option(
     "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else."
 )
-
-seed = option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    default=0,
-    show_default=True,
-    help="Seed of every random choice.",
-    group="Learner",
-)
-
-settings = option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set a configuration key, as learner.nu=0.02; may be repeated.",
-    group="Learner",
-)
-
-preset = option(
+jobs = number("--jobs", "Parallel processes.", 1, 1024, default=1)
+preset = word(
     "--preset",
-    metavar="NAME",
-    help="Preset (icub, oscillatory, cameras) or a .toml file; by default the one of the source.",
+    "NAME",
+    "Preset (icub, oscillatory, cameras) or a .toml file; by default the one of the source.",
     group="Learner",
 )
-
-loop = option(
-    "--loop", is_flag=True, help="Start a recording or log again at its end.", group="Source"
-)
-
-salvage = option(
-    "--salvage", is_flag=True, help="Pass over damaged parts and images of a log.", group="Source"
-)
-
-no_rerun = option("--no-rerun", is_flag=True, help="Do not build the Rerun view run.rrd.")
-
-retry_failed = option(
-    "--retry-failed", is_flag=True, help="Compute trials again that failed before."
-)
-
-keyframes = option(
+keyframes = number(
     "--keyframes",
-    type=click.IntRange(1),
-    metavar="N",
-    help="Keep the learner's state every N iterations; by default every 100, or less often so "
-    "that they stay a small part of the log.",
+    "Keep the learner's state every N iterations; by default every 100, or less often so that they "
+    "stay a small part of the log.",
+    *(1, None, "N"),
 )
-
-fsync_every = option(
+fsync_every = number(
     "--fsync-every",
-    type=click.FloatRange(0.0, 1e6),
-    metavar="SECONDS",
-    help="Let the disk have what is written after so long, so that a power cut takes no more; by "
+    "Let the disk have what is written after so long, so that a power cut takes no more; by "
     "default the operating system decides until a file is finished.",
+    *(0.0, 1e6, "SECONDS"),
 )
-
-force = option("--force", is_flag=True, help="Overwrite what is already there.")
-
-jobs = option(
-    "--jobs",
-    type=click.IntRange(1, 1024),
-    default=1,
-    show_default=True,
-    help="Parallel processes.",
-)
-
 engine = together(
-    option(
+    choice(
         "--engine",
-        type=click.Choice(["local", "dask"]),
-        default="local",
-        show_default=True,
-        help="Where to compute: in processes of this machine, or in workers of dask.",
+        "Where to compute: in processes of this machine, or in workers of dask.",
+        ("local", "dask"),
     ),
-    option("--scheduler", metavar="ADDRESS", help="Address of a dask scheduler that runs."),
+    word("--scheduler", "ADDRESS", "Address of a dask scheduler that runs."),
 )
 
 
-def end_after(what: str, meaning: str) -> Callable[[Command], Command]:
+def seed(
+    about: str = "Seed of every random choice.", default: int | None = 0
+) -> Callable[[Command], Command]:
+    """`--seed`."""
+    return number("--seed", about, 0, 2**63 - 1, default=default, group="Learner")
+
+
+def seeds(about: str, default: str) -> Callable[[Command], Command]:
+    """`--seeds`, which `parse_seeds` reads."""
+    about += ": a range without its end, or numbers with commas, as 1,5,9."
+    return word("--seeds", "FIRST:END", about, default=default, show_default=True)
+
+
+def settings(
+    about: str = "Set a configuration key, as learner.nu=0.02; may be repeated.",
+    unit: str = "KEY=VALUE",
+) -> Callable[[Command], Command]:
+    """`--set`."""
+    return option("--set", "settings", multiple=True, metavar=unit, help=about, group="Learner")
+
+
+def end_after(what: str, about: str) -> Callable[[Command], Command]:
     """`--max-iterations` or `--max-modules`."""
-    return option(f"--max-{what}", type=click.IntRange(1), help=meaning, group="Learner")
+    return number(f"--max-{what}", about, 1, group="Learner")
+
+
+def path(
+    name: str, about: str, unit: str | None = None, **how: Any
+) -> Callable[[Command], Command]:
+    """An option that is a path of this machine."""
+    return option(name, type=OUT, metavar=unit, help=about, **how)
 
 
 def _hold(ctx: click.Context, param: click.Parameter, value: float) -> None:
@@ -208,10 +198,10 @@ def _matched(words: tuple[str, ...]) -> tuple[str, ...]:
     """Words with patterns as what matches them."""
     if not any(letter in word for word in words for letter in "*?["):
         return words
-    from replay.inputs import places
+    from replay.inputs import locations
     from replay.storage.location import Url
 
-    return tuple(p.address if isinstance(p, Url) else str(p) for p in places(words))
+    return tuple(p.address if isinstance(p, Url) else str(p) for p in locations(words))
 
 
 def _copy_of(ctx: click.Context, word: str) -> Path:

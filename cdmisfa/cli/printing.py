@@ -14,6 +14,7 @@ from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:
     from cdmisfa.core.blocks import FrameSource
+    from cdmisfa.experiments.run_folder import RunResult
 
 SCHEMA = 1
 """Version of the JSON documents; rises when a key changes its meaning or goes away."""
@@ -43,6 +44,13 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     cells.insert(1, ["-" * width for width in widths])
     for row in cells:
         click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
+
+
+def say_failed(rows: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
+    """Say which trials failed."""
+    for row in rows:
+        at = " ".join(f"{key}={value}" for key, value in row["point"].items())
+        click.echo(f"failed: {at} seed {row['seed']}: {row['error']}", err=err)
 
 
 def tell(line: str) -> None:
@@ -122,3 +130,57 @@ def print_plan(source: FrameSource, *, as_json: bool) -> None:
         click.echo(f"{said}: {' '.join(unknown)}")
     for warning in warnings:
         warn(warning)
+
+
+def announce(address: str) -> None:
+    """Say where a live view is, and open it where there is a display."""
+    from replay.viewer.program import has_display, open_privately
+
+    tell(f"live view {address}    look at it: rerun {address}")
+    if has_display():
+        open_privately(address)
+
+
+def outcome_line(outcome: Mapping[str, Any]) -> str:
+    """What became of a stream, in words."""
+    came = outcome["state"].replace("_", " ")
+    if outcome["module"] is not None:
+        came += f" by module {outcome['module']}"
+    if outcome["slowness"] is not None:
+        came += f", slowness {outcome['slowness']:.4f} on frames not learned from"
+    because = f": {outcome['why']}" if outcome["why"] else ""
+    return f"{outcome['stream']}: {came}, after {outcome['blocks']} blocks{because}"
+
+
+def print_result(result: RunResult, *, as_json: bool) -> None:
+    """Print what a run came to."""
+    from cdmisfa.core.signals import ACTIONS
+    from cdmisfa.experiments.loop import ENDINGS
+
+    if as_json:
+        print_json(result.as_json())
+        return
+    rows = [
+        (
+            module.index,
+            module.stream,
+            module.iteration,
+            " ".join(ACTIONS[action] for action in module.policy),
+            ", ".join(f"{eta:.4f}" for eta in module.eta),
+        )
+        for module in result.modules
+    ]
+    if rows and "streams" not in result.summary:
+        print_table(("module", "stream", "iteration", "policy", "eta"), rows)
+    elif rows:  # no policy led to them
+        without = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
+        print_table(("module", "stream", "iteration", "eta"), without)
+    else:
+        click.echo("no module was learned")
+    for outcome in result.summary.get("streams", ()):
+        click.echo(outcome_line(outcome))
+    click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
+    click.echo(f"signals sha256 {result.signals_sha256}")
+    if result.run is not None:
+        look = f"look at it: cdmisfa view {quoted(result.run)}"
+        click.echo(f"run {result.run}    {look}")

@@ -15,7 +15,7 @@ import reprlib
 import tomllib
 import types
 import typing
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -277,7 +277,6 @@ def build(
     Raises:
         UsageError: an unknown key (with the nearest valid one) or a value of the wrong type.
     """
-    fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     hints = _hints(cls)
     values: dict[str, Any] = {}
     nested: dict[str, list[Mapping[str, Any]]] = {}
@@ -286,8 +285,8 @@ def build(
             name, dot, rest = key.partition(".")
             if f"{prefix}.{name}" in FORMER:
                 continue
-            if name not in fields:
-                hint = did_you_mean(name, fields, f"{prefix}.")
+            if name not in hints:
+                hint = did_you_mean(name, hints, f"{prefix}.")
                 raise UsageError(f"unknown key {prefix}.{shown(key)}: {hint}")
             if dataclasses.is_dataclass(hints[name]):
                 if not dot and not isinstance(value, Mapping):
@@ -300,11 +299,10 @@ def build(
             else:
                 values[name] = convert_value(value, hints[name], f"{prefix}.{name}")
     for name, parts in nested.items():
-        start = getattr(base, name) if base is not None else _default(fields[name])
-        values[name] = build(hints[name], f"{prefix}.{name}", *parts, base=start)
-    if base is not None:
-        return dataclasses.replace(base, **values)  # type: ignore[type-var]
-    return cls(**values)
+        values[name] = build(
+            hints[name], f"{prefix}.{name}", *parts, base=getattr(base or cls(), name)
+        )
+    return dataclasses.replace(base, **values) if base else cls(**values)  # type: ignore[type-var]
 
 
 def convert_value(value: Any, hint: Any, key: str) -> Any:
@@ -324,45 +322,57 @@ def convert_value(value: Any, hint: Any, key: str) -> Any:
             return None
         return convert_value(value, next(a for a in arguments if a is not types.NoneType), key)
     if origin is tuple:
-        parts = (
-            [p.strip() for p in value.strip("()[] ").split(",") if p.strip()]
-            if isinstance(value, str)
-            else value
-        )
+        parts = value.strip("()[] ").split(",") if isinstance(value, str) else value
         if not isinstance(parts, list | tuple):
             raise UsageError(f"{key} is {shown(value)}: it must be a list")
+        if isinstance(value, str):
+            parts = [part.strip() for part in parts if part.strip()]
         inner = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(parts)
         if len(inner) != len(parts):
             raise UsageError(f"{key} is {shown(value)}: it must have {len(inner)} values")
         return tuple(convert_value(p, h, key) for p, h in zip(parts, inner, strict=True))
+    if hint not in _SCALARS:
+        raise TypeError(f"{key}: fields of type {hint} cannot be configured")
+    words, scalar = _SCALARS[hint]
     try:
-        if hint is bool:
-            if isinstance(value, str):
-                return {"true": True, "false": False}[value.lower()]
-            if not isinstance(value, bool):
-                raise ValueError
-            return value
-        if hint is int:
-            if isinstance(value, bool):
-                raise ValueError
-            whole = int(value) if isinstance(value, str) else index(value)
-            if abs(whole) > LARGEST:
-                raise ValueError
-            return whole
-        if hint is float:
-            if isinstance(value, bool):
-                raise ValueError
-            number = float(value)
-            if math.isnan(number):
-                raise ValueError
-            return number
-        if hint is str:
-            if not isinstance(value, str):
-                raise ValueError
-            return value
+        return scalar(value)
     except (ValueError, TypeError, KeyError, OverflowError):
-        raise UsageError(f"{key} is {_SHORT.repr(value)}: it must be {_WORDS[hint]}") from None
-    raise TypeError(f"{key}: fields of type {hint} cannot be configured")
+        raise UsageError(f"{key} is {_SHORT.repr(value)}: it must be {words}") from None
+
+
+def _boolean(value: Any) -> bool:
+    if isinstance(value, bool):
+        return value
+    return {"true": True, "false": False}[value.lower() if isinstance(value, str) else ""]
+
+
+def _whole(value: Any) -> int:
+    number = int(value) if isinstance(value, str) else index(value)
+    if isinstance(value, bool) or abs(number) > LARGEST:
+        raise ValueError
+    return number
+
+
+def _number(value: Any) -> float:
+    number = float(value)
+    if isinstance(value, bool) or math.isnan(number):
+        raise ValueError
+    return number
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+_SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {
+    bool: ("true or false", _boolean),
+    int: ("a whole number", _whole),
+    float: ("a number", _number),
+    str: ("a text", _text),
+}
+"""What a value of a type is in words, and how it is made of a value or text."""
 
 
 def section_table(section: Any) -> dict[str, Any]:
@@ -387,12 +397,3 @@ def differences(before: Any, now: Any, key: str = "") -> Iterator[tuple[str, Any
             yield from differences(before.get(name), now.get(name), where)
     elif before != now:
         yield key, before, now
-
-
-_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-
-
-def _default(field: Any) -> Any:
-    if field.default is not dataclasses.MISSING:
-        return field.default
-    return field.default_factory() if field.default_factory is not dataclasses.MISSING else None

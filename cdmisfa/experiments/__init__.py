@@ -12,8 +12,8 @@ __getattr__, __dir__, __all__ = exports(
         "cdmisfa.experiments.session": "Session run",
         "cdmisfa.experiments.sources": "Configuration configure open_source",
         "replay.camera_logs.options": "CameraOptions",
-        "cdmisfa.experiments.store": "TrialStore",
-        "cdmisfa.experiments.sweep": "SweepReport SweepTrial",
+        "cdmisfa.experiments.store": "SweepReport TrialStore",
+        "cdmisfa.experiments.sweep": "SweepTrial",
         "cdmisfa.experiments.trial": "run_trial",
     },
 )

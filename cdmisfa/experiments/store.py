@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
-from io import RawIOBase
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, LogWriteError
 from cdmisfa.core.processes import WorkerDied, run_all
@@ -47,37 +46,32 @@ def code(*more: str) -> str:
     return f"{metadata.version('cdmisfa')}+{digest.hexdigest()[:12]}"
 
 
-def identity(*depends: Any) -> str:
+def trial_id(*depends: Any) -> str:
     """The name of a trial: a hash of what decides its result, as JSON values."""
     text = json.dumps(depends, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-class AnyTrial(Protocol):
-    """What there is to know of a trial to compute it only once."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredTrial:
+    """What there is to know of a trial to compute it only once.
 
-    @property
-    def id(self) -> str:
-        """Hash of all it depends on."""
+    Attributes:
+        id: hash of all it depends on.
+        point: what it is a trial of.
+        seed: which of the trials there.
+        code: version of the code that the hash is about; workers must have the same.
+        log: folder in which to keep its log, or None.
+    """
 
-    @property
-    def point(self) -> Mapping[str, str]:
-        """What it is a trial of."""
-
-    @property
-    def seed(self) -> int:
-        """Which of the trials there."""
-
-    @property
-    def log(self) -> Path | None:
-        """Folder in which to keep its log, or None."""
-
-    @property
-    def code(self) -> str:
-        """Version of the code that the hash is about; workers must have the same."""
+    id: str
+    point: Mapping[str, Any]
+    seed: int
+    code: str
+    log: Path | None = None
 
 
-Task = TypeVar("Task", bound=AnyTrial)
+Task = TypeVar("Task", bound=StoredTrial)
 
 
 class TrialStore:
@@ -99,23 +93,13 @@ class TrialStore:
                 make_folder(folder)
             opened.enter_context(held(folder))
             refuse_special(self._path)
+            self.rows, size = _read(self._path)
             with self._telling():
                 # Unbuffered: what a disk refused once is not tried again when it is closed.
-                self._file = opened.enter_context(open(self._path, "a+b", buffering=0))
-                self._file.truncate(_whole_lines(self._file))  # a kill cut the rest short
+                self._file = opened.enter_context(open(self._path, "ab", buffering=0))
+                self._file.truncate(size)  # a kill cut the rest short
                 to_disk(folder)
-            self.rows = {row["id"]: row for row in read_rows(folder)}
             self._opened = opened.pop_all()
-
-    def needs_computing(self, trial: str, kept: Path | None = None, *, retry: bool = False) -> bool:
-        """Whether a trial has no row yet, or what was `kept` of it beside its row is gone.
-
-        One that has failed needs computing only with `retry`.
-        """
-        row = self.rows.get(trial)
-        if row is None or (retry and row["status"] == FAILED):
-            return True
-        return row["status"] == DONE and kept is not None and not kept.exists()
 
     def add(self, row: Mapping[str, Any]) -> None:
         """Add the row of a trial: its `id`, its `status`, the `point` it is at, and more."""
@@ -148,10 +132,15 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
         UsageError: they are in no regular file.
         LogDamagedError: a line is not a row, or together they take more memory than `budget`.
     """
-    path = folder / ROWS
+    yield from _read(folder / ROWS)[0].values()
+
+
+def _read(path: Path) -> tuple[dict[str, dict[str, Any]], int]:
+    """The last row of every trial, by its identity, and the bytes of whole lines."""
     rows: dict[str, dict[str, Any]] = {}
+    size = 0
     if not path.exists():
-        return
+        return rows, size
     try:
         with budget(), opened_regular(path) as file:
             lines = iter(lambda: file.readline(MAX_LIST + 1), b"")
@@ -165,26 +154,14 @@ def read_rows(folder: Path) -> Iterator[dict[str, Any]]:
                     raise LogDamagedError(
                         f"{path} line {number} is no trial's row: remove the line"
                     ) from error
+                size += len(line)
     except MemoryError:
         rows.clear()
         raise LogDamagedError(
             f"{path}: its rows take more than {BUDGET >> 20} MiB of memory, the limit: "
             "split the grid over several folders"
         ) from None
-    yield from rows.values()
-
-
-def _whole_lines(file: RawIOBase) -> int:
-    """Bytes of a file up to the end of its last whole line."""
-    stop = file.seek(0, os.SEEK_END)
-    while stop:
-        start = max(stop - MAX_LIST, 0)
-        file.seek(start)
-        end = (file.read(stop - start) or b"").rfind(b"\n")
-        if end >= 0:
-            return start + end + 1
-        stop = start
-    return 0
+    return rows, size
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +194,7 @@ def run_trials(
     scheduler: str | None = None,
     retry_failed: bool = False,
     begin: Callable[[Sequence[Task]], None] = lambda missing: None,
-    progress: Callable[[int, int, int], None] | None = None,
+    progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
 ) -> SweepReport:
     """Compute the trials that have no row in a folder yet.
 
@@ -237,29 +214,32 @@ def run_trials(
         EngineError: no scheduler answers.
     """
     refuse_special(folder)
+
+    def is_missing(trial: Task) -> bool:
+        row = store.rows.get(trial.id)
+        if row is None or (retry_failed and row["status"] == FAILED):
+            return True
+        return row["status"] == DONE and trial.log is not None and not trial.log.exists()
+
     with contextlib.closing(TrialStore(folder)) as store:
-        missing = [t for t in trials if store.needs_computing(t.id, t.log, retry=retry_failed)]
+        missing = [trial for trial in trials if is_missing(trial)]
         begin(missing)
         outdated = _outdated(missing, store.rows.values())
-        finished = skipped = len(trials) - len(missing)
-        again = {trial.id for trial in missing}
-        failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in again)
-        for index, result in run_all(
-            compute, missing, jobs=jobs, engine=engine, scheduler=scheduler
-        ):
-            trial = missing[index]
-            row = _row(trial, result)
+        skipped = len(trials) - len(missing)
+        left = {trial.id for trial in missing}
+        failed = sum(store.rows[t.id]["status"] == FAILED for t in trials if t.id not in left)
+        computed = run_all(compute, missing, jobs=jobs, engine=engine, scheduler=scheduler)
+        for finished, (index, result) in enumerate(computed, start=skipped + 1):
+            row = _row(missing[index], result)
             store.add(row)
-            finished += 1
             failed += row["status"] == FAILED
-            if progress is not None:
-                progress(finished, failed, len(trials))
-    rows = store.rows
+            progress(finished, failed, len(trials))
+        rows = store.rows
     return SweepReport(
         folder=folder,
         trials=len(trials),
         skipped=skipped,
-        computed=sum(rows[t.id]["status"] == DONE for t in missing),
+        computed=sum(rows[trial.id]["status"] == DONE for trial in missing),
         failed=tuple(rows[t.id] for t in trials if rows[t.id]["status"] == FAILED),
         outdated=outdated,
     )
@@ -286,7 +266,7 @@ def answer(
         return {"error": f"{type(error).__name__}: {error}"}
 
 
-def _row(trial: AnyTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
+def _row(trial: StoredTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, Any]:
     if isinstance(result, WorkerDied):
         result = {"error": result.what}
     failed = "error" in result
@@ -301,7 +281,7 @@ def _row(trial: AnyTrial, result: Mapping[str, Any] | WorkerDied) -> dict[str, A
     }
 
 
-def _outdated(trials: Sequence[AnyTrial], rows: Iterable[Mapping[str, Any]]) -> int:
+def _outdated(trials: Sequence[StoredTrial], rows: Iterable[Mapping[str, Any]]) -> int:
     """How many trials are in the rows already, but computed by other code."""
     mine = {trial.code for trial in trials}
     done = {

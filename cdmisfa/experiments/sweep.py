@@ -29,7 +29,14 @@ from cdmisfa.experiments.sources import (
     log_settings,
     open_logs,
 )
-from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
+from cdmisfa.experiments.store import (
+    StoredTrial,
+    SweepReport,
+    answer,
+    code,
+    run_trials,
+    trial_id,
+)
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.log.files import atomic_write
 from recorder.world.oscillatory import OscillatoryConfig
@@ -44,32 +51,26 @@ UNKEPT = ("schema", "run", "source", "seed", "signals_sha256")
 """What of a run's result a trial's row has elsewhere, or not at all."""
 
 
-@dataclass(frozen=True, slots=True)
-class SweepTrial:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepTrial(StoredTrial):
     """One run of a sweep, and everything a worker needs to compute it.
 
     Attributes:
-        id: hash of all it depends on.
         source: a scene's name, or the paths of a recording.
         configuration: preset, settings, the grid's point and the seed, all together.
-        point: the grid's keys with this trial's values.
-        seed: of the learner, and of a live scene.
-        log: folder in which to keep its log, or None.
-        code: version of the code that the hash is about; workers must have the same.
+        loop: whether a recording starts again at its end.
+        cameras: how images of others become frames.
+        max_iterations: end after so many.
+        max_modules: end after so many.
         limits: of the time for servers that the source is on.
     """
 
-    id: str
     source: tuple[str, ...]
     configuration: Configuration
-    point: Mapping[str, str]
-    seed: int
     loop: bool
     cameras: CameraOptions
     max_iterations: int | None
     max_modules: int | None
-    log: Path | None
-    code: str
     limits: Limits
 
 
@@ -79,18 +80,13 @@ def sweep(
     *,
     grid: Mapping[str, Sequence[Any]] | None = None,
     seeds: Iterable[int] = range(20),
-    preset: str | None = None,
-    settings: Sequence[str] = (),
-    loop: bool = False,
-    cameras: CameraOptions | None = None,
-    max_iterations: int | None = None,
-    max_modules: int | None = None,
     jobs: int = 1,
     engine: str = "local",
     scheduler: str | None = None,
     keep_logs: bool = False,
     retry_failed: bool = False,
-    progress: Callable[[int, int, int], None] | None = None,
+    progress: Callable[[int, int, int], None] = lambda finished, failed, total: None,
+    **how: Any,
 ) -> SweepReport:
     """Run every trial of a grid that is not finished yet.
 
@@ -99,19 +95,14 @@ def sweep(
         folder: where the rows are; made where it does not exist.
         grid: values to try, by configuration key; every combination is a point.
         seeds: every point is tried with each of them.
-        preset: instead of the source's own.
-        settings: `section.key=value` words for all trials.
-        loop: start a recording again at its end.
-        cameras: how images of others become frames; see `open_source`.
-        max_iterations: end each trial after so many.
-        max_modules: end each trial after so many.
         jobs: local processes.
-        engine: where to compute, see `engines.ENGINES`.
+        engine: where to compute, see `processes.ENGINES`.
         scheduler: address of a dask scheduler.
         keep_logs: keep each trial's run folder in folder/trials; with workers on other
             machines it must be a shared one.
         retry_failed: compute trials again that failed before.
         progress: called with the trials finished, failed, and asked for.
+        how: further arguments of `plan`, for all trials.
 
     Raises:
         UsageError: a wrong key, value, source or engine, found before any trial starts.
@@ -120,18 +111,8 @@ def sweep(
     folder = Path(folder).resolve()
     if log := next(folder.glob("*.mcap*"), None):
         raise UsageError(f"{folder} holds {log.name}, of a run or a recording: choose another -o")
-    trials = plan(
-        source,
-        grid=grid or {},
-        seeds=seeds,
-        preset=preset,
-        settings=settings,
-        loop=loop,
-        cameras=cameras,
-        max_iterations=max_iterations,
-        max_modules=max_modules,
-        logs=folder / "trials" if keep_logs else None,
-    )
+    logs = folder / "trials" if keep_logs else None
+    trials = plan(source, grid=grid or {}, seeds=seeds, logs=logs, **how)
     request = as_text(_request(grid or {}, trials))
     if len(request) > MAX_LIST:
         raise UsageError(
@@ -165,6 +146,18 @@ def plan(
 ) -> list[SweepTrial]:
     """Every trial of a sweep, in the grid's order, seeds innermost; checks all settings.
 
+    Args:
+        source: see `sweep`.
+        grid: see there.
+        seeds: see there.
+        preset: instead of the source's own.
+        settings: `section.key=value` words for all trials.
+        loop: start a recording again at its end.
+        cameras: how images of others become frames; see `open_source`.
+        max_iterations: end each trial after so many.
+        max_modules: end each trial after so many.
+        logs: folder in which each trial keeps its run.
+
     Raises:
         UsageError: an unknown key, a value that does not fit, or no such source.
     """
@@ -190,7 +183,7 @@ def plan(
                 depends.append(used)
             if cameras != CameraOptions():
                 depends.append(dataclasses.asdict(cameras))
-            name = identity(depends, seed, recorded, [max_iterations, max_modules], code())
+            name = trial_id(depends, seed, recorded, [max_iterations, max_modules], code())
             trial = SweepTrial(
                 id=name,
                 source=paths,

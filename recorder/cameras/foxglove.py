@@ -112,24 +112,26 @@ class FoxgloveCamera:
             steady = Steady()
             video = decode if isinstance(decode, VideoPackets) else None
             for message in connection:
-                if isinstance(message, bytes) and len(message) >= _HEADER.size:
-                    what, subscription, log_time = _HEADER.unpack_from(message)
-                    if (what, subscription) == (_DATA, _SUBSCRIPTION):
-                        tries = 0
-                        logged = log_time / NANOSECONDS if log_time else None
-                        age = steady.age(time.monotonic(), logged)
-                        data = message[_HEADER.size :]
-                        if self.distances is None and not self._reading.fields:
-                            self.distances = holds_distances(kind.schema, kind.encoding, data)
-                        if video is None or video.begins(data):
-                            video = None  # it has begun
-                            yield age, decode(data)
-                elif isinstance(message, str) and self._is_gone(message, number):
+                told = _told(message)
+                if told.get("op") == "unadvertise" and number in told.get("channelIds", ()):
                     return
-                elif isinstance(message, str) and tries and self._is_refused(message):
+                if told.get("op") == "status" and told.get("level") in (1, 2) and tries:
                     tries -= 1
                     time.sleep(_AGAIN)
                     connection.send(subscribe)
+                if not isinstance(message, bytes) or len(message) < _HEADER.size:
+                    continue
+                what, subscription, log_time = _HEADER.unpack_from(message)
+                if (what, subscription) != (_DATA, _SUBSCRIPTION):
+                    continue
+                tries = 0
+                age = steady.age(time.monotonic(), log_time / NANOSECONDS if log_time else None)
+                data = message[_HEADER.size :]
+                if self.distances is None and not self._reading.fields:
+                    self.distances = holds_distances(kind.schema, kind.encoding, data)
+                if video is None or video.begins(data):
+                    video = None  # it has begun
+                    yield age, decode(data)
 
     def describe(self) -> Mapping[str, Any]:
         """The server and the topic."""
@@ -153,7 +155,8 @@ class FoxgloveCamera:
                 continue
             if told.get("op") == "advertise":
                 channels |= {str(c.get("topic")): c for c in told.get("channels", ())}
-                images = {t: d for t, c in channels.items() if (d := self._decoder(c)) is not None}
+                decoders = {t: decoder_of(_kind(c), self._reading) for t, c in channels.items()}
+                images = {topic: decode for topic, decode in decoders.items() if decode is not None}
             found = self._topic or (next(iter(images)) if len(images) == 1 else "")
             if found in images:
                 channel = channels[found]
@@ -173,20 +176,6 @@ class FoxgloveCamera:
         known = ", ".join(sorted(images)) or "nothing"
         what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
         return f"{self._where} {what}: it has {wanted} on {known}"
-
-    def _decoder(self, channel: Mapping[str, Any]) -> Taken | None:
-        return decoder_of(_kind(channel), self._reading)
-
-    @staticmethod
-    def _is_refused(message: str) -> bool:
-        """Whether a server says that something is wrong, as with what was subscribed to."""
-        told = _told(message)
-        return told.get("op") == "status" and told.get("level") in (1, 2)
-
-    @staticmethod
-    def _is_gone(message: str, number: int) -> bool:
-        told = _told(message)
-        return told.get("op") == "unadvertise" and number in told.get("channelIds", ())
 
 
 def _kind(channel: Mapping[str, Any]) -> MessageKind:

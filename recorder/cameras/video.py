@@ -6,7 +6,7 @@ import errno
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,41 +44,32 @@ class VideoCamera:
     and its pictures were taken when they come.
 
     Args:
-        word: as the user named it.
-        address: what FFmpeg opens.
-        form: the format FFmpeg takes it for; None to find out.
+        word: `camera:DEVICE`, `av:FORMAT:ADDRESS`, `av:ADDRESS`, or a URL.
         name: of the stream.
         timeout: seconds that opening and reading may take of a network stream.
         color: show its colours.
 
     Raises:
-        UsageError: PyAV is missing.
+        UsageError: PyAV is missing, or the word names nothing.
     """
 
-    def __init__(
-        self,
-        word: str,
-        address: str,
-        form: str | None,
-        name: str,
-        *,
-        timeout: float,
-        color: bool = False,
-    ) -> None:
+    def __init__(self, word: str, name: str, *, timeout: float, color: bool = False) -> None:
         self.name = name
         self.rate: float | None = None
-        self._word, self._address, self._form, self._timeout = word, address, form, timeout
-        self._remote = _NETWORK.match(address) is not None
-        device = address.startswith("/dev/") and not Path(address).is_file()  # /dev/shm has files
-        self.finite = not self._remote and not device
+        self._word, self._timeout = word, timeout
         self._av = pyav(word)
-        self._shown = frame_colors if color else frame_gray
+        self._form, self._address = _form_and_address(word, self._av.formats_available)
+        self._remote = _NETWORK.match(self._address) is not None
+        # /dev/shm has files
+        device = self._address.startswith("/dev/") and not Path(self._address).is_file()
+        self.finite = not self._remote and not device
+        self._convert = frame_colors if color else frame_gray
 
     def pictures(self) -> Iterator[tuple[int, ByteArray]]:
         """See `Camera`."""
         with self._open() as container:
             if not container.streams.video:
-                raise CdmisfaError(f"{_SECRET.sub('', self._word)}: there is no video in it")
+                raise CdmisfaError(f"{self._shown_word}: there is no video in it")
             video = container.streams.video[0]
             context = video.codec_context
             self._check(context, context.codec)
@@ -89,13 +80,28 @@ class VideoCamera:
             timed = not (self._remote and container.format.flags & _TIMELESS)
             stated = timed and (video.average_rate or video.guessed_rate)
             self.rate = float(stated) if stated else None
+            steady = Steady()
             try:
-                yield from self._paced(container.decode(video), context.codec, timed=timed)
+                for frame in container.decode(video):
+                    self._check(frame, context.codec)
+                    presented = frame.time if timed else None
+                    early = steady.early(time.monotonic(), presented)
+                    if early > 0 and not self._remote:
+                        time.sleep(early)
+                    yield steady.age(time.monotonic(), presented), self._convert(frame)
             except (OSError, ValueError, self._av.FFmpegError) as error:
                 reason = _reason(error)
                 if getattr(error, "errno", None) == errno.EINVAL:  # all that FFmpeg says of it
                     reason += f", as where pictures come to have more than {most} pixels"
                 raise CdmisfaError(f"{self.name} is gone: {reason}") from None
+
+    def describe(self) -> Mapping[str, Any]:
+        """The word, without what may be a password."""
+        return {"camera": self._shown_word}
+
+    @property
+    def _shown_word(self) -> str:
+        return _SECRET.sub("", self._word)
 
     def _open(self) -> Any:
         """Open it within the budget; what decodes it later does so beside others, without one."""
@@ -116,8 +122,7 @@ class VideoCamera:
             reason = _reason(error)
             if isinstance(error, MemoryError):
                 reason = f"it takes more than {BUDGET >> 20} MiB of memory, the limit"
-            shown = _SECRET.sub("", self._word)
-            raise CdmisfaError(f"{shown} cannot be opened: {reason}") from None
+            raise CdmisfaError(f"{self._shown_word} cannot be opened: {reason}") from None
 
     def _check(self, shown: Any, codec: Any) -> None:
         """Refuse pictures, of what states a width, a height and a format, that take too much."""
@@ -127,22 +132,6 @@ class VideoCamera:
                 f"{self.name}: images of {shown.width}x{shown.height}, live ones of this kind have "
                 f"1 to {most} pixels"
             )
-
-    def _paced(
-        self, frames: Iterator[Any], codec: Any, *, timed: bool
-    ) -> Iterator[tuple[int, ByteArray]]:
-        steady = Steady()
-        for frame in frames:
-            self._check(frame, codec)
-            presented = frame.time if timed else None
-            early = steady.early(time.monotonic(), presented)
-            if early > 0 and not self._remote:
-                time.sleep(early)
-            yield steady.age(time.monotonic(), presented), self._shown(frame)
-
-    def describe(self) -> Mapping[str, Any]:
-        """The word, without what may be a password."""
-        return {"camera": _SECRET.sub("", self._word)}
 
 
 class Steady:
@@ -179,28 +168,21 @@ class Steady:
         return round((delay - self._offset) * NANOSECONDS)
 
 
-def video_camera(word: str, name: str, *, timeout: float, color: bool = False) -> VideoCamera:
-    """The camera that a word names: `camera:DEVICE`, `av:FORMAT:ADDRESS`, `av:ADDRESS`, or a URL.
-
-    Raises:
-        UsageError: PyAV is missing, or the word names nothing.
-    """
+def _form_and_address(word: str, formats: Collection[str]) -> tuple[str | None, str]:
+    """The format that FFmpeg takes what a word names for, None to find out, and its address."""
     head, _, rest = word.partition(":")
     if head not in ("camera", "av"):
-        return VideoCamera(word, word, None, name, timeout=timeout, color=color)
+        return None, word
     if not rest:
         raise UsageError(f"{word} names no device: write {head}:/dev/video0, as it is")
-    form = None
     if head == "camera":
-        form = "v4l2" if rest.startswith("/dev/video") else None
         if not os.path.exists(rest):
             raise UsageError(f"{rest}: there is no such device")
-    else:
-        known, _, address = rest.partition(":")
-        formats = pyav(word).formats_available
-        if address and not address.startswith("//") and known in formats:
-            form, rest = known, address
-    return VideoCamera(word, rest, form, name, timeout=timeout, color=color)
+        return "v4l2" if rest.startswith("/dev/video") else None, rest
+    known, _, address = rest.partition(":")
+    if address and not address.startswith("//") and known in formats:
+        return known, address
+    return None, rest
 
 
 def _reason(error: Exception) -> str:

@@ -58,9 +58,9 @@ def _foxglove(word: str, name: str, *, say: Callable[[str], None], **chosen: Any
 
 
 def _video(word: str, name: str, *, color: bool = False) -> Camera:
-    from recorder.cameras.video import video_camera
+    from recorder.cameras.video import VideoCamera
 
-    return video_camera(word, name, timeout=_TIMEOUT, color=color)
+    return VideoCamera(word, name, timeout=_TIMEOUT, color=color)
 
 
 CAMERAS: Registry[CameraKind] = Registry(

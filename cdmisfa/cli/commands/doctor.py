@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.printing import SCHEMA, print_json, print_table
+from cdmisfa.cli.printing import print_document, print_table
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.registry import GROUPS, Registry, find, plugins
 
@@ -57,7 +57,7 @@ def doctor_command(ctx: click.Context, as_json: bool) -> None:
     ok = all(check.ok or check.needed_for for check in checks)
     if as_json:
         rows = [asdict(check) for check in checks]
-        print_json({"schema": SCHEMA, "ok": ok, "checks": rows})
+        print_document(ok=ok, checks=rows)
     else:
         words = [(("missing", "ok")[c.ok], c.what, c.detail, c.needed_for) for c in checks]
         print_table(("", "what", "detail", "needed for"), words)

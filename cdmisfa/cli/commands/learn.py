@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,47 +12,40 @@ import click
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.cameras import live_source
-from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
-    print_json,
+    announce,
     print_plan,
-    print_table,
+    print_result,
     quoted,
     say_about,
     say_changes,
+    say_counts,
+    tell,
 )
-from cdmisfa.cli.progress import Bar, bar
+from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import UsageError
-from cdmisfa.core.learning import Sink
 
 if TYPE_CHECKING:
-    from cdmisfa.cli.interrupts import Stop
-    from cdmisfa.core.blocks import Block, FrameSource
-    from cdmisfa.core.learning import Learner
-    from cdmisfa.core.signals import BlockSignals
-    from cdmisfa.experiments.run_folder import RunResult
+    from cdmisfa.core.blocks import FrameSource
     from cdmisfa.experiments.sources import Configuration
     from recorder.cameras.options import LiveOptions
     from replay.camera_logs.options import CameraOptions
 
-MEGABYTE, GIGABYTE = 10**6, 10**9
-
-TICK = 0.1
-"""Seconds between two updates of the bar: a block may take only microseconds."""
+KEPT = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
+"""Options that are handed on to the run as they are."""
 
 
 @grouped("learn", common=("out", "seed", "settings", "max_iterations", "loop", "resume"))
 @click.argument("source", nargs=-1)
 @uploads.out_option("Folder of the run, or s3://...; without it nothing is written.")
-@options.seed
+@options.seed()
 @options.preset
-@options.settings
-@option(
+@options.settings()
+@word(
     "--algorithm",
-    metavar="NAME",
-    help=f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
+    "NAME",
+    f"The learner, short for --set learner.algorithm=: {', '.join(LEARNERS)}, or a plugin's. "
     "By default 2.0 for scenes and their recordings, progress for all other streams.",
     group="Learner",
 )
@@ -65,23 +57,16 @@ TICK = 0.1
     "streams.",
 )
 @options.loop
-@option("--resume", is_flag=True, help="Resume the run in -o where it was stopped.")
+@flag("--resume", "Resume the run in -o where it was stopped.")
 @options.salvage
-@option("--live-view", is_flag=True, help="Show the run in Rerun while it learns.")
+@flag("--live-view", "Show the run in Rerun while it learns.")
 @options.no_rerun
-@option(
-    "--follow",
-    is_flag=True,
-    help="Wait for the frames of a recording being written.",
-    group="Source",
-)
-@option(
+@flag("--follow", "Wait for the frames of a recording being written.", group="Source")
+@number(
     "--follow-timeout",
-    type=click.FloatRange(0.1, 1e6),
+    "With --follow, give up when no frame came for so long.",
+    *(0.1, 1e6, "SECONDS"),
     default=60.0,
-    show_default=True,
-    metavar="SECONDS",
-    help="With --follow, give up when no frame came for so long.",
     group="Source",
 )
 @option(
@@ -110,8 +95,6 @@ def learn_command(
     force: bool,
     as_json: bool,
     dry_run: bool,
-    no_rerun: bool,
-    live_view: bool,
     live: LiveOptions,
     cameras: CameraOptions,
     **told: Any,
@@ -143,18 +126,14 @@ def learn_command(
     from recorder.cameras.words import is_live
 
     of_cameras = any(map(is_live, source))
-    if of_cameras:
-        opened = opened_live(ctx.params, source, live, cameras)
-    else:
-        opened = opened_logs(ctx.params, source, cameras)
-    with opened as (frames, configuration):
+    opened = opened_live if of_cameras else opened_logs
+    with opened(ctx.params, source, cameras, live) as (frames, configuration):
         if dry_run:
             print_plan(frames, as_json=as_json)
             return
         with learning(told["max_iterations"], as_json=as_json) as (stop, reporter):
             if hasattr(frames, "stop"):
                 frames.stop = stop  # waiting for frames ends with a signal, too
-            kept = ("seed", "max_iterations", "max_modules", "keyframes", "fsync_every")
             result = run(
                 frames,
                 configuration.learner,
@@ -163,27 +142,26 @@ def learn_command(
                 command=command_of(source, ctx.params, out or Path()),
                 force=force,
                 resume=resume,
-                rerun=not no_rerun,
-                live=live_view,
+                rerun=not told["no_rerun"],
+                live=told["live_view"],
                 announce=announce,
                 sinks=(reporter,),
                 stop=stop,
                 hashing=reporter.hashing,
-                **{name: told[name] for name in kept},
+                **{name: told[name] for name in KEPT},
             )
     if resume and not reporter.told and not stop():
-        click.echo("nothing was left to do: the run had come as far before", err=True)
-    show(result, as_json=as_json)
+        tell("nothing was left to do: the run had come as far before")
+    print_result(result, as_json=as_json)
     if result.ended == INTERRUPTED:
         if result.run is not None and not of_cameras:
-            again = f"cdmisfa learn --resume -o {quoted(result.run)}"
-            click.echo(f"go on with {again}", err=True)
+            tell(f"go on with cdmisfa learn --resume -o {quoted(result.run)}")
         ctx.exit(stop.exit_code)
 
 
 @contextlib.contextmanager
 def opened_logs(
-    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions
+    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions, live: LiveOptions
 ) -> Iterator[tuple[FrameSource, Configuration]]:
     """A scene, a recording or logs, and what is said of them before and after.
 
@@ -191,6 +169,7 @@ def opened_logs(
         told: the options of the command.
         source: its words.
         cameras: how images of others become frames.
+        live: how live streams do; see `opened_live`.
     """
     from cdmisfa.experiments.sources import open_source
 
@@ -215,24 +194,48 @@ def opened_logs(
             say_changes(frames)
 
 
+@contextlib.contextmanager
 def opened_live(
-    told: Mapping[str, Any], source: tuple[str, ...], live: LiveOptions, cameras: CameraOptions
-) -> contextlib.AbstractContextManager[tuple[FrameSource, Configuration]]:
+    told: Mapping[str, Any], source: tuple[str, ...], cameras: CameraOptions, live: LiveOptions
+) -> Iterator[tuple[FrameSource, Configuration]]:
     """Live streams, recorded meanwhile where that is asked for; see `opened_logs`."""
+    from cdmisfa.experiments.sources import open_cameras_now
+    from recorder.live import RecordedWhileWatched
+    from recorder.log.files import refuse_existing
+
     if any(told[name] for name in ("resume", "loop", "salvage", "follow", "dry_run")):
         raise UsageError(
             "live streams cannot go back: leave out --resume, --loop, --salvage, --follow "
             "and --dry-run, or learn from a recording of them"
         )
-    return live_source(
+    out, record_to, force = told["out"], told["record_to"], told["force"]
+    for folder in (out, record_to):
+        if folder is not None:
+            refuse_existing(folder, force=force, goes_on=False)
+    frames, configuration = open_cameras_now(
         source,
         replace(live, seed=told["seed"]),
-        cameras,
-        told["out"],
-        told["record_to"],
+        cameras=cameras,
+        preset=told["preset"],
         settings=settings_of(told),
-        **{name: told[name] for name in ("preset", "fsync_every", "force")},
+        say=tell,
     )
+    with contextlib.closing(frames):
+        try:
+            if record_to is None:
+                yield frames, configuration
+                return
+            with RecordedWhileWatched(
+                frames,
+                record_to,
+                settings=configuration.record,
+                fsync_every=told["fsync_every"],
+                force=force,
+            ) as recorded:
+                yield recorded, configuration
+            tell(f"recording {record_to}")
+        finally:
+            say_counts(frames)
 
 
 def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
@@ -240,19 +243,6 @@ def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
     algorithm = told["algorithm"]
     named = () if algorithm is None else (f"learner.algorithm={algorithm}",)
     return (*told["settings"], *named)
-
-
-@contextlib.contextmanager
-def learning(max_iterations: int | None, *, as_json: bool) -> Iterator[tuple[Stop, Reporter]]:
-    """Show the progress of a run, end it at a signal, and print its result if its source ended."""
-    from cdmisfa.experiments.run_folder import RunExhaustedError
-
-    try:
-        with bar("learning", "blocks") as shown, stoppable() as stop:
-            yield stop, Reporter(shown, max_iterations)
-    except RunExhaustedError as error:
-        show(error.result, as_json=as_json)
-        raise
 
 
 def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
@@ -269,95 +259,3 @@ def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
         if ctx.get_parameter_source(name) is not click.core.ParameterSource.COMMANDLINE
     }
     ctx.invoke(learn_command, **{**ctx.params, **kept, "source": words})
-
-
-def announce(address: str) -> None:
-    """Say where a live view is, and open it where there is a display."""
-    from replay.viewer.program import has_display, open_privately
-
-    click.echo(f"live view {address}    look at it: rerun {address}", err=True)
-    if has_display():
-        open_privately(address)
-
-
-class Reporter(Sink):
-    """Shows a run's progress: every module once, the rest a few times a second.
-
-    Attributes:
-        told: whether any block was learned.
-    """
-
-    def __init__(self, shown: Bar, max_iterations: int | None) -> None:
-        self.told = self._hashing = False
-        self._shown, self._max_iterations = shown, max_iterations
-        self._next = 0.0
-
-    def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
-        """See `Sink`."""
-        self.told, modules = True, len(learner.modules)
-        for text in learner.events:
-            self._shown.say(f"iteration {signals.iteration}: {text}")
-        now = time.monotonic()
-        if now >= self._next:
-            self._next = now + TICK
-            if self._hashing:
-                self._hashing = False
-                self._shown.turn_to("learning", "blocks")
-            learning = int((signals.state == 0).sum())
-            left = f"{learning} being learned" if learning else f"ε {signals.epsilon:.2f}"
-            note = f"{modules} saved, {left}"
-            self._shown.update(learner.iteration, self._max_iterations, note)
-
-    def hashing(self, done: int, size: int) -> None:
-        """Show how far the source's files are hashed, once that is waited for."""
-        if not self._hashing:
-            self._hashing = True
-            self._shown.turn_to("hashing", "MB")
-            read = f"{done / GIGABYTE:.1f} of {size / GIGABYTE:.1f} GB are read"
-            self._shown.say(f"waiting for the SHA-256 of what is learned from: {read}")
-        self._shown.update(done / MEGABYTE, size / MEGABYTE)
-
-
-def outcome_line(outcome: Mapping[str, Any]) -> str:
-    """What became of a stream, in words."""
-    came = outcome["state"].replace("_", " ")
-    if outcome["module"] is not None:
-        came += f" by module {outcome['module']}"
-    if outcome["slowness"] is not None:
-        came += f", slowness {outcome['slowness']:.4f} on frames not learned from"
-    because = f": {outcome['why']}" if outcome["why"] else ""
-    return f"{outcome['stream']}: {came}, after {outcome['blocks']} blocks{because}"
-
-
-def show(result: RunResult, *, as_json: bool) -> None:
-    """Print what a run came to."""
-    from cdmisfa.core.signals import ACTIONS
-    from cdmisfa.experiments.loop import ENDINGS
-
-    if as_json:
-        print_json(result.as_json())
-        return
-    rows = [
-        (
-            module.index,
-            module.stream,
-            module.iteration,
-            " ".join(ACTIONS[action] for action in module.policy),
-            ", ".join(f"{eta:.4f}" for eta in module.eta),
-        )
-        for module in result.modules
-    ]
-    if rows and "streams" not in result.summary:
-        print_table(("module", "stream", "iteration", "policy", "eta"), rows)
-    elif rows:  # no policy led to them
-        plain = [(index, stream, iteration, eta) for index, stream, iteration, _, eta in rows]
-        print_table(("module", "stream", "iteration", "eta"), plain)
-    else:
-        click.echo("no module was learned")
-    for outcome in result.summary.get("streams", ()):
-        click.echo(outcome_line(outcome))
-    click.echo(f"ended after {result.iterations} iterations: {ENDINGS[result.ended]}")
-    click.echo(f"signals sha256 {result.signals_sha256}")
-    if result.run is not None:
-        look = f"look at it: cdmisfa view {quoted(result.run)}"
-        click.echo(f"run {result.run}    {look}")

@@ -1,18 +1,28 @@
-"""`cdmisfa info`, `verify`, `recover`, `upload`: what is in a log, is it whole, can it be saved."""
+"""Commands on what is there: logs, recordings, runs, and what can be made of them."""
 
 from __future__ import annotations
 
+import dataclasses
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.printing import SCHEMA, print_json, print_table
-from cdmisfa.core.errors import LogDamagedError, UsageError
+from cdmisfa.cli.making import flag, option
+from cdmisfa.cli.printing import (
+    print_document,
+    print_json,
+    print_table,
+    quoted,
+    say_about,
+    tell,
+)
+from cdmisfa.core.errors import LogDamagedError, NotReproducedError, UsageError
 
 if TYPE_CHECKING:
+    from replay.camera_logs.options import CameraOptions
     from replay.integrity.info import LogInfo
 
 
@@ -123,7 +133,7 @@ def recover_command(ctx: click.Context, path: str, out: Path, force: bool, as_js
         if found.lost:
             print_table(("lost", "what"), [(p.where, p.what) for p in found.lost])
         for mended in found.mended:
-            click.echo(f"{mended.where}: {mended.what}", err=True)
+            tell(f"{mended.where}: {mended.what}")
         click.echo(f"written {out}")
     if not found.complete:
         ctx.exit(LogDamagedError.exit_code)
@@ -147,5 +157,176 @@ def upload_command(result: Path, url: str, as_json: bool) -> None:
         raise UsageError(f"{url} is no s3:// address: write s3://BUCKET/NAME")
     files, size = uploads.upload_now(result, to, "the same command")
     if as_json:
-        document = {"schema": SCHEMA, "url": str(to), "files": files, "bytes": size}
-        print_json(document)
+        print_document(url=str(to), files=files, bytes=size)
+
+
+@click.command("compare")
+@options.fetched_argument("runs", nargs=-1)
+@options.path("--save", "Also write their curves, one over the other, as a view.", "F.rrd")
+@options.server_limits
+@options.force
+@options.as_json
+@click.pass_context
+def compare_command(
+    ctx: click.Context, runs: tuple[Path, ...], save: Path | None, force: bool, as_json: bool
+) -> None:
+    """Check that runs' signals are the same bits, and show their curves.
+
+    Of two runs it says where they first differ, with all signals there and what the runs were
+    told or computed otherwise, and exits with 4 if they do. Of more it
+    prints a table, each run compared with the first, and exits with 0. A run may be the URL of
+    its run.mcap, of which a copy is made.
+    """
+    if len(runs) < 2:
+        raise click.UsageError("name two runs, or more")
+    from replay.runs.compare import HEAD, both_signals, side_by_side, signals_of
+
+    rows = side_by_side(runs)
+    if save is not None:
+        from replay.view.overlay import build_overlay  # takes half a second
+
+        build_overlay(runs, rows, save, force=force)
+    different = [row.difference for row in rows if row.difference is not None]
+    at = different[0].iteration if different and len(runs) == 2 else -1
+    first, second = ({}, {}) if at < 0 else (signals_of(runs[0], at), signals_of(runs[1], at))
+    if as_json:
+        print_document(
+            identical=not different,
+            first_difference=different[0].as_json() if different else None,
+            signals={name: [first[name], second[name]] for name in first if name in second},
+            runs=[row.as_json() for row in rows],
+            view=save,
+        )
+    elif len(runs) == 2:
+        click.echo(str(different[0]) if different else "identical, bit for bit")
+    else:
+        print_table(HEAD, [row.cells() for row in rows])
+    for explanation in filter(None, (row.explanation() for row in rows)):
+        if not as_json:
+            click.echo(explanation)
+    if first and second and not as_json:
+        click.echo(f"signals of iteration {at}:")
+        print_table(("signal", rows[0].name, rows[1].name, ""), both_signals(first, second))
+    if save is not None and not as_json:
+        tell(f"view {save}    look at it: cdmisfa view {quoted(save)}")
+    if different and len(runs) == 2:
+        ctx.exit(NotReproducedError.exit_code)
+
+
+@click.command("plot")
+@options.fetched_argument("run")
+@options.out("Folder of the figures; by default figures in the run's folder.")
+@options.server_limits
+@options.force
+@options.as_json
+def plot_command(run: Path, out: Path | None, force: bool, as_json: bool) -> None:
+    """Draw the figures of a run.
+
+    RUN is its folder, or its run.mcap, which may be behind a URL: then a copy is made.
+    """
+    if out is None and options.is_fetched(run):
+        raise click.UsageError("of a run behind a URL say where the figures go: -o FOLDER")
+    from replay.export.figures import draw_figures
+
+    files = draw_figures(run, out, force=force)
+    if as_json:
+        print_document(run=str(run), figures=[str(file) for file in files])
+        return
+    for file in files:
+        click.echo(file)
+    if not files:
+        tell(f"nothing is drawn of {run}: it has no iterations")
+
+
+@click.command("export")
+@options.fetched_argument("path", nargs=-1)
+@option(
+    "--to",
+    "form",
+    metavar="FORM",
+    help="Form: parquet, npz, csv, arrow, images, mp4, lerobot, or a plugin's; by default what the "
+    "file's name ends in.",
+)
+@uploads.out_option("The file to write, for a recording the folder, or s3://...", required=True)
+@flag("--lossless", "Keep every value of images in a video.")
+@options.look_options
+@options.server_limits
+@options.force
+@options.as_json
+def export_command(
+    path: tuple[Path, ...],
+    form: str | None,
+    out: Path,
+    lossless: bool,
+    force: bool,
+    as_json: bool,
+    cameras: CameraOptions,
+) -> None:
+    """Write a run's signals as a table or arrays, a recording as images, videos or a dataset.
+
+    Signals go to one file, Parquet, CSV, Arrow or NumPy's npz. CSV has no room for the
+    outputs frame by frame (y, y_frozen) and leaves them out. A recording goes to a folder:
+    PNG files, an MP4 file per view (of one view also to a file), or a LeRobot dataset v3.0. So do
+    camera logs of others, several at once, too, and numbers in them with --field.
+    """
+    from replay.export.forms import FORMS, export
+    from replay.export.tables import CSV_LEAVES_OUT
+
+    if str(out) == "-":
+        raise click.UsageError("-o - would be a file of this name: name another")
+    form = form or out.suffix.removeprefix(".")
+    rows = export(path, out, form, force=force, lossless=lossless, cameras=cameras, about=say_about)
+    if form == "csv":
+        left_out = " and ".join(CSV_LEAVES_OUT)
+        tell(f"CSV leaves out {left_out}: Parquet, Arrow and npz hold them")
+    if form in ("mp4", "lerobot") and not lossless and _is_film(out):
+        tell("H.264 changes pixels a little: --lossless keeps them all")
+    if as_json:
+        print_document(path=" ".join(map(str, path)), file=str(out), rows=rows)
+        return
+    click.echo(f"{rows} {FORMS[form].unit} written to {out}")
+
+
+def _is_film(out: Path) -> bool:
+    """Whether there is a video in what was exported: a dataset of numbers has none."""
+    return out.is_file() or next(out.rglob("*.mp4"), None) is not None
+
+
+@click.command("signals")
+@flag("--markdown", "Print the page docs/signals.md.")
+@options.as_json
+def signals_command(markdown: bool, as_json: bool) -> None:
+    """List every signal that a run records."""
+    from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS
+
+    signals = [dataclasses.asdict(signal) for signal in SIGNALS.values()]
+    if as_json:
+        print_document(signals_version=SCHEMA_VERSION, signals=signals)
+        return
+    columns = ("name", "symbol", "equation", "unit", "dims", "dtype", "show", "since", "about")
+    rows = [[signal[column] for column in columns] for signal in signals]
+    if markdown:
+        click.echo(_page(SCHEMA_VERSION, columns, rows))
+    else:
+        print_table(columns, rows)
+
+
+def _page(version: int, columns: tuple[str, ...], rows: list[list[Any]]) -> str:
+    from cdmisfa.experiments.documents import markdown
+
+    return "\n".join(
+        [
+            "# Signals",
+            "",
+            "Made by `cdmisfa signals --markdown`; a test fails when page and code differ.",
+            f"Version {version} of the record. One record is one iteration, that is one block of",
+            "T = `learner.tau` frames. A signal that does not exist in an iteration is NaN.",
+            "",
+            "Letters of `dims`: T frames of the block, J outputs of an abstraction, M frozen",
+            "modules, S streams, A actions (stay, switch); nothing is a scalar. `equation` is the",
+            "paper's number. `show` is how the viewer shows it. `since` is the first version of",
+            "the record with it: in a run of an older one it is NaN.",
+            "",
+            markdown(columns, [[f"`{row[0]}`", *row[1:]] for row in rows]),
+        ]
+    )

@@ -2,38 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.learn import learning, outcome_line, show
-from cdmisfa.cli.making import option
-from cdmisfa.cli.printing import SCHEMA, print_json, quoted
+from cdmisfa.cli.making import number, option, word
+from cdmisfa.cli.printing import outcome_line, print_document, print_result, quoted, tell
+from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
-Command = TypeVar("Command", bound=Callable[..., Any])
-
-source = option(
+source = word(
     "--source",
-    multiple=True,
-    metavar="SOURCE",
-    help="What it learned from, where that is no longer what the run says, as its recording; "
+    "SOURCE",
+    "What it learned from, where that is no longer what the run says, as its recording; "
     "repeatable.",
+    multiple=True,
 )
 
 
 @click.command("at")
 @options.path_argument("run")
 @click.argument("iterations", metavar="K", type=click.IntRange(0))
-@option(
-    "--save-module",
-    type=options.OUT,
-    metavar="F.npz",
-    help="Write what it was just learning as a file of modules.",
-)
+@options.path("--save-module", "Write what it was just learning as a file of modules.", "F.npz")
 @source
 @options.server_limits
 @options.force
@@ -62,18 +54,15 @@ def at_command(
     if save_module is not None:
         _save_unfinished(learner, save_module, force=force)
     if as_json:
-        print_json(
-            {
-                "schema": SCHEMA,
-                "run": str(log.parent),
-                "iterations": iterations,
-                "t": t,
-                "stream": streams[learner.stream],
-                "modules": [module_table(module) for module in learner.modules],
-                **learner.summary(),
-                "policy_rng": state.policy_rng,
-                "arrays": state.arrays,
-            }
+        print_document(
+            run=str(log.parent),
+            iterations=iterations,
+            t=t,
+            stream=streams[learner.stream],
+            modules=[module_table(module) for module in learner.modules],
+            **learner.summary(),
+            policy_rng=state.policy_rng,
+            arrays=state.arrays,
         )
         return
     click.echo(f"after {iterations} iterations: frame {t}, next {streams[learner.stream]}")
@@ -137,7 +126,7 @@ def check_command(
 
     checked = Session.check(run, source, start, stop)
     if as_json:
-        print_json({"schema": SCHEMA, "run": str(run), **checked.as_json()})
+        print_document(run=str(run), **checked.as_json())
     else:
         click.echo(str(checked))
     if not checked.holds:
@@ -146,26 +135,10 @@ def check_command(
 
 @click.command("fork")
 @options.path_argument("run")
-@option(
-    "--at",
-    type=click.IntRange(0),
-    required=True,
-    metavar="K",
-    help="Go on after so many iterations of the run.",
-)
+@number("--at", "Go on after so many iterations of the run.", 0, unit="K", required=True)
 @options.out("Folder of the fork.", required=True)
-@option(
-    "--set",
-    "settings",
-    multiple=True,
-    metavar="learner.KEY=VALUE",
-    help="What the learner is told from there on; may be repeated.",
-)
-@option(
-    "--seed",
-    type=click.IntRange(0, 2**63 - 1),
-    help="Seed of the random choices from there on; the world stays.",
-)
+@options.settings("What the learner is told from there on; may be repeated.", "learner.KEY=VALUE")
+@options.seed("Seed of the random choices from there on; the world stays.", default=None)
 @options.end_after("iterations", "End after so many iterations in all; by default as the run.")
 @options.end_after("modules", "End after so many modules in all; by default as the run.")
 @source
@@ -210,8 +183,8 @@ def fork_command(
             rerun=not no_rerun,
             hashing=reporter.hashing,
         )
-    show(result, as_json=as_json)
+    print_result(result, as_json=as_json)
     both = f"cdmisfa compare {quoted(run)} {quoted(out)} --save both.rrd"
-    click.echo(f"both in one view: {both}", err=True)
+    tell(f"both in one view: {both}")
     if result.ended == INTERRUPTED:
         ctx.exit(stop.exit_code)

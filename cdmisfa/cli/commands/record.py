@@ -14,7 +14,7 @@ from click.core import ParameterSource
 
 from cdmisfa.cli import options, uploads
 from cdmisfa.cli.interrupts import Stop, stoppable
-from cdmisfa.cli.making import grouped, option
+from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     print_document,
     print_plan,
@@ -44,13 +44,13 @@ LIVE = ("cameras", "gym")
 @grouped("record", common=("out", "frames", "seed", "settings", "size", "resume"))
 @click.argument("source", nargs=-1)
 @uploads.out_option("Folder of the recording, or s3://...")
-@option(
+@number(
     "--frames",
-    type=click.IntRange(1),
-    help="Frames of each view; by default 1000, with --resume as many as first asked for, of "
-    "cameras until Ctrl-C.",
+    "Frames of each view; by default 1000, with --resume as many as first asked for, of cameras "
+    "until Ctrl-C.",
+    1,
 )
-@options.seed
+@options.seed()
 @option(
     "--view",
     "views",
@@ -61,18 +61,13 @@ LIVE = ("cameras", "gym")
 )
 @options.jobs
 @options.preset
-@options.settings
-@option(
-    "--scene-picture",
-    type=options.OUT,
-    metavar="F.png",
-    help="Draw the scene from outside instead of recording it.",
-)
-@option("--resume", is_flag=True, help="Resume an interrupted recording.")
-@option(
+@options.settings()
+@options.path("--scene-picture", "Draw the scene from outside instead of recording it.", "F.png")
+@flag("--resume", "Resume an interrupted recording.")
+@word(
     "--split",
-    metavar="LIMIT",
-    help="Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
+    "LIMIT",
+    "Begin a new file of each view at this size or duration: 512MB, 10min; by default, with "
     "--resume as first asked for.",
 )
 @options.fsync_every
@@ -273,7 +268,7 @@ def record_streams(
 @options.dry_run
 @options.live_options
 @options.salvage
-@option("--resume", is_flag=True, help="Resume an attempt that was stopped.")
+@flag("--resume", "Resume an attempt that was stopped.")
 @options.server_limits
 @options.fsync_every
 @options.force
@@ -303,7 +298,7 @@ def convert_command(
     from cdmisfa.experiments.convert import convert
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
-    from replay.inputs import open_cameras, places, refuse_what_is_no_log
+    from replay.inputs import locations, open_cameras, refuse_what_is_no_log
 
     out = Path("REC") if out is None and dry_run else _folder(out)
     writing: dict[str, Any] = {"fsync_every": fsync_every, "force": force}
@@ -314,7 +309,7 @@ def convert_command(
             )
         record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
         return
-    named = places(source)
+    named = locations(source)
     for place in named:
         refuse_what_is_no_log(place)
     if not resume and not dry_run:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
 
 from cdmisfa.cli import options, uploads
-from cdmisfa.cli.making import grouped, option
-from cdmisfa.cli.printing import SCHEMA, print_json, print_table, quoted
+from cdmisfa.cli.making import flag, grouped, word
+from cdmisfa.cli.printing import (
+    print_document,
+    print_json,
+    print_table,
+    quoted,
+    say_failed,
+    tell,
+)
 from cdmisfa.cli.progress import bar
-
-if TYPE_CHECKING:
-    from replay.camera_logs.options import CameraOptions
 
 MOST_SEEDS = 1_000_000
 
@@ -25,28 +29,22 @@ MOST_SEEDS = 1_000_000
     required=True,
     goes_on=True,
 )
-@option(
+@word(
     "--grid",
+    "KEY=V1,V2,...",
+    "Values to try for a configuration key; several grids multiply.",
     multiple=True,
-    metavar="KEY=V1,V2,...",
-    help="Values to try for a configuration key; several grids multiply.",
 )
-@option(
-    "--seeds",
-    default="0:20",
-    show_default=True,
-    metavar="FIRST:END",
-    help="Seeds of every point: a range without its end, or numbers with commas, as 1,5,9.",
-)
+@options.seeds("Seeds of every point", "0:20")
 @options.preset
-@options.settings
+@options.settings()
 @options.end_after("iterations", "End each trial after so many iterations.")
 @options.end_after("modules", "End each trial after so many modules.")
 @options.loop
 @options.log_options
 @options.jobs
 @options.engine
-@option("--keep-logs", is_flag=True, help="Keep the run of every trial, with its log.")
+@flag("--keep-logs", "Keep the run of every trial, with its log.")
 @options.retry_failed
 @options.server_limits
 @options.as_json
@@ -58,18 +56,8 @@ def sweep_command(
     out: Path,
     grid: tuple[str, ...],
     seeds: str,
-    preset: str | None,
-    settings: tuple[str, ...],
-    max_iterations: int | None,
-    max_modules: int | None,
-    loop: bool,
-    jobs: int,
-    engine: str,
-    scheduler: str | None,
-    keep_logs: bool,
-    retry_failed: bool,
     as_json: bool,
-    cameras: CameraOptions,
+    **how: Any,
 ) -> None:
     """Learn from a source many times, over a grid of settings and seeds.
 
@@ -78,61 +66,34 @@ def sweep_command(
     """
     from cdmisfa.experiments.sweep import sweep
 
+    values, numbers = parse_grid(grid), parse_seeds(seeds)
     with bar("sweep", "trials") as shown:
 
         def progress(finished: int, failed: int, total: int) -> None:
             shown.update(finished, total, f"{failed} failed" if failed else "")
 
         try:
-            report = sweep(
-                source,
-                out,
-                grid=parse_grid(grid),
-                seeds=parse_seeds(seeds),
-                preset=preset,
-                settings=settings,
-                loop=loop,
-                cameras=cameras,
-                max_iterations=max_iterations,
-                max_modules=max_modules,
-                jobs=jobs,
-                engine=engine,
-                scheduler=scheduler,
-                keep_logs=keep_logs,
-                retry_failed=retry_failed,
-                progress=progress,
-            )
+            report = sweep(source, out, grid=values, seeds=numbers, progress=progress, **how)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"{out} keeps the trials that are finished: say the same again to go on"
             ) from None
     failed = [{key: row[key] for key in ("id", "point", "seed", "error")} for row in report.failed]
     if report.outdated:
-        click.echo(
+        tell(
             f"{report.outdated} trials that were finished before are computed again: the code "
-            "of the learner or the recorder has changed since",
-            err=True,
+            "of the learner or the recorder has changed since"
         )
     if as_json:
-        print_json(
-            {
-                "schema": SCHEMA,
-                "sweep": report.folder,
-                "trials": report.trials,
-                "skipped": report.skipped,
-                "computed": report.computed,
-                "outdated": report.outdated,
-                "failed": failed,
-            }
-        )
+        counts = ("trials", "skipped", "computed", "outdated")
+        each = {name: getattr(report, name) for name in counts}
+        print_document(sweep=report.folder, **each, failed=failed)
     else:
         click.echo(
             f"{report.trials} trials: {report.computed} computed, {report.skipped} finished "
             f"before, {len(failed)} failed"
         )
-        for row in failed:
-            at = " ".join(f"{key}={value}" for key, value in row["point"].items())
-            click.echo(f"failed: {at} seed {row['seed']}: {row['error']}")
+        say_failed(failed)
         click.echo(f"look at it: cdmisfa results {quoted(out)}")
     if failed:
         ctx.exit(1)
@@ -141,11 +102,11 @@ def sweep_command(
 def parse_grid(words: tuple[str, ...]) -> dict[str, list[str]]:
     """`KEY=V1,V2` words as values by key."""
     grid: dict[str, list[str]] = {}
-    for word in words:
-        key, equals, values = word.partition("=")
+    for each in words:
+        key, equals, values = each.partition("=")
         found = [value.strip() for value in values.split(",") if value.strip()]
         if not (equals and key.strip() and found):
-            raise click.UsageError(f"--grid {word}: write it as section.key=value,value")
+            raise click.UsageError(f"--grid {each}: write it as section.key=value,value")
         if key.strip() in grid:
             raise click.UsageError(f"--grid {key.strip()} is given twice: put all values in one")
         grid[key.strip()] = found
@@ -169,24 +130,24 @@ def parse_seeds(text: str) -> list[int]:
 
 @click.command("results")
 @options.path_argument("folder")
-@option("--csv", "as_csv", is_flag=True, help="Print comma-separated values.")
-@option("--latex", "as_latex", is_flag=True, help="Print a LaTeX table (booktabs).")
+@flag("--csv", "Print comma-separated values.")
+@flag("--latex", "Print a LaTeX table (booktabs).")
 @options.as_json
-def results_command(folder: Path, as_csv: bool, as_latex: bool, as_json: bool) -> None:
+def results_command(folder: Path, csv: bool, latex: bool, as_json: bool) -> None:
     """Print mean and standard deviation over seeds at each point of a sweep.
 
     FOLDER is that of the sweep, the trials are those that it was asked for last.
     """
     from cdmisfa.experiments import results
 
-    if as_csv + as_latex + as_json > 1:
+    if csv + latex + as_json > 1:
         raise click.UsageError("choose one of --csv, --latex and --json")
     points = results.results(folder)
     if as_json:
         print_json(results.as_json(points))
-    elif as_csv:
+    elif csv:
         click.echo(results.as_csv(points), nl=False)
-    elif as_latex:
+    elif latex:
         click.echo(results.as_latex(points), nl=False)
     else:
         print_table(*results.as_table(points))

@@ -10,10 +10,9 @@ from typing import Any
 import click
 
 from cdmisfa.cli import options
-from cdmisfa.cli.commands.learn import announce
 from cdmisfa.cli.interrupts import stoppable
-from cdmisfa.cli.making import grouped, option, options_of
-from cdmisfa.cli.printing import print_document, say_about, tell
+from cdmisfa.cli.making import flag, grouped, number, option, options_of, word
+from cdmisfa.cli.printing import announce, print_document, say_about, tell
 from cdmisfa.cli.progress import bar
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
@@ -21,42 +20,34 @@ from replay.camera_logs.options import CameraOptions
 
 @grouped("view", common=("save", "web", "screenshot", "at", "tab", "every"))
 @options.fetched_argument("run", nargs=-1)
-@option("--save", type=options.OUT, metavar="F.rrd", help="Write the view to a file.")
-@option("--web", is_flag=True, help="Serve the view to a browser on this machine only.")
-@option(
-    "--screenshot",
-    type=options.OUT,
-    metavar="F.png",
-    help="Draw the view into a file, without a screen.",
-)
-@option(
+@options.path("--save", "Write the view to a file.", "F.rrd")
+@flag("--web", "Serve the view to a browser on this machine only.")
+@options.path("--screenshot", "Draw the view into a file, without a screen.", "F.png")
+@word(
     "--at",
-    metavar="WHEN",
-    help='Moment of the screenshot: a frame, "iteration 500", or words of an event, as "module 2".',
+    "WHEN",
+    'Moment of the screenshot: a frame, "iteration 500", or words of an event, as "module 2".',
 )
-@option("--tab", metavar="NAME", help="Name of the open tab; by default the first.")
-@option("--size", metavar="WxH", help="Size of the window or screenshot, as 1600x1000.")
-@option("--port", type=click.IntRange(1, 65535), help="Where --web, or a sweep, is served.")
-@option(
+@word("--tab", "NAME", "Name of the open tab; by default the first.")
+@word("--size", "WxH", "Size of the window or screenshot, as 1600x1000.")
+@number("--port", "Where --web, or a sweep, is served.", 1, 65535)
+@number(
     "--every",
-    type=click.IntRange(1),
+    "Show the images of every Nth frame; numbers are all shown.",
+    *(1, None, "N"),
     default=10,
-    show_default=True,
-    metavar="N",
-    help="Show the images of every Nth frame; numbers are all shown.",
 )
-@option(
+@options.path(
     "--all-views",
-    type=options.OUT,
-    metavar="RECORDING",
-    help="Also show what was not watched, from the recording that the run learned from.",
+    "Also show what was not watched, from the recording that the run learned from.",
+    "RECORDING",
 )
-@option(
+@word(
     "--memory-limit",
+    "SIZE",
+    "Most memory that the viewer takes for what it keeps.",
     default="2GB",
     show_default=True,
-    metavar="SIZE",
-    help="Most memory that the viewer takes for what it keeps.",
 )
 @options.look_options
 @options.server_limits
@@ -162,32 +153,19 @@ def _view_sweep(
     show_default=True,
     help="To the Rerun viewer, or to all that speak the Foxglove WebSocket protocol, as a robot.",
 )
-@option(
-    "--rate",
-    type=click.FloatRange(1e-3, 1e3),
-    default=1.0,
-    show_default=True,
-    metavar="TIMES",
-    help="How many times as fast as it was seen.",
-)
-@option(
-    "--fps",
-    type=click.FloatRange(1e-3, 1e6),
-    metavar="HZ",
-    help="Frames a second of what tells none, as folders of pictures.",
-)
+@number("--rate", "How many times as fast as it was seen.", *(1e-3, 1e3, "TIMES"), default=1.0)
+@number("--fps", "Frames a second of what tells none, as folders of pictures.", *(1e-3, 1e6, "HZ"))
 @options_of(CameraOptions, "cameras", "topics", "fields", "time", "depth")
-@option("--loop", is_flag=True, help="Start again at its end, until Ctrl-C.")
-@option(
+@flag("--loop", "Start again at its end, until Ctrl-C.")
+@number(
     "--wait",
-    type=click.IntRange(0),
-    metavar="TOPICS",
-    help="As a robot, begin once so many topics are watched; by default 1, with 0 at once.",
+    "As a robot, begin once so many topics are watched; by default 1, with 0 at once.",
+    *(0, None, "TOPICS"),
 )
-@option(
+@number(
     "--port",
-    type=click.IntRange(0, 65535),
-    help="Where to serve, on this machine; by default 8765 as a robot, else a free one.",
+    "Where to serve, on this machine; by default 8765 as a robot, else a free one.",
+    *(0, 65535),
 )
 @options.server_limits
 @options.as_json

@@ -19,7 +19,7 @@ from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.registry import Registry
 from cdmisfa.experiments.documents import plain
 from cdmisfa.experiments.sources import configure
-from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
+from cdmisfa.experiments.store import SweepReport, answer, code, run_trials, trial_id
 from cdmisfa.studies.arena.library import Library
 from cdmisfa.studies.arena.streams import SETS, SUITE, parse
 from cdmisfa.studies.arena.trial import ArenaTrial, run_arena_trial
@@ -122,8 +122,16 @@ def plan_arena(
             config = configure(preset, settings=(*CONTESTANTS[learner], *settings)).learner
             point = {"set": name, "learner": learner, **more}
             for seed in each:
-                number = identity(shown, section_table(config), seed, version)
-                trials.append(ArenaTrial(number, point, seed, entry, config, library, version))
+                trial = ArenaTrial(
+                    id=trial_id(shown, section_table(config), seed, version),
+                    point=point,
+                    seed=seed,
+                    code=version,
+                    streams=entry,
+                    learner=config,
+                    library=library,
+                )
+                trials.append(trial)
     return trials
 
 

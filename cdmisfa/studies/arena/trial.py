@@ -22,6 +22,7 @@ from cdmisfa.core.learning import Learner
 from cdmisfa.core.modules import Module
 from cdmisfa.experiments.loop import ending
 from cdmisfa.experiments.statistics import correlation
+from cdmisfa.experiments.store import StoredTrial
 from cdmisfa.features.sfa import slowness
 from cdmisfa.studies.arena.library import ArenaSource, Library, Reference
 from cdmisfa.studies.arena.pictures import Footage
@@ -43,31 +44,22 @@ RIDGE: Final = 1e-3
 """Penalty of the linear probe, as a share of the number of frames."""
 
 
-@dataclass(frozen=True, slots=True)
-class ArenaTrial:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArenaTrial(StoredTrial):
     """A learner on a set, and everything a worker needs to compute it.
 
+    Its point is the names of set and learner, and what else was set; its seed is that of the
+    learner and of the streams.
+
     Attributes:
-        id: hash of all it depends on.
-        point: the names of set and learner, and what else was set.
-        seed: of the learner and of the streams.
         streams: the set.
         learner: the configuration.
         library: folder of the streams.
-        code: version of the code that the hash is about; workers must have the same.
     """
 
-    id: str
-    point: Mapping[str, str]
-    seed: int
     streams: ArenaSet
     learner: Any
     library: Path
-    code: str
-
-    @property
-    def log(self) -> None:
-        """A trial of the arena keeps no log."""
 
     @property
     def reference(self) -> tuple[int, str]:

@@ -22,14 +22,13 @@ from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import MAX_LIST, read_json
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
-from cdmisfa.experiments.store import answer, code, identity, read_rows, run_trials
+from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.pages import Page
-from cdmisfa.studies.paper.comparison import Costs, Stability
 from cdmisfa.studies.paper.difficulty import Difficulty
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Settings, Trial
 from cdmisfa.studies.paper.icub import Icub
 from cdmisfa.studies.paper.nonstationary import NonStationary
-from cdmisfa.studies.paper.oscillatory import FiveStreams, Oscillatory
+from cdmisfa.studies.paper.oscillatory import Costs, FiveStreams, Oscillatory, Stability
 from recorder.log.files import atomic_write
 
 EXPERIMENTS: Mapping[str, Experiment] = {
@@ -47,30 +46,11 @@ SETTING = "set_"
 """How the columns of rows.parquet begin that hold a trial's settings."""
 
 
-@dataclass(frozen=True, slots=True)
-class PaperTrial:
-    """A trial as the store knows it, and everything a worker needs to compute it.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperTrial(StoredTrial):
+    """A trial of one of `EXPERIMENTS`; its settings are its point."""
 
-    Attributes:
-        id: hash of all it depends on.
-        experiment: a name in `EXPERIMENTS`.
-        point: its settings.
-        code: version of the code that the hash is about.
-    """
-
-    id: str
     experiment: str
-    point: Settings
-    code: str
-
-    @property
-    def seed(self) -> int:
-        """Which of the trials of its condition."""
-        return int(self.point["seed"])
-
-    @property
-    def log(self) -> None:
-        """It keeps no log."""
 
 
 def reproduce(
@@ -97,7 +77,16 @@ def reproduce(
     if not request.force:
         _keep_results(request.folder, planned)
     version = code()
-    tasks = [PaperTrial(identity(name, s, version), name, s, version) for s in planned]
+    tasks = [
+        PaperTrial(
+            id=trial_id(name, settings, version),
+            point=settings,
+            seed=int(settings["seed"]),
+            code=version,
+            experiment=name,
+        )
+        for settings in planned
+    ]
     report = run_trials(
         tasks,
         request.folder,

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from cdmisfa.core.arrays import FloatArray
-from cdmisfa.core.blocks import check_frame
 from recorder.world.icub.config import BoxConfig, CylinderConfig, IcubConfig, Range, SphereConfig
 
 CHUNK = 4096
@@ -66,49 +65,33 @@ def reflect(values: FloatArray, limits: Range) -> FloatArray:
 
 
 class Motions:
-    """Where all objects of a scene are, frame after frame, as a seed moves them."""
+    """Where all objects of a scene are at every frame, as a seed moves them."""
 
     def __init__(self, scene: IcubConfig, seed: int) -> None:
-        self._scene = scene
-        self._seed = seed
+        self._scene, self._seed = scene, seed
         self._restart()
-        self.seek(0)
 
-    @property
-    def t(self) -> int:
-        """Frame of the next positions."""
-        return self._t
+    def positions(self, start: int, n: int) -> FloatArray:
+        """(n, objects, 2) x and y at n frames from `start` on, the paper's coordinates, metres."""
+        parts = []
+        while n > 0:
+            chunk, first = divmod(start, CHUNK)
+            parts.append(self._draw(chunk)[first : first + n])
+            start, n = start + len(parts[-1]), n - len(parts[-1])
+        return np.concatenate(parts)
 
-    def seek(self, t: int) -> None:
-        """Go to frame t: drawing on when it lies ahead, from the start when behind."""
-        check_frame(t)
-        chunk = t // CHUNK
+    def _draw(self, chunk: int) -> FloatArray:
+        """The positions of a chunk: draws on when it lies ahead, from the start when behind."""
         if chunk < self._chunk:
             self._restart()
         while self._chunk < chunk:
             self._positions = np.stack([next(motion) for motion in self._motions], axis=1)
             self._chunk += 1
-        self._t = t
-
-    def take(self, n: int) -> FloatArray:
-        """(n, objects, 2) x and y in the next n frames, the paper's coordinates, metres."""
-        parts = []
-        while n > 0:
-            self.seek(self._t)
-            start = self._t % CHUNK
-            part = self._positions[start : start + n]
-            parts.append(part)
-            self._t += len(part)
-            n -= len(part)
-        return np.concatenate(parts)
+        return self._positions
 
     def _restart(self) -> None:
-        box, cylinder, sphere = (
-            np.random.Generator(
-                np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=(_WORLD, i)))
-            )
-            for i in range(3)
-        )
+        seeds = [np.random.SeedSequence(self._seed, spawn_key=(_WORLD, i)) for i in range(3)]
+        box, cylinder, sphere = (np.random.Generator(np.random.PCG64(seed)) for seed in seeds)
         self._motions = (
             toggling_motion(self._scene.object1, box),
             uniform_motion(self._scene.object2, cylinder),

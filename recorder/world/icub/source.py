@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cdmisfa.core.arrays import ByteArray, FloatArray
-from cdmisfa.core.blocks import Block, HeadPose, SeekableSource, SourceSpec, check_request, freeze
+from cdmisfa.core.blocks import Block, ClockedSource, HeadPose, SourceSpec, check_request, freeze
 from cdmisfa.core.config import section_table
 from recorder.config import RecordConfig
 from recorder.world.icub.config import EyesConfig, IcubConfig, TableConfig
@@ -129,7 +129,7 @@ class Eyes:
         return self._world.render(matrix, self._projection, eyes.width, eyes.height, eyes.light)
 
 
-class IcubSource(SeekableSource):
+class IcubSource(ClockedSource):
     """What the robot's eyes see in a scene, rendered when it is asked for, on a clock.
 
     Raises:
@@ -148,16 +148,6 @@ class IcubSource(SeekableSource):
         )
 
     @property
-    def spec(self) -> SourceSpec:
-        """What the source delivers."""
-        return self._spec
-
-    @property
-    def t(self) -> int:
-        """Global counter of the next frame."""
-        return self._motions.t
-
-    @property
     def head_poses(self) -> Sequence[HeadPose]:
         """The head's pose in each view."""
         x, y, z = self._world.neck.tolist()
@@ -167,17 +157,14 @@ class IcubSource(SeekableSource):
     def take(self, stream: int, n: int) -> Block:
         """Render the next n frames of a view; see `FrameSource.take`."""
         check_request(self._spec, stream, n)
-        t = self.t
-        positions = self._motions.take(n)
+        positions = self._motions.positions(self._t, n)
         frames = np.empty((n, *self._spec.frame_shape), np.uint8)
         for frame, places in zip(frames, positions, strict=True):
             self._world.place(places)
             self._eyes.see(stream, frame)
-        return Block(stream, t, freeze(frames), freeze(positions.reshape(n, -1)))
-
-    def seek(self, t: int) -> None:
-        """Move the clock to frame t."""
-        self._motions.seek(t)
+        block = Block(stream, self._t, freeze(frames), freeze(positions.reshape(n, -1)))
+        self._t += n
+        return block
 
     def describe(self) -> Mapping[str, Any]:
         """The scene's seed and everything it was built from."""
@@ -214,7 +201,7 @@ def scene_picture(scene: IcubConfig) -> Image.Image:
     width, height = SIZE[0] * _SAMPLES, SIZE[1] * _SAMPLES
     with contextlib.closing(World(scene, robot_seen=True)) as world:
         _furnish(world, scene.table)
-        world.place(Motions(scene, scene.seed or 0).take(1)[0])
+        world.place(Motions(scene, scene.seed or 0).positions(0, 1)[0])
         world.turn_head(scene.eyes.yaw[len(scene.eyes.yaw) // 2])
         colours, _ = world.render(
             look(_CAMERA, _TARGET),

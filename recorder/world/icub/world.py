@@ -58,14 +58,13 @@ class World:
             )
             try:
                 self._build(scene, _robot_file(models, scene.robot), robot_seen)
-            except bullet.error as error:
+            except BaseException as error:
                 self.close()
+                if not isinstance(error, bullet.error):
+                    raise
                 raise CdmisfaError(
                     f"PyBullet cannot build the scene: {error}; check scene.robot"
                 ) from error
-            except BaseException:
-                self.close()
-                raise
 
     def place(self, positions: NDArray[np.float64]) -> None:
         """Put the objects at (objects, 2) positions, x and y in the paper's coordinates.

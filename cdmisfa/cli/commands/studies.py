@@ -1,0 +1,231 @@
+"""`cdmisfa reproduce`, `arena` and `demo`: experiments of the paper, and others like them."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from cdmisfa.cli import options
+from cdmisfa.cli.commands.sweep import parse_seeds
+from cdmisfa.cli.making import flag, number, word
+from cdmisfa.cli.printing import (
+    print_document,
+    print_json,
+    print_table,
+    quoted,
+    say_failed,
+    tell,
+)
+from cdmisfa.cli.progress import Bar, bar
+from cdmisfa.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from cdmisfa.studies.paper.experiment import Request
+
+ALL = "all"
+
+
+@click.command("reproduce")
+@click.argument("name", required=False)
+@options.out("Folder of the results [default: reproduction].")
+@number("--trials", "Trials per condition, instead of the paper's number.", 1)
+@options.jobs
+@options.engine
+@options.path("--recording", "Recording of the iCub scene.")
+@flag("--quick", "Few trials, enough to test the claim.")
+@options.path("--page", "Write this Markdown page of all results.")
+@flag("--force", "Replace results of more or other trials.")
+@options.as_json
+def reproduce_command(
+    name: str | None,
+    out: Path | None,
+    trials: int | None,
+    jobs: int,
+    recording: Path | None,
+    quick: bool,
+    page: Path | None,
+    force: bool,
+    as_json: bool,
+    **where: Any,
+) -> None:
+    """Reproduce an experiment of the paper: numbers, tables and figures.
+
+    NAME is oscillatory, five, stability, costs, nonstationary, icub, difficulty or all.
+    Finished trials are kept and not run again; results of more or other trials than are asked
+    for now are not replaced without --force. Exit code 4 says that a claim of the paper did
+    not come out. Without NAME, --page makes the page from the results that are there.
+    """
+    from cdmisfa.studies.paper.experiment import Request
+    from cdmisfa.studies.paper.reproduce import (
+        EXPERIMENTS,
+        check_claims,
+        markdown_table,
+        write_paper_page,
+    )
+
+    root = out or Path("reproduction")
+    if name is None and page is None:
+        raise UsageError(f"say which experiment: {', '.join(EXPERIMENTS)} or all")
+    names = tuple(EXPERIMENTS) if name == ALL else (name,) if name else ()
+    documents: list[dict[str, Any]] = []
+    for each in names:
+        if each == "icub" and recording is None:
+            tell(f"icub: records the scene into {root}/icub-recording first")
+        request = Request(trials, quick, recording, root / each, jobs, force)
+        documents.append(_reproduce(each, request, **where))
+    if page is not None:
+        write_paper_page(root, page)
+        tell(f"page {page}")
+    if as_json:
+        print_document(experiments=documents)
+    lines: list[str] = []
+    for document in documents:
+        lines += [document["title"], "", markdown_table(document["table"])]
+        for claim in document["claims"]:
+            holds = "yes" if claim["holds"] else "NO "
+            lines.append(f"{holds}  {claim['claim']}: {claim['detail']}")
+        lines.append("")
+    if not as_json:
+        click.echo("\n".join(lines), nl=False)
+    for document in documents:
+        check_claims(document)
+
+
+def _reproduce(name: str, request: Request, **where: Any) -> dict[str, Any]:
+    """Reproduce an experiment, and say on stderr how it went."""
+    from cdmisfa.studies.paper.reproduce import reproduce
+
+    started, finished = time.monotonic(), list[int]()
+    with bar(name, "trials") as shown:
+
+        def progress(done: int, total: int) -> None:
+            finished.append(done)
+            shown.update(done, total)
+
+        document = reproduce(name, request, progress=progress, **where)
+    seconds, ran = time.monotonic() - started, finished[-1] - finished[0]
+    tell(
+        f"{name}: {document['trials']} trials, {ran} of them now, {seconds:.1f} s, "
+        f"{ran / seconds:.1f} trials/s, "
+        f"{'reproduced' if document['reproduced'] else 'NOT reproduced'}"
+    )
+    return document
+
+
+@click.command("arena")
+@click.argument("sets", nargs=-1, metavar="[SET]...")
+@word("--learners", "NAME,...", "Which learners [default: all].")
+@options.seeds("Seeds of learners and streams", "0:10")
+@options.out("Folder of the results; what is finished in it is not computed again [default: arena]")
+@options.path("--streams", "Folder of the streams [default: OUT/streams].")
+@number("--frames", "Stop a run after so many frames, instead of the set's number.", 1)
+@options.settings()
+@options.jobs
+@options.engine
+@options.retry_failed
+@options.path("--page", "Write this Markdown page of all results in OUT.")
+@options.as_json
+@click.pass_context
+def arena_command(
+    ctx: click.Context,
+    /,
+    sets: tuple[str, ...],
+    out: Path | None,
+    page: Path | None,
+    as_json: bool,
+    **each: Any,
+) -> None:
+    """Compare learners on sets of streams: what they learn, and how soon.
+
+    SET is one of those that docs/arena.md lists, or all; without one the six of the public suite
+    are run, or, with --page, the page made from the results that are there. Most sets need the
+    extra [arena]; the set small needs nothing.
+    """
+    from cdmisfa.studies.arena.page import arena_table, draw_curves, write_arena_page
+    from cdmisfa.studies.arena.results import arena_results
+
+    folder = out or Path("arena")
+    failed = () if page is not None and not sets else _run_arena(folder, sets, **each)
+    document = arena_results(folder)
+    figure, _ = draw_curves(document, folder)
+    if page is not None:
+        write_arena_page(document, figure, page)
+    tell(f"figure {figure}" + (f", page {page}" if page is not None else ""))
+    if as_json:
+        print_document(**document, folder=folder)
+    else:
+        print_table(*arena_table(document))
+    say_failed(failed, err=True)
+    if failed:
+        ctx.exit(1)
+
+
+def _run_arena(
+    folder: Path, sets: tuple[str, ...], *, learners: str | None, seeds: str, **each: Any
+) -> Any:
+    """Compute what is missing; the rows of the trials that failed."""
+    from cdmisfa.studies.arena.arena import run_arena
+    from cdmisfa.studies.arena.streams import SETS, SUITE
+
+    names = [name for word in sets for name in (SETS if word == ALL else (word,))]
+    chosen = [name.strip() for name in (learners or "").split(",") if name.strip()]
+    with bar("arena", "trials") as shown:
+        report = run_arena(
+            folder,
+            names or SUITE,
+            chosen,
+            parse_seeds(seeds),
+            making=lambda done, total, note: shown.update(done, total, "streams, made first"),
+            progress=shown.update,
+            **each,
+        )
+    again = f" ({report.outdated} again: the code has changed since)" if report.outdated else ""
+    tell(
+        f"{report.trials} trials: {report.computed} computed{again}, {report.skipped} finished "
+        f"before, {len(report.failed)} failed"
+    )
+    return report.failed
+
+
+@click.command("demo")
+@options.out("Folder of the recordings and runs; by default the one you are in.")
+@options.seed()
+@number("--frames", "Frames a view.", 400, default=16000)
+@options.jobs
+@options.as_json
+def demo_command(out: Path | None, as_json: bool, **how: Any) -> None:
+    """Record, learn, check and show: the whole story in minutes.
+
+    What an earlier demo left in the same folder is replaced.
+    """
+    from cdmisfa.studies.demo import demo
+
+    report = demo(out or Path(), stage=_stage, **how)
+    if as_json:
+        print_json(report)
+        return
+    head = ("module", "view", "policy", "iteration", "follows", "correlation")
+    told = {"policy": " ".join, "correlation": "{:.3f}".format}
+    rows = [[told.get(key, str)(module[key]) for key in head] for module in report["modules"]]
+    print_table(head, rows)
+    click.echo()
+    for figure in report["figures"]:
+        if figure.suffix == ".png":
+            click.echo(f"figure     {figure}")
+    click.echo(f"look at it {quoted(sys.argv[0])} view {quoted(report['run'])}")
+
+
+@contextmanager
+def _stage(title: str, unit: str) -> Iterator[Bar]:
+    """Announce a stage and say how long it took, also where nobody sees a bar."""
+    start = time.monotonic()
+    tell(title)
+    with bar("", unit) as shown:
+        yield shown
+    tell(f"    {time.monotonic() - start:.0f} s")
