@@ -303,7 +303,7 @@ def open_logs(
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
-    from replay.inputs import open_log, places
+    from replay.inputs import locations, open_log
     from replay.storage.location import Url
 
     if live := [str(word) for word in words if is_live(str(word))]:
@@ -311,7 +311,7 @@ def open_logs(
             f"{live[0]} is a live stream, which cannot go back: record it first, with cdmisfa "
             f"record {shlex.join(live)} -o REC"
         )
-    paths = places(words)
+    paths = locations(words)
     for path in paths:
         if not isinstance(path, Url) and not path.exists() and follow is None:
             raise UsageError(
