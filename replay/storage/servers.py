@@ -85,7 +85,7 @@ class Server(ABC):
 
     @abstractmethod
     async def part(self, start: int, stop: int) -> Part:
-        """The bytes [start, stop), or up to the end; raises `RetryError` for a fault that may pass."""
+        """The bytes [start, stop), fewer at the end; raises `RetryError` where a fault may pass."""
 
     def begin(self, start: int, stop: int) -> Future[Part]:
         """Ask for the bytes [start, stop), without waiting for them."""
