@@ -146,8 +146,8 @@ def _a_run(path: Location) -> UsageError:
     )
 
 
-def places(words: Sequence[str | Location]) -> list[Location]:
-    """The places that words name, in their order; a pattern names what matches, by number.
+def locations(words: Sequence[str | Location]) -> list[Location]:
+    """The paths and URLs that words name, in their order; a pattern names matches, by number.
 
     Raises:
         UsageError: nothing matches a pattern, or a URL is of a kind that is not read.

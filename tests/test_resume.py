@@ -26,8 +26,8 @@ from cdmisfa.core.config import LearnerConfig, differences
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 from cdmisfa.core.learning import Keyframe, Learner, LearnerState, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.command import SET_ASIDE
 from cdmisfa.experiments.loop import Keyframes
+from cdmisfa.experiments.resume import SET_ASIDE
 from cdmisfa.experiments.run_folder import RunResult
 from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig

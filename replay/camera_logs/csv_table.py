@@ -54,7 +54,7 @@ class Words(NamedTuple):
     said: str
 
 
-class Table(NamedTuple):
+class LoadedTable(NamedTuple):
     """A table in memory.
 
     Attributes:
@@ -70,7 +70,7 @@ class Table(NamedTuple):
     notes: Sequence[str]
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> LoadedTable:
     """Read a CSV or a Parquet file.
 
     Columns of CSV are separated by commas or, where the line of names has none, by semicolons or
@@ -88,7 +88,7 @@ def read_table(path: Path) -> Table:
         else:
             import pyarrow.parquet
 
-            table = Table(path, pyarrow.parquet.ParquetFile(path).read(), {}, [])
+            table = LoadedTable(path, pyarrow.parquet.ParquetFile(path).read(), {}, [])
         rows, names = table.columns.num_rows, table.columns.column_names
         if rows > max(MAX_ROWS, path.stat().st_size):
             raise LogDamagedError(f"{path}: {rows} rows are too many for its few bytes")
@@ -131,7 +131,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             line = reader.line_num + 1
 
 
-def _read_csv(path: Path) -> Table:
+def _read_csv(path: Path) -> LoadedTable:
     import pyarrow
     from pyarrow import csv
 
@@ -168,7 +168,7 @@ def _read_csv(path: Path) -> Table:
             f"{path}: its first line, {names[:80]}, holds numbers, no names: "
             "write a line before it with the name of each column"
         )
-    return _with_numbers(Table(path, table, {}, notes), missing)
+    return _with_numbers(LoadedTable(path, table, {}, notes), missing)
 
 
 def _cut_line(path: Path, separator: str) -> str | None:
@@ -224,7 +224,7 @@ def _separator(names: str) -> str:
     return next((s for s in (",", ";", "\t") if s in bare), ",")
 
 
-def _with_numbers(table: Table, missing: Sequence[str]) -> Table:
+def _with_numbers(table: LoadedTable, missing: Sequence[str]) -> LoadedTable:
     """Turn the columns of a table into numbers that were taken for text for a few words."""
     import pyarrow
     import pyarrow.compute as compute

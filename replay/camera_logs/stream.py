@@ -179,8 +179,7 @@ def choose_images(
     Raises:
         UsageError: there is none, or not one topic, or its messages are of several kinds.
     """
-    readable: dict[str, dict[MessageKind, list[Found]]] = {}
-    decoders: dict[MessageKind, Taken] = {}
+    readable: dict[str, dict[MessageKind, tuple[list[Found], Taken]]] = {}
     others: dict[str, str] = {}
     for name, kind, channel in channels:
         decoder = decoder_of(kind, reading)
@@ -189,8 +188,7 @@ def choose_images(
         else:
             alike = kind if reading.fields else MessageKind(kind.schema, kind.encoding)
             kinds = readable.setdefault(name, {})
-            kinds.setdefault(alike, []).append(channel)
-            decoders.setdefault(alike, decoder)
+            kinds.setdefault(alike, ([], decoder))[0].append(channel)
     found = [name for name in readable if topic in (None, name)]
     if len(found) == 1:
         kinds = readable[found[0]]
@@ -200,8 +198,7 @@ def choose_images(
                 f"{path}: {found[0]} holds messages of {len(kinds)} kinds, which are no one "
                 f"stream: {said}"
             )
-        kind = next(iter(kinds))
-        return kinds[kind], decoders[kind]
+        return next(iter(kinds.values()))
     known = ", ".join(sorted(readable)) or "none"
     what = "messages with fields" if reading.fields else "images"
     if not readable and any(said.startswith(VECTOR_SCHEMA) for said in others.values()):
@@ -209,17 +206,14 @@ def choose_images(
             f"{path}: it is a recording of values, not of images: learn, view, export and play "
             "take it without options of images; to convert it, name them with --field values"
         )
-    if not readable and topic is None:
-        raise UsageError(holds_none(path, reading))
     if topic is None:
-        raise UsageError(f"{path}: name one --topic or more; it has {what} on: {known}")
-    if topic in others and reading.fields:
-        raise UsageError(f"{path}: {topic} holds {others[topic]}, whose fields are not known")
+        several = f"{path}: name one --topic or more; it has {what} on: {known}"
+        raise UsageError(several if readable else holds_none(path, reading))
     if topic in others:
-        raise UsageError(
-            f"{path}: {topic} holds {others[topic]}, which is no image: numbers are taken with "
-            f"--field; images are {', '.join(SCHEMAS)}"
-        )
+        images = ", ".join(SCHEMAS)
+        why = f"which is no image: numbers are taken with --field; images are {images}"
+        why = "whose fields are not known" if reading.fields else why
+        raise UsageError(f"{path}: {topic} holds {others[topic]}, {why}")
     raise UsageError(f"{path}: no topic {topic}; it has {what} on: {known}")
 
 

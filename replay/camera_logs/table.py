@@ -15,7 +15,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
 from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
-from replay.camera_logs.csv_table import Table, called, read_table
+from replay.camera_logs.csv_table import LoadedTable, called, read_table
 from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,
@@ -138,7 +138,7 @@ def table_notes(path: Path) -> list[str]:
     ]
 
 
-def _numeric(table: Table, of_times: str) -> tuple[str, ...]:
+def _numeric(table: LoadedTable, of_times: str) -> tuple[str, ...]:
     """The columns of numbers but that of the times; refuses a table without."""
     columns = table.columns
     found = [name for name in columns.column_names if _is_numeric(columns[name])]
@@ -150,7 +150,7 @@ def _numeric(table: Table, of_times: str) -> tuple[str, ...]:
 
 
 def _said_of_columns(
-    table: Table,
+    table: LoadedTable,
     used: Collection[str],
     columns: Mapping[str, FloatArray],
     whole: NDArray[np.bool_],
@@ -168,7 +168,7 @@ def _said_of_columns(
             yield f"{name} holds whole numbers beyond 2^53, which are rounded to float64"
 
 
-def _has_digits(table: Table, name: str) -> bool:
+def _has_digits(table: LoadedTable, name: str) -> bool:
     """Whether the file may hold a field more exactly than float64 does."""
     import pyarrow.types as kinds
 
@@ -181,7 +181,7 @@ def _has_digits(table: Table, name: str) -> bool:
     return not kinds.is_floating(kind)
 
 
-def _lacking(table: Table, columns: Mapping[str, FloatArray], row: int) -> str:
+def _lacking(table: LoadedTable, columns: Mapping[str, FloatArray], row: int) -> str:
     """What a row lacks, in words."""
     for name, numbers in columns.items():
         words = table.words.get(name)
@@ -205,7 +205,7 @@ def _is_empty(column: Any) -> bool:
     return bool(column.null_count == len(column))
 
 
-def _column(table: Table, name: str) -> FloatArray:
+def _column(table: LoadedTable, name: str) -> FloatArray:
     """The numbers of a field in each row, (n, I) float64; NaN where there is none.
 
     Raises:
@@ -245,7 +245,7 @@ def _floats(column: Any) -> FloatArray:
     return found
 
 
-def _times(table: Table, named: str | None) -> tuple[IntArray | None, str]:
+def _times(table: LoadedTable, named: str | None) -> tuple[IntArray | None, str]:
     """When each row was, nanoseconds, -1 where that is missing; and the name of the column."""
     if named is None:
         return None, ""

@@ -15,7 +15,7 @@ from recorder.mcap.records import MalformedRecord, Problem, Segment
 from replay.camera_logs.opening import channels_of, log_format, only_foreign, open_images
 from replay.camera_logs.stream import ImageStream
 from replay.camera_logs.table import table_notes
-from replay.inputs import places
+from replay.inputs import locations
 from replay.integrity.info import (
     SCHEMA,
     Crc,
@@ -61,7 +61,7 @@ class LogCheck:
 
 def check_logs(*words: str | Location) -> LogCheck:
     """Check several logs, each by itself; see `check_log`."""
-    checks = [check_log(place) for place in places(words)]
+    checks = [check_log(place) for place in locations(words)]
     return LogCheck(
         tuple(problem for check in checks for problem in check.problems),
         tuple(file for check in checks for file in check.files),
