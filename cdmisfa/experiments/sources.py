@@ -20,7 +20,6 @@ from recorder.images.options import ImageOptions
 from recorder.recording import ViewRecording, record
 from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
-from replay.camera_logs.source import ForeignSource
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
