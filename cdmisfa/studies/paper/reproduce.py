@@ -24,12 +24,11 @@ from cdmisfa.core.untrusted import MAX_LIST, read_json
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
 from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.pages import Page
-from cdmisfa.studies.paper.comparison import Costs, Stability
 from cdmisfa.studies.paper.difficulty import Difficulty
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Settings, Trial
 from cdmisfa.studies.paper.icub import Icub
 from cdmisfa.studies.paper.nonstationary import NonStationary
-from cdmisfa.studies.paper.oscillatory import FiveStreams, Oscillatory
+from cdmisfa.studies.paper.oscillatory import Costs, FiveStreams, Oscillatory, Stability
 from recorder.log.files import atomic_write
 
 EXPERIMENTS: Mapping[str, Experiment] = {
