@@ -17,26 +17,30 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
-from cdmisfa.experiments.command import COMMAND, SET_ASIDE, command_of, command_of_fork, source_of
 from cdmisfa.experiments.loop import Digest, Keyframes, learn
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
+    COMMAND,
     FORK,
+    SET_ASIDE,
     changes,
+    command_of,
+    command_of_fork,
     continued,
     header_to_resume,
     refuse_difference,
     restore,
     restore_from,
+    source_of,
 )
 from cdmisfa.experiments.run_folder import (
     OpenLog,
     RunExhaustedError,
     RunResult,
     opened_log,
+    versions_used,
     write_results,
 )
-from cdmisfa.experiments.sources import versions_used
 from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.run import stated_source, states_whole

@@ -295,7 +295,7 @@ def convert_command(
     'logs/*.mcap'. What was interrupted is resumed with --resume. Live streams are recorded, as by
     cdmisfa record.
     """
-    from cdmisfa.experiments.convert import convert
+    from cdmisfa.experiments.sources import convert
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
     from replay.inputs import locations, open_cameras, refuse_what_is_no_log
