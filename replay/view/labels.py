@@ -55,7 +55,7 @@ def line_labels(signal: Signal, module: int, outputs: int) -> list[str]:
     return [f"{text} output {j + 1}{unit}" for j in range(outputs)]
 
 
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     """Lines of a table, and an empty one behind it."""
     lines = [head, ["---"] * len(head), *rows]
     return [*(f"| {' | '.join(map(str, line))} |" for line in lines), ""]

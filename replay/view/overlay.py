@@ -16,7 +16,7 @@ from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, MOST_STREAMS, Column, Target, power_of_ten
-from replay.view.labels import label, markdown_table, part
+from replay.view.labels import label, part, text_table
 from replay.view.layouts import blueprint, lines, time_axis
 
 CURVES = {
@@ -89,7 +89,7 @@ def table_text(rows: Sequence[Row]) -> str:
     short = [(*row.cells()[:-1], _shortly(row.difference)) for row in rows]
     cells = [[cell.replace("|", "/") for cell in line] for line in short]
     forks = [line for row in rows if (line := _fork(row))]
-    return "\n".join(["## Runs compared", "", *markdown_table(HEAD, cells), *forks])
+    return "\n".join(["## Runs compared", "", *text_table(HEAD, cells), *forks])
 
 
 def _fork(row: Row) -> str:

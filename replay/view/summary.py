@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.run import Outline
 from replay.view.columns import MOST_STREAMS
-from replay.view.labels import markdown_table
+from replay.view.labels import text_table
 
 ENDED = "ended:"
 """How the event begins that says why a run ended."""
@@ -45,7 +45,7 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
             (names[s], f"{visits[s]} frames, {visits[s] / frames:.0%}")
             for s in outline.streams(MOST_STREAMS)
         ]
-        lines += markdown_table(("stream", "watched"), watched)
+        lines += text_table(("stream", "watched"), watched)
     settings = [("seed", header.manifest.get("seed"))]
     keys = TOLD_OF_PROGRESS if header.by_progress else TOLD
     settings += [(key, header.setting("learner", key)) for key in keys]
@@ -64,7 +64,7 @@ def _of_modules(outline: Outline) -> list[str]:
         policy = policy_text(save.policy, streams)
         rows.append((save.module, streams[save.stream], save.iteration, eta, policy))
     head = "module", "stream", "iteration", "η [1/frame]", "policy"
-    lines = markdown_table(head, rows) if rows else []
+    lines = text_table(head, rows) if rows else []
     unfinished = _unfinished(outline)
     return [*lines, unfinished, ""] if unfinished else lines
 
@@ -109,7 +109,7 @@ def decision_text(
             (name, *(f"{1000 * v:.3f}" for v in row))
             for name, row in zip(names, values.tolist(), strict=True)
         ]
-        lines += [f"**{title}** [1/1000]", "", *markdown_table(head, rows)]
+        lines += [f"**{title}** [1/1000]", "", *text_table(head, rows)]
     return "\n".join(lines)
 
 
