@@ -1,4 +1,4 @@
-"""What an earlier attempt at a recording left, and where each view is resumed.
+"""Resume a recording: what an earlier attempt left of each view, and where to continue.
 
 The logs of an attempt are read in the order of the file, up to where they are damaged or torn. A
 log that is resumed is kept aside while its frames are copied into a new one, which so has the
@@ -35,7 +35,7 @@ _LEAST = 64
 
 
 class FramesHeld(NamedTuple):
-    """What an earlier log of a view holds.
+    """The frames in an earlier log of a view.
 
     Attributes:
         first: its first frame.
@@ -52,7 +52,7 @@ class FramesHeld(NamedTuple):
     frames: int = 0
 
     def stop_from(self, first: int) -> int:
-        """Up to before which frame all from a given one on are there."""
+        """The stop of the frames [first, stop) that are all there."""
         follows = self.first == first or (self.gaps and self.first > first)
         return self.stop if self.end and follows else first
 
@@ -120,7 +120,7 @@ class ViewResume:
 
 
 def begin_view(folder: Path, view: str, split: Split | None, first: int = 0) -> ViewResume:
-    """The place of a view of which nothing is there, and that begins with a frame."""
+    """Where a view begins of which nothing is there yet."""
     return ViewResume(folder / part_name(view, None if split is None else 0), first=first)
 
 
@@ -392,7 +392,7 @@ def _opened(path: Path) -> LogReader | None:
 
 
 def _metadata(path: Path) -> Metadata | None:
-    """What a log says of what it is, its first metadata record; None where it does not say it."""
+    """The first metadata record of a log, or None."""
     log = _opened(path)
     if log is None:
         return None
