@@ -241,41 +241,24 @@ def _resume_view(
         later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
         log = max(attempts, key=lambda p: there[p].stop_from(first), default=path)
         stop = there[log].stop_from(first) if attempts else first
-        follows = log == path and bool(later)
-        if stop == first and path in attempts:
+        if stop > first:
+            _refuse_other(log, recording.metadata(view, first))
+        elif path in attempts:
             raise UsageError(
                 f"{path} holds no frames of {view} from {first} on: overwrite with --force"
             )
+        follows = any(there[p].end or p.suffix == ".mcap" for p in later)
+        if stop > first and log == path and (follows or stop == frames or ended):
+            parts.append((path, there[path].frames))
+            stale += [kept] if kept in attempts else []
+            first = stop
+            if follows:
+                continue
+            return ViewResume(path, tuple(parts), first, stale=(*stale, *later), complete=True)
+        _refuse_finished(path, later)
         if stop > first:
-            _refuse_other(log, recording.metadata(view, first))
-            if split is not None and not recording.gaps:
-                _refuse_other_length(log, split.frames(recording.spec.fps), stop - first, follows)
-        complete = log == path and (stop == frames or ended) and not follows
-        if stop == first or not (follows or complete):
-            _refuse_finished(path, later)
-            if stop == first:
-                stale += [*attempts, *later]
-                return ViewResume(path, tuple(parts), first, stale=tuple(stale))
             return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
-        if follows and stop >= frames:
-            raise UsageError(
-                f"{path} ends at frame {stop}, and more follow: ask for more frames, "
-                "or overwrite with --force"
-            )
-        stale += [kept] if kept in attempts else []
-        parts.append((path, there[path].frames))
-        first = stop
-        if complete:
-            return ViewResume(path, tuple(parts), first, stale=tuple(stale), complete=True)
-
-
-def _refuse_other_length(path: Path, length: int | None, frames: int, follows: bool) -> None:
-    """Refuse a part of more frames than --split says, or of fewer where another follows."""
-    if length is not None and (frames > length or (follows and frames != length)):
-        raise UsageError(
-            f"{path} has {frames} frames, with this --split it would have {length}: "
-            "use the same, or overwrite with --force"
-        )
+        return ViewResume(path, tuple(parts), first, stale=(*stale, *attempts, *later))
 
 
 def _refuse_finished(path: Path, later: Sequence[Path]) -> None:
