@@ -289,25 +289,24 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
     Raises:
         LogDamagedError: the disk does not give a log.
     """
-    logs = logs_in(folder) if folder.is_dir() and not (folder / RECORDING).exists() else []
+    if not folder.is_dir() or (folder / RECORDING).exists():
+        return []
     found: list[tuple[str, Path, int]] = []
-    streams: set[str] = set()
-    count, gaps = "", False
     stops: dict[str, int] = {}
-    for path in sorted(logs, key=lambda path: (len(path.name), path.name)):
+    stated: ViewMetadata | None = None
+    for path in sorted(logs_in(folder), key=lambda path: (len(path.name), path.name)):
         record = _metadata(path)
         if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
             return []
-        streams.update(filter(None, record.values.get("streams", "").split(",")))
-        count = record.values.get("stream_count", "")
-        gaps = record.values.get("gaps") == str(True)
-        there = frames_held(path, view := record.values.get("view", ""), gaps=gaps)
-        if there.stop_from(stops.get(view, 0)) != there.end or not there.end:
+        stated = ViewMetadata.parse(path, record.values)
+        there = frames_held(path, stated.view, gaps=stated.gaps)
+        if there.stop_from(stops.get(stated.view, 0)) != there.end or not there.end:
             return []
-        stops[view] = there.stop
-        found.append((view, path, there.frames))
-    every = stops.keys() == streams if streams else str(len(stops)) == count
-    return found if every and (gaps or len(set(stops.values())) == 1) else []
+        stops[stated.view] = there.stop
+        found.append((stated.view, path, there.frames))
+    if stated is None or len(stops) != (len(stated.streams) or stated.stream_count):
+        return []
+    return found if stated.gaps or len(set(stops.values())) == 1 else []
 
 
 def other_recordings(folder: Path, recording: RecordingSpec) -> list[Path]:
