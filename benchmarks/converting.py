@@ -15,7 +15,7 @@ from PIL import Image
 from benchmarks import foreign
 from benchmarks.report import interleaved, middle, save
 from benchmarks.report import ratio as times_ratio
-from cdmisfa.experiments.convert import convert
+from cdmisfa.experiments.sources import convert
 from recorder.world.scenes import BLOCK
 from replay.camera_logs.source import ForeignSource
 

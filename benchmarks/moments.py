@@ -17,8 +17,8 @@ from cdmisfa.core.blocks import Block
 from cdmisfa.core.learning import Learner
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments import session
-from cdmisfa.experiments.command import command_of
 from cdmisfa.experiments.loop import Keyframes
+from cdmisfa.experiments.resume import command_of
 from cdmisfa.experiments.sources import open_source
 from recorder.mcap.reader import LogReader
 from replay.runs.folders import run_log

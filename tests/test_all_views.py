@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 from run_data import read_signals
+from view_data import View, scalars
 
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
@@ -37,21 +37,10 @@ def test_every_view_is_there_at_every_frame(made, tmp_path, monkeypatch):
     source = RecordedSource(made / "rec")
     expected = source.take(1, 500).frames
     source.close()
-    rows = {}
-    for chunk in RrdReader(str(tmp_path / "v.rrd")).stream():
-        if chunk.entity_path == "/views/2_x2" and not chunk.is_static:
-            batch = chunk.to_record_batch()
-            times = zip(
-                batch.column("frame").to_pylist(),
-                batch.column("iteration").to_pylist(),
-                batch.column("Scalars:scalars").to_pylist(),
-                strict=True,
-            )
-            rows |= {t: (k, value) for t, k, value in times}
-    assert sorted(rows) == list(range(800))
-    for t, (k, value) in rows.items():
-        assert k == t // 100
-        np.testing.assert_array_equal(value, expected[t % 500])
+    rows = View(tmp_path / "v.rrd").rows["/views/2_x2"]
+    assert rows["frame"] == list(range(800))
+    assert rows["iteration"] == [t // 100 for t in range(800)]
+    np.testing.assert_array_equal(scalars(rows), expected[np.arange(800) % 500])
 
 
 def test_another_recording_is_refused(made, tmp_path):
@@ -79,15 +68,11 @@ def test_the_head_turns_to_what_is_watched(tmp_path):
     run(source, config, tmp_path / "run", max_iterations=6, rerun=False)
     source.close()
     build_view(tmp_path / "run", tmp_path / "v.rrd", all_views=sample)
-    shown, gazes = {}, {}
-    for chunk in RrdReader(str(tmp_path / "v.rrd")).stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path == "/head/poses/watching" and not chunk.is_static:
-            turns = batch.column("Transform3D:quaternion").flatten().to_pylist()
-            gazes |= dict(zip(batch.column("iteration").to_pylist(), turns, strict=True))
-        if chunk.entity_path == "/head/yaw" and not chunk.is_static:
-            values = batch.column("Scalars:scalars").flatten().to_pylist()
-            shown |= dict(zip(batch.column("iteration").to_pylist(), values, strict=True))
+    rows = View(tmp_path / "v.rrd").rows
+    head, gaze = rows["/head/yaw"], rows["/head/poses/watching"]
+    shown = dict(zip(head["iteration"], scalars(head)[:, 0].tolist(), strict=True))
+    turns = [turn for (turn,) in gaze["Transform3D:quaternion"]]
+    gazes = dict(zip(gaze["iteration"], turns, strict=True))
     names = ("left", "center", "right")
     expected = {s.iteration: yaws[names[s.stream]] for s in read_signals(tmp_path / "run")}
     assert shown == expected

@@ -30,16 +30,14 @@ from replay.view.properties import (
 from replay.viewer.catalogue import (
     LAYER,
     ROWS,
-    _created,
-    _identity,
-    _register,
     add_views,
     ready_view,
     serve_catalogue,
+    served_table,
     set_layout,
 )
 from replay.viewer.headless import draw_table, headless_viewer
-from replay.viewer.program import free_port, missing_driver, running
+from replay.viewer.program import missing_driver
 
 
 @pytest.fixture
@@ -49,6 +47,12 @@ def sweep(tmp_path):
         run.mkdir(parents=True)
         write_run(run / "run.mcap", VECTOR, 6, seed=seed)
     return tmp_path / "sweep #1"
+
+
+def recording_of(file):
+    """Name of the recording in a file."""
+    (name,) = (s.recording_id for s in RrdReader(str(file)).recordings())
+    return name
 
 
 def test_runs_are_found_in_a_sweep_and_beside_one_another(sweep):
@@ -64,8 +68,8 @@ def test_rows_and_views_of_a_run_have_one_name_and_say_what_was_run(sweep, tmp_p
     names = set()
     rows = write_rows(runs_in(sweep), tmp_path)
     for run, row in zip(runs_in(sweep), rows, strict=True):
-        assert _identity(row) == _identity(ready_view(run)) == run_identity(run)
-        names.add(_identity(row))
+        assert recording_of(row) == recording_of(ready_view(run)) == run_identity(run)
+        names.add(recording_of(row))
         for file in (row, run / "run.rrd"):
             properties = {
                 name
@@ -125,7 +129,9 @@ def test_the_command_serves_every_run_at_its_table_until_interrupted(sweep):
         assert set(dataset.segment_ids()) == {run_identity(run) for run in runs_in(sweep)}
         # the views follow the table
         wait_for(lambda: dict(dataset.info().layers).get(LAYER) == 3, 60, process)
-        assert set(dataset.segment_ids()) == {_identity(run / "run.rrd") for run in runs_in(sweep)}
+        assert set(dataset.segment_ids()) == {
+            recording_of(run / "run.rrd") for run in runs_in(sweep)
+        }
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=20) == 130
     finally:
@@ -140,14 +146,6 @@ def test_the_table_of_a_sweep_is_drawn(sweep, tmp_path, monkeypatch):
     with Image.open(tmp_path / "table.png") as picture:
         assert picture.size in ((800, 500), (1600, 1000))
         assert len(np.unique(np.asarray(picture.convert("L")))) > 20
-
-
-@pytest.fixture
-def dataset():
-    """An empty dataset of a server."""
-    port = str(free_port())
-    with running(["server", "--host", "127.0.0.1", "--port", port]) as server:
-        yield _created(f"rerun+http://127.0.0.1:{port}", "runs", server)
 
 
 def manifest(run, **learner):
@@ -170,49 +168,42 @@ def cells(file, name):
     ]
 
 
-def test_a_column_of_several_types_keeps_every_cell(sweep, tmp_path, dataset, capfd):
-    runs = runs_in(sweep)
-    for run, beta, nu in zip(runs, ("auto", 0.5, 2), (0.25, 1, 0.5), strict=True):
+def test_a_column_of_several_types_keeps_every_cell(sweep, tmp_path, capfd):
+    runs, betas = runs_in(sweep), ("auto", 0.5, 2)
+    for run, beta, nu in zip(runs, betas, (0.25, 1, 0.5), strict=True):
         manifest(run, beta=beta, nu=nu)
     rows = write_rows(runs, tmp_path)
     assert [cells(row, "beta") for row in rows] == [["auto"], ["0.5"], ["2"]]
     assert [cells(row, "nu") for row in rows] == [[0.25], [1.0], [0.5]]
-    assert _register(dataset, rows, ROWS) == {}
     # Views were made for themselves, in types of their own.
-    for run, beta in zip(runs, ("auto", 0.5, 2), strict=True):
+    for run, beta in zip(runs, betas, strict=True):
         stream = RrdReader(str(ready_view(run))).stream()
         chunks = [c for c in stream if not c.entity_path.startswith("/__properties")]
         chunks += [Chunk(c) for c in property_chunks({"learner": {"beta": beta}})]
         ChunkStore.from_chunks(chunks).write_rrd(
             run / "run.rrd", application_id="cdmisfa", recording_id=run_identity(run)
         )
-    add_views(runs, dataset, tmp_path)
-    assert dict(dataset.info().layers) == {ROWS: 3, LAYER: 3}
+    with served_table(sweep) as table:
+        add_views(runs, table.dataset, tmp_path)
+        assert dict(table.dataset.info().layers) == {ROWS: 3, LAYER: 3}
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.skipif(bool(missing_driver()), reason=missing_driver())
-def test_a_run_opens_in_the_prepared_layout(sweep, tmp_path, dataset):
-    runs = runs_in(sweep)
-    assert _register(dataset, write_rows(runs, tmp_path), ROWS) == {}
-    set_layout(runs, dataset, tmp_path)
-    add_views(runs, dataset, tmp_path)
-    url = dataset.segment_url(run_identity(runs[1]))
-    with headless_viewer("1200x800") as viewer:
+def test_a_run_opens_in_the_prepared_layout(sweep, tmp_path):
+    prepared = {"Events", "Change of weights ξ, as powers of ten"}  # as of one run alone
+    with served_table(sweep) as table, headless_viewer("1200x800") as viewer:
+        set_layout(table.runs, table.dataset, tmp_path)
+        add_views(table.runs, table.dataset, tmp_path)
+        url = table.dataset.segment_url(run_identity(table.runs[1]))
         viewer.ask(lambda client: client.open(url) or True)
-        prepared = {
-            "Events",
-            "Change of weights ξ, as powers of ten",
-        }  # as the views of one run are called
         viewer.ask(lambda client: prepared <= {view.name for view in client.get_state().views})
 
 
-def served_nothing():
-    with running(["server", "--port", "?"]) as server:
-        server.wait()
-        assert _created(f"rerun+http://127.0.0.1:{free_port()}", "runs", server) is None
-
-
-def test_a_server_that_has_ended_is_not_waited_for():
-    with pytest.raises(CdmisfaError, match="code"):
-        served_nothing()
+def test_a_server_that_has_ended_is_not_waited_for(sweep, tmp_path, monkeypatch):
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\necho 'no luck' >&2\nexit 3\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("replay.viewer.program.viewer_program", lambda: program)
+    with pytest.raises(CdmisfaError, match="code 3: no luck"), served_table(sweep) as table:
+        assert table is None

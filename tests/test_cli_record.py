@@ -17,7 +17,7 @@ from conftest import Cdmisfa
 from folders import contents
 from waiting import wait_for
 
-from cdmisfa.experiments.convert import convert
+from cdmisfa.experiments.sources import convert
 from recorder.config import Split
 from recorder.recording import RecordingStoppedError, record_scene
 from recorder.world.oscillatory import OscillatoryConfig

@@ -17,7 +17,7 @@ from folders import contents, coverage
 
 from cdmisfa.core.blocks import FrameSource
 from cdmisfa.core.errors import LogExhaustedError, UsageError
-from cdmisfa.experiments.convert import convert
+from cdmisfa.experiments.sources import convert
 from cdmisfa.testing.sources import SourceContract
 from recorder.config import Split
 from recorder.images.framing import FRAME_PIXELS, default_size, fitted

@@ -50,34 +50,32 @@ def feed(view, spec, iterations=30, tau=40):
     view.event(iterations * tau, iterations - 1, "the end")
 
 
-@pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
-def test_every_record_is_handed_over(spec, monkeypatch):
-    """What the server is given equals what a finished run's view is given."""
-    sent = {}
+@pytest.fixture
+def sent(monkeypatch):
+    """What viewers are handed, in the order in which it is: the values of each line by its path."""
+    found = {}
 
     def keep(self, times, values):
-        sent.setdefault(self.path, []).append(np.array(values))
+        found.setdefault(self.path, []).append(np.array(values).reshape(-1))
 
     monkeypatch.setattr("replay.view.columns.Column.send", keep)
     monkeypatch.setattr(live, "MOST_BLOCKS", 7)
+    return found
+
+
+@pytest.mark.parametrize("spec", [IMAGE, VECTOR], ids=["images", "vectors"])
+def test_every_record_is_handed_over(spec, sent):
+    """What the server is given equals what a finished run's view is given."""
     with LiveView(spec, MANIFEST, 40, 1) as view:
         feed(view, spec)
     records = [signals for signals, _ in run_of(spec, 30, saves=True)]
     for name in ("epsilon", "y", "xi"):
-        found = np.concatenate([part.reshape(-1) for part in sent[f"signals/{name}"]])
         expected = np.concatenate([np.ravel(getattr(s, name)) for s in records])
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(np.concatenate(sent[f"signals/{name}"]), expected)
     assert len(sent["signals/epsilon"]) == 5
 
 
-def test_the_progress_learner_is_shown_by_its_streams(monkeypatch):
-    sent = {}
-
-    def keep(self, times, values):
-        sent.setdefault(self.path, []).append(np.array(values).reshape(-1))
-
-    monkeypatch.setattr("replay.view.columns.Column.send", keep)
-    monkeypatch.setattr(live, "MOST_BLOCKS", 7)
+def test_the_progress_learner_is_shown_by_its_streams(sent):
     table = {"algorithm": "progress", "settled": 0.05, "agreement": 0.25}
     with LiveView(VECTOR, {"config": {"learner": table}}, 40, 1) as view:
         feed(view, VECTOR)
@@ -145,35 +143,16 @@ def test_only_who_has_the_address_is_given_the_run(tmp_path):
 
 
 def test_what_does_not_fit_goes_from_behind_the_beginning():
-    stream = Pieces(50)
-    early, late = stream.read(), stream.read()
+    pieces = Pieces(50)
+    early, late = pieces.read(), pieces.read()
     for number in range(4):
-        stream.add(bytes([number]) * 10)
+        pieces.add(bytes([number]) * 10)
     assert [next(early)[0] for _ in range(4)] == [0, 1, 2, 3]
     for number in range(4, 9):
-        stream.add(bytes([number]) * 10)
-    stream.end(0)
+        pieces.add(bytes([number]) * 10)
+    pieces.end(0)
     assert [piece[0] for piece in early] == [6, 7, 8]
     assert [piece[0] for piece in late] == [0, 1, 6, 7, 8]
-
-
-def test_a_viewer_is_given_the_rest_before_the_end():
-    stream = Pieces(1000)
-    taken = []
-
-    def slowly():
-        for piece in stream.read():
-            time.sleep(0.1)
-            taken.append(piece)
-
-    reader = threading.Thread(target=slowly)
-    stream.add(b"a")
-    reader.start()
-    stream.add(b"b")
-    time.sleep(0.02)
-    stream.end(5)
-    assert taken == [b"a", b"b"]
-    reader.join()
 
 
 @pytest.mark.skipif(bool(program.missing_driver()), reason=program.missing_driver())
@@ -205,45 +184,24 @@ def test_a_window_shows_the_run_and_nobody_the_address(tmp_path, monkeypatch):
 
 
 def test_a_run_gives_the_same_with_and_without(tmp_path):
-    said = []
-    config = LearnerConfig()
-    quiet = run(OscillatorySource(), config, None, max_iterations=60)
-    shown = run(
-        OscillatorySource(),
-        config,
-        tmp_path / "run",
-        max_iterations=60,
-        live=True,
-        announce=said.append,
-    )
+    said, folder = [], tmp_path / "run"
+    quiet = run(OscillatorySource(), LearnerConfig(), None, max_iterations=60)
+    how = {"max_iterations": 60, "live": True, "announce": said.append}
+    shown = run(OscillatorySource(), LearnerConfig(), folder, **how)
     assert shown.signals_sha256 == quiet.signals_sha256
-    assert (tmp_path / "run" / "run.rrd").is_file()
+    assert (folder / "run.rrd").is_file()
     assert len(said) == 1
 
 
-def test_a_resumed_run_shows_what_went_before(tmp_path, monkeypatch):
+def test_a_resumed_run_shows_what_went_before(tmp_path, sent):
     """All of a resumed run is handed over, each record once, and in order."""
-    config, sent = LearnerConfig(), []
-
-    def keep(self, times, values):
-        if self.path == "signals/epsilon":
-            sent.append(np.array(values).reshape(-1))
-
-    folder = tmp_path / "run"
-    run(OscillatorySource(), config, folder, max_iterations=30, rerun=False)
-    monkeypatch.setattr("replay.view.columns.Column.send", keep)
-    run(
-        OscillatorySource(),
-        config,
-        folder,
-        max_iterations=50,
-        rerun=False,
-        resume=True,
-        live=True,
-    )
+    folder, how = tmp_path / "run", {"rerun": False}
+    run(OscillatorySource(), LearnerConfig(), folder, max_iterations=30, **how)
+    how |= {"resume": True, "live": True}
+    run(OscillatorySource(), LearnerConfig(), folder, max_iterations=50, **how)
     expected = [s.epsilon for s in read_signals(folder)]
     assert len(expected) == 50
-    np.testing.assert_array_equal(np.concatenate(sent), expected)
+    np.testing.assert_array_equal(np.concatenate(sent["signals/epsilon"]), expected)
 
 
 def test_what_went_before_has_a_picture_of_each_block(tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from recorder.mcap.reader import LogReader
 from replay.storage import servers
 from replay.storage.location import Limits, Url, limited, limits
 from replay.storage.remote import RemoteStore
-from replay.storage.servers import UnreachableError, asked_wait, backoff
+from replay.storage.servers import UnreachableError, backoff, retry_seconds
 
 pytest.importorskip("aiohttp")
 
@@ -204,11 +204,11 @@ def test_waits_grow_and_differ(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_wait_that_is_asked_for_is_read_or_none() -> None:
-    assert [asked_wait(text) for text in ("7", " 120 ", "", "soon", "-3", "1.5", "٣")] == [
+    assert [retry_seconds(text) for text in ("7", " 120 ", "", "soon", "-3", "1.5", "٣")] == [
         *(7.0, 120.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     ]
-    assert asked_wait("Wed, 21 Oct 2099 07:28:00 GMT") > 1e9
-    assert asked_wait("Wed, 21 Oct 1999 07:28:00 GMT") == 0
+    assert retry_seconds("Wed, 21 Oct 2099 07:28:00 GMT") > 1e9
+    assert retry_seconds("Wed, 21 Oct 1999 07:28:00 GMT") == 0
 
 
 def test_the_options_are_the_limits(cdmisfa: Cdmisfa, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,21 @@ def test_files_from_before_are_read_and_the_width_decides(tmp_path: Path) -> Non
     np.testing.assert_allclose(module.transform(frames), y, rtol=1e-9, atol=1e-9)
 
 
+def test_modules_come_back_in_order_and_to_the_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    modules = [
+        replace(with_width(5), index=i, stream_index=i % 2, phi=rng.standard_normal((1, 5)))
+        for i in range(1, 12)
+    ]
+    save_modules(tmp_path / "modules.npz", modules)
+    back = load_modules(tmp_path)
+    assert [(m.index, m.stream_index, m.iteration) for m in back] == [
+        (i, i % 2, 9) for i in range(1, 12)
+    ]
+    for ours, theirs in zip(modules, back, strict=True):
+        assert ours.phi.tobytes() == theirs.phi.tobytes()
+
+
 @pytest.mark.parametrize("change", [{"module1_expansion": 3.0}, {"module1_scale": "x"}])
 def test_a_file_with_other_things_in_their_place_is_damaged(
     change: dict[str, Any], tmp_path: Path
@@ -104,8 +120,17 @@ def test_a_file_with_other_things_in_their_place_is_damaged(
     save_modules(tmp_path / "modules.npz", [with_width(2)])
     with np.load(tmp_path / "modules.npz") as stored:
         np.savez(tmp_path / "bad.npz", **{**stored, **{k: np.array(v) for k, v in change.items()}})
-    with pytest.raises(LogDamagedError):
+    with pytest.raises(LogDamagedError, match="holds no modules"):
         load_modules(tmp_path / "bad.npz")
+
+
+@pytest.mark.parametrize("data", [b"", b"PK\x03\x04 no zip", b"\x93NUMPY"])
+def test_a_file_of_something_else_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
+    (tmp_path / "modules.npz").write_bytes(data)
+    with pytest.raises(LogDamagedError, match=r"modules\.npz"):
+        load_modules(tmp_path)
+    with pytest.raises(UsageError, match="does not exist"):
+        load_modules(tmp_path / "elsewhere")
 
 
 def test_keyframes_keep_both() -> None:

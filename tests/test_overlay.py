@@ -6,9 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-import rerun.blueprint as rrb
-from rerun.chunk import RrdReader
 from run_data import VECTOR, write_run
+from view_data import View, scalars, views_of
 
 from cdmisfa.core.errors import UsageError
 from replay.runs.compare import Difference, side_by_side
@@ -42,19 +41,15 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
     runs, records = three
     out = tmp_path / "all.rrd"
     build_overlay(runs, side_by_side(runs), out)
-    found = {}
-    reader = RrdReader(str(out))
-    for chunk in reader.stream():
-        if not chunk.is_static and chunk.entity_path.endswith(("/epsilon", "R_stay/1_x1")):
-            batch = chunk.to_record_batch()
-            assert batch.column("iteration").to_pylist() == list(range(12))
-            found[chunk.entity_path] = batch.column("Scalars:scalars").flatten().to_numpy()
-    assert len(reader.blueprints()) == 1
+    view = View(out)
+    assert len(view.blueprints) == 1
     for name, signals in zip(("1_run", "2_run", "3_c"), records, strict=True):
         expected = [s.epsilon for s in signals]
-        np.testing.assert_array_equal(found[f"/compare/{name}/epsilon"], expected)
+        found = view.rows[f"/compare/{name}/epsilon"]
+        assert found["iteration"] == list(range(12))
+        np.testing.assert_array_equal(scalars(found)[:, 0], expected)
         stay = [s.R[0, 0, 0] for s in signals]
-        np.testing.assert_array_equal(found[f"/compare/{name}/R_stay/1_x1"], stay)
+        np.testing.assert_array_equal(view.numbers(f"/compare/{name}/R_stay/1_x1"), stay)
     with pytest.raises(UsageError, match="--force"):
         build_overlay(runs, side_by_side(runs), out)
     with pytest.raises(UsageError, match="no tab 'nowhere'"):
@@ -65,11 +60,9 @@ def test_the_view_holds_each_runs_values(three, tmp_path):
 def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
     runs, (records, *_) = three
     build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
-    found = []
-    for chunk in RrdReader(str(tmp_path / "all.rrd")).stream():
-        assert not chunk.entity_path.endswith(f"/{name}")
-        if not chunk.is_static and chunk.entity_path == f"/compare/1_run/log_{name}":
-            found += chunk.to_record_batch().column("Scalars:scalars").flatten().to_pylist()
+    view = View(tmp_path / "all.rrd")
+    assert not [entity for entity in view.names if entity.endswith(f"/{name}")]
+    found = scalars(view.rows[f"/compare/1_run/log_{name}"])[:, 0]
     np.testing.assert_allclose(
         np.power(10, found), [np.ravel(getattr(r, name))[0] for r in records]
     )
@@ -77,24 +70,17 @@ def test_what_falls_through_powers_of_ten_is_drawn_so(name, three, tmp_path):
 
 @pytest.mark.parametrize("batch", [500, 2])
 def test_where_a_fork_begins_is_marked_on_each_curve(batch, three, tmp_path, monkeypatch):
-    """Also on one of which nothing is known in that iteration."""
+    """Or, on one that has no value in that iteration, at its next value."""
     runs, (records, *_) = three
     monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", batch)
     monkeypatch.setattr("replay.runs.log.RunHeader.forked_at", 5)
     build_overlay(runs, side_by_side(runs), tmp_path / "all.rrd")
-    marks = 0
-    for chunk in RrdReader(str(tmp_path / "all.rrd")).stream():
-        if chunk.is_static or "/1_run/forked/learning_error_of/" not in chunk.entity_path:
-            continue
-        batch = chunk.to_record_batch()
-        stream = int(chunk.entity_path.split("/")[-1][0]) - 1
-        own = [(s.iteration, s.learning_error) for s in records if s.stream == stream]
-        at, shown = batch["iteration"].to_pylist(), batch["Scalars:scalars"].to_pylist()
-        expected = np.interp(at, *zip(*own, strict=True))
-        np.testing.assert_allclose(np.ravel(shown), expected, rtol=1e-12)
-        assert at == [5 if own[0][0] <= 5 else own[0][0]]
-        marks += 1
-    assert marks == 3
+    view = View(tmp_path / "all.rrd")
+    for s, name in enumerate(VECTOR.streams):
+        own = [(r.iteration, r.learning_error) for r in records if r.stream == s]
+        first, value = next(point for point in own if point[0] >= 5)
+        mark = view.rows[f"/compare/1_run/forked/learning_error_of/{s + 1}_{name}"]
+        assert (mark["iteration"], scalars(mark).tolist()) == ([first], [[value]])
 
 
 def test_runs_that_are_the_same_until_one_ends_are_said_to_be():
@@ -124,26 +110,15 @@ def test_curves_that_no_run_tells_have_no_panel(tmp_path, monkeypatch):
     assert names == [overlay.CURVES[n] for n in CURVES_LEFT]
     views = [view for tab in tabs for view in views_of(tab)]
     assert len({id(view) for view in views}) == len(views)  # a view has one place
-    found = {}
-    for chunk in RrdReader(str(out)).stream():
-        if not chunk.is_static:
-            batch = chunk.to_record_batch()
-            found[chunk.entity_path] = batch
+    found = View(out).rows
     for view in views:
         assert all(entity in found for entity in view.contents if isinstance(view.contents, list))
     name = tmp_path.name
     own = [s.iteration for s in written if s.stream == 1]
-    batch = found[f"/compare/1_{name}/learning_error_of/2_x2"]
-    assert batch.column("iteration").to_pylist() == own
+    assert found[f"/compare/1_{name}/learning_error_of/2_x2"]["iteration"] == own
 
 
 CURVES_LEFT = ("eta", "learning_error", "tested", "epsilon")
-
-
-def views_of(part):
-    """All views in a container."""
-    inner = [] if isinstance(part, rrb.View) else part.contents
-    return [part] if isinstance(part, rrb.View) else [v for one in inner for v in views_of(one)]
 
 
 def test_the_command_exits_with_4_only_for_two_that_differ(three, tmp_path, cdmisfa):

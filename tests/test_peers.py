@@ -11,7 +11,7 @@ from camera_files import HEIGHT, WIDTH, encoded, pictures, write_cameras
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 
-from cdmisfa.experiments.convert import convert
+from cdmisfa.experiments.sources import convert
 from recorder.mcap.reader import LogReader
 from replay.camera_logs.source import ForeignSource
 

@@ -20,7 +20,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import UsageError
 from cdmisfa.experiments.documents import versions
 from cdmisfa.experiments.trial import run_trial
-from cdmisfa.studies.paper import comparison, difficulty, icub, nonstationary
+from cdmisfa.studies.paper import difficulty, icub, nonstationary, oscillatory
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Trial
 from cdmisfa.studies.paper.oscillatory import Oscillatory, paper_config
 from cdmisfa.studies.paper.reproduce import markdown_table, reproduce
@@ -40,7 +40,7 @@ def stability(folder: Path, trials: int = 1, jobs: int = 1) -> tuple[dict[str, A
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """No figures, which take a second each, where they are not looked at."""
-    for experiment in (Oscillatory, comparison.Stability):
+    for experiment in (Oscillatory, oscillatory.Stability):
         monkeypatch.setattr(experiment, "draw", lambda self, trials, folder: [])
 
 
@@ -148,7 +148,7 @@ def test_a_claim_that_fails_exits_4(
         row = {"exploration_ends": 1, "changes": 1, "before": "011", "after": "101"}
         return row, {"R": np.zeros((9, 3)), "policy": np.eye(9, 3, dtype=np.int8)}
 
-    monkeypatch.setattr(comparison.Stability, "run", unstable)
+    monkeypatch.setattr(oscillatory.Stability, "run", unstable)
     done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path)
     assert done.code == 4
     said = "stability did not come out: 2.0 keeps its policy after epsilon = 0 (0 of 1 trials)"
@@ -168,7 +168,7 @@ def test_a_trial_that_breaks_or_is_damaged_is_named(
     def broken(self: Experiment, settings: Any) -> Any:
         raise UsageError("it broke")
 
-    monkeypatch.setattr(comparison.Stability, "run", broken)
+    monkeypatch.setattr(oscillatory.Stability, "run", broken)
     done = cdmisfa("reproduce", "stability", "--trials", 1, "-o", tmp_path / "other")
     assert done.code == 1
     assert "'seed': 0}: it broke; the others are kept" in done.err
@@ -186,8 +186,8 @@ def test_a_key_that_is_not_counted_for_an_algorithm_changes_nothing(algorithm: s
     other |= {"roc_memory": 10, "roc_error": 0.01}
     unchanged = learned()
     assert unchanged[0]
-    assert learned(*set(other) - set(comparison.used_keys(algorithm))) == unchanged
-    assert learned(*set(other) & set(comparison.used_keys(algorithm))) != unchanged
+    assert learned(*set(other) - set(oscillatory.used_keys(algorithm))) == unchanged
+    assert learned(*set(other) & set(oscillatory.used_keys(algorithm))) != unchanged
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from run_data import IMAGE, VECTOR, parts_of, read_signals, rows_of, run_of, sig
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import LogDamagedError, UsageError
-from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SCHEMA_VERSION, SIGNALS, canonical_bytes
 from replay.runs.codec import (
     decode_matrix,
@@ -30,7 +29,6 @@ from replay.runs.codec import (
 )
 from replay.runs.folders import is_run
 from replay.runs.log import read_header
-from replay.runs.modules import load_modules, save_modules
 from replay.runs.writer import RunWriter
 
 
@@ -219,43 +217,6 @@ def test_what_is_no_run_is_refused_by_name(tmp_path):
     with pytest.raises(UsageError, match="does not exist"):
         list(read_signals(tmp_path / "nothing"))
     assert not is_run(tmp_path)
-
-
-def test_modules_come_back(tmp_path):
-    rng = np.random.default_rng(1)
-    modules = [
-        Module(
-            index=i,
-            stream="ab"[i % 2],
-            stream_index=i % 2,
-            iteration=100 * i,
-            phi=rng.standard_normal((2, 5)),
-            mean=rng.standard_normal(5),
-            band_mean=rng.random(2),
-            band_sd=rng.random(2),
-            eta=rng.random(2),
-            policy=np.array([0, 1, 1]),
-        )
-        for i in range(1, 12)
-    ]
-    save_modules(tmp_path / "modules.npz", modules)
-    back = load_modules(tmp_path)
-    assert [m.index for m in back] == list(range(1, 12))
-    for a, b in zip(modules, back, strict=True):
-        assert (a.stream, a.iteration) == (b.stream, b.iteration)
-        for name in ("phi", "mean", "band_mean", "band_sd", "eta", "policy"):
-            assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"PK\x03\x04 no zip", b"\x93NUMPY"], ids=["empty", "zip", "npy"]
-)
-def test_damaged_modules_are_refused_in_words(data, tmp_path):
-    (tmp_path / "modules.npz").write_bytes(data)
-    with pytest.raises(LogDamagedError, match=r"modules\.npz"):
-        load_modules(tmp_path)
-    with pytest.raises(UsageError, match="does not exist"):
-        load_modules(tmp_path / "elsewhere")
 
 
 def test_a_message_does_not_depend_on_how_arrays_lie_in_memory():

@@ -8,12 +8,12 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from run_data import VECTOR, having, parts_of, read_signals, rows_of, write_run
+from view_data import tabs_of, views_of
 
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -23,11 +23,7 @@ from cdmisfa.experiments.resume import refuse_difference
 from replay.runs.codec import decode_signals, encode_signals
 from replay.runs.compare import first_difference
 from replay.runs.log import read_header
-from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
-from replay.view import panels
-from replay.view.layouts import WorldTab
-from replay.view.panels import run_layout
 
 OLD = Path(__file__).parent / "data" / "signals_v1"
 SIGNALS_SHA256 = "b86ab92af6b8ba255cb239dd54c187a1adbdccc9b43f096a348ad4f83bd85a2f"
@@ -164,19 +160,15 @@ def test_sizes_without_values_allocate_nothing() -> None:
 VERDICT = "Verdict on each block: the last 50 blocks"
 
 
-def gate_of(run: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def gate_of(run: Path) -> list[str]:
     """Titles in the gate's tab of a run's layout."""
-    tabs: list[Any] = []
-    monkeypatch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
-    run_layout(read_outline(run), WorldTab())
-    (gate,) = [tab for tab in tabs if tab.name == "Gate"]
-    return [view.name for view in gate.contents]
+    return [view.name for view in tabs_of(run)["Gate"].contents]
 
 
-def test_the_gate_of_1_0_shows_its_clusters_where_the_log_has_them(monkeypatch, tmp_path) -> None:
-    assert gate_of(OLD, monkeypatch)[1:] == [VERDICT, "Share of novel blocks"]
+def test_the_gate_of_1_0_shows_its_clusters_where_the_log_has_them(tmp_path) -> None:
+    assert gate_of(OLD)[1:] == [VERDICT, "Share of novel blocks"]
     write_run(tmp_path / "run.mcap", VECTOR, 3, learner={"algorithm": "1.0", "roc_error": 3.0})
-    assert gate_of(tmp_path, monkeypatch)[1:] == [
+    assert gate_of(tmp_path)[1:] == [
         VERDICT,
         "Clustering error by module 1: known below 3",
         "Clustering error by module 2: known below 3",
@@ -185,8 +177,20 @@ def test_the_gate_of_1_0_shows_its_clusters_where_the_log_has_them(monkeypatch, 
     ]
 
 
-def test_the_gate_of_2_0_shows_its_bands(monkeypatch, tmp_path) -> None:
+def test_the_gate_of_2_0_shows_its_bands(tmp_path) -> None:
     write_run(tmp_path / "run.mcap", VECTOR, 12)
-    shown = gate_of(tmp_path, monkeypatch)
+    shown = gate_of(tmp_path)
     assert any("within the band of 2 SD" in name for name in shown)
     assert not any("Clustering" in name for name in shown)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "words"),
+    [("1.0", "clustering error's mean is below 0.25"), ("2.0", "saved below δ")],
+)
+def test_the_overview_shows_what_comes_down_until_a_save(tmp_path, algorithm, words) -> None:
+    table = {"algorithm": algorithm, "roc_error": 0.25}
+    write_run(tmp_path / "run.mcap", VECTOR, 3, learner=table)
+    names = [view.name for view in views_of(tabs_of(tmp_path)["Overview"])]
+    (feels,) = (name for name in names if name.startswith("What it feels"))
+    assert words in feels

@@ -36,21 +36,10 @@ def test_outputs_are_those_the_run_recorded(run):
         np.testing.assert_allclose(features[0].transform(block), y, rtol=1e-9, atol=1e-9)
 
 
-def image_module(**changes):
+def image_module():
     rng = np.random.default_rng(0)
-    values = {
-        "index": 1,
-        "stream": "a",
-        "stream_index": 0,
-        "iteration": 5,
-        "phi": rng.standard_normal((2, 12)),
-        "mean": rng.random(12),
-        "band_mean": np.zeros(2),
-        "band_sd": np.zeros(2),
-        "eta": np.zeros(2),
-        "policy": np.zeros(3, dtype=np.int64),
-    }
-    return Module(**{**values, **changes})
+    phi, mean, zero = rng.standard_normal((2, 12)), rng.random(12), np.zeros(2)
+    return Module(1, "a", 0, 5, phi, mean, zero, zero, zero, np.zeros(3, dtype=np.int64))
 
 
 def test_pixels_count_one_255th(tmp_path):

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
-from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 from run_data import DELTA, IMAGE, VECTOR, run_of, write_run
+from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.errors import CdmisfaError, UsageError
 from cdmisfa.core.modules import Module
 from cdmisfa.core.signals import SIGNALS
-from recorder.recording import record_scene
-from recorder.world.oscillatory import OscillatoryConfig
 from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
-from replay.view import run as run_view
 from replay.view.build import build_view
-from replay.view.columns import image_column, images, named_tensors, tensors
-from replay.view.layouts import WorldTab
-from replay.view.panels import run_layout
+from replay.view.columns import images, named_tensors, tensors
 from replay.view.summary import summary_text
 
 REPLAY = Path(__file__).parents[1] / "replay"
@@ -38,43 +31,6 @@ TAU = 40
 def _strict(monkeypatch):
     """Rerun drops data that it does not understand, with a warning only, unless told so."""
     monkeypatch.setenv("RERUN_STRICT", "1")
-
-
-def rows_of(path):
-    """Per entity: its columns over all chunks in the order of frames."""
-    chunks = defaultdict(list)
-    for chunk in RrdReader(str(path)).stream():
-        if not chunk.is_static:
-            chunks[chunk.entity_path].append(chunk.to_record_batch())
-    entities = {}
-    for entity, batches in chunks.items():
-        columns = {}
-        for name in batches[0].schema.names:
-            values = [
-                batch.column(name).to_pylist() for batch in batches if name in batch.schema.names
-            ]
-            columns[name] = [v for part in values for v in part]
-        if "frame" in columns:
-            order = np.argsort(columns["frame"], kind="stable")
-            columns = {name: [c[i] for i in order] for name, c in columns.items()}
-        entities[entity] = columns
-    return entities
-
-
-def views_of(layout):
-    """The views of a layout or a container, in order."""
-    root = getattr(layout, "root_container", layout)
-    if not hasattr(root, "contents") or not hasattr(root, "kind"):
-        return [root]
-    return [view for part in root.contents for view in views_of(part)]
-
-
-def statics_of(path):
-    return {chunk.entity_path for chunk in RrdReader(str(path)).stream() if chunk.is_static}
-
-
-def scalars(entity):
-    return np.array(entity["Scalars:scalars"], dtype=np.float64)
 
 
 @pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
@@ -97,51 +53,44 @@ def shown(request, tmp_path_factory):
     )
     save_modules(folder / "modules.npz", [module])
     build_view(folder, folder / "run.rrd", every=20)
-    return request.param, records, rows_of(folder / "run.rrd"), folder
+    view = View(folder / "run.rrd")
+    return request.param, records, view.rows, view
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in SIGNALS if n not in ("iteration", "t", "log_time", "R", "Q")]
-)
-def test_every_signal_of_every_iteration_is_there(name, shown):
+def test_every_signal_of_every_iteration_is_there(shown):
+    """Each curve and each tensor equals the log."""
     _, records, rows, _ = shown
-    if SIGNALS[name].dims.startswith("M"):
-        for module in (1, 2):
-            expected = [
-                getattr(s, name)[module - 1].reshape(-1, 1)
-                for s in records
-                if len(s.y_frozen) >= module
-            ]
-            found = scalars(rows[f"/signals/{name}/{module}"])
-            np.testing.assert_array_equal(found, np.concatenate(expected))
-        return
-    per_frame = SIGNALS[name].dims.startswith("T")
-    values = [np.asarray(getattr(s, name), dtype=float) for s in records]
-    expected = [v.reshape(TAU if per_frame else 1, -1) for v in values]
-    entity = rows[f"/signals/{name}"]
-    np.testing.assert_array_equal(scalars(entity), np.concatenate(expected))
-    repeat = TAU if per_frame else 1
-    assert entity["iteration"] == [s.iteration for s in records for _ in range(repeat)]
-    assert entity["frame"] == [s.t + i for s in records for i in range(repeat)]
-
-
-@pytest.mark.parametrize("name", ["R", "Q"])
-def test_tensors_are_there(name, shown):
-    _, records, rows, _ = shown
-    found = rows[f"/signals/{name}"]["Tensor:data"]
-    for signals, (tensor,) in zip(records, found, strict=True):
-        expected = getattr(signals, name)
-        assert tensor["shape"] == list(expected.shape)
-        np.testing.assert_array_equal(np.reshape(tensor["buffer"], expected.shape), expected)
+    for name, signal in SIGNALS.items():
+        values = [np.asarray(getattr(s, name)) for s in records]
+        if name in ("iteration", "t", "log_time"):
+            continue
+        if signal.show == "heat":
+            for value, (tensor,) in zip(
+                values, rows[f"/signals/{name}"]["Tensor:data"], strict=True
+            ):
+                assert tensor["shape"] == list(value.shape)
+                np.testing.assert_array_equal(np.reshape(tensor["buffer"], value.shape), value)
+            continue
+        count = TAU if "T" in signal.dims else 1
+        expected = {f"/signals/{name}": [v.reshape(count, -1) for v in values]}
+        if signal.dims.startswith("M"):
+            expected = {
+                f"/signals/{name}/{m + 1}": [v[m].reshape(-1, 1) for v in values if len(v) > m]
+                for m in (0, 1)
+            }
+        else:
+            entity = rows[f"/signals/{name}"]
+            assert entity["iteration"] == [s.iteration for s in records for _ in range(count)]
+            assert entity["frame"] == [s.t + i for s in records for i in range(count)]
+        for entity, found in expected.items():
+            np.testing.assert_array_equal(scalars(rows[entity]), np.concatenate(found))
 
 
 def test_all_stand_on_the_clock_of_the_log(shown):
     spec, records, rows, _ = shown
-    times = rows["/signals/xi"]["message_log_time"]
-    found = [np.datetime64(t, "ns").astype(int) for t in times]
-    assert found == [s.log_time for s in records]
-    times = rows["/signals/y"]["message_log_time"]
-    assert np.datetime64(times[-1], "ns").astype(int) == spec.time_ns(ITERATIONS * TAU - 1)
+    assert rows["/signals/xi"]["message_log_time"] == [s.log_time for s in records]
+    last = spec.time_ns(ITERATIONS * TAU - 1)
+    assert rows["/signals/y"]["message_log_time"][-1] == last
 
 
 def test_every_frame_has_the_log_time_of_the_log_at_any_rate(tmp_path):
@@ -149,14 +98,9 @@ def test_every_frame_has_the_log_time_of_the_log_at_any_rate(tmp_path):
     spec = dataclasses.replace(VECTOR, fps=29.97)
     write_run(tmp_path / "run.mcap", spec, 9, tau=14_985)
     build_view(tmp_path, tmp_path / "run.rrd")
-    times = {}
-    for chunk in RrdReader(str(tmp_path / "run.rrd")).stream():
-        if chunk.entity_path == "/signals/y" and not chunk.is_static:
-            batch = chunk.to_record_batch()
-            log_times = batch.column("message_log_time").cast("int64").to_pylist()
-            times |= dict(zip(batch.column("frame").to_pylist(), log_times, strict=True))
-    frames = range(9 * 14_985)
-    assert [t for t in frames if times[t] != spec.time_ns(t)] == []
+    rows = View(tmp_path / "run.rrd").rows["/signals/y"]
+    assert rows["frame"] == list(range(9 * 14_985))
+    assert rows["message_log_time"] == [spec.time_ns(t) for t in rows["frame"]]
 
 
 def test_what_was_watched_is_there(shown):
@@ -191,14 +135,14 @@ def test_lanes_say_what_was_the_case(shown):
 
 
 def test_eyes_get_threshold_band_weights_and_events(shown):
-    spec, records, rows, folder = shown
+    spec, records, rows, view = shown
     assert set(np.ravel(scalars(rows["/abstraction/delta"]))) == {np.log10(DELTA)}
     band = scalars(rows["/gate/band/1"])
     np.testing.assert_allclose(band, np.tile([0.008, 0.012], (len(band), 1)))
     assert rows["/abstraction/phi"]["iteration"] == [0, 10, 20]
     assert rows["/modules/1/weights"]["iteration"] == [8]
     assert rows["/events"]["TextLog:text"] == [["stopped: the test is over"]]
-    assert "/summary" in statics_of(folder / "run.rrd")
+    assert "/summary" in view.static
     stay = scalars(rows[f"/decision/R_stay/2_{spec.streams[1]}"])[:, 0]
     np.testing.assert_allclose(stay, [1000 * s.R[1, 0, 1] for s in records])
     fell = [np.log10(s.eta_dot[0]) for s in records]
@@ -207,16 +151,16 @@ def test_eyes_get_threshold_band_weights_and_events(shown):
     assert f"| {spec.streams[1]} | {1000 * records[0].Q[1, 0]:.3f} |" in first[0]
 
 
-def test_the_share_of_the_recent_blocks_is_there(shown, monkeypatch):
-    spec, records, _, folder = shown
-    monkeypatch.setattr(run_view, "RECENT", 5)
+def test_the_share_of_the_recent_blocks_is_there(tmp_path, monkeypatch):
+    monkeypatch.setattr("replay.view.run.RECENT", 5)
     monkeypatch.setattr("replay.runs.log.BATCH_ITERATIONS", 4)
-    build_view(folder, folder / "short.rrd", every=20)
-    found = scalars(rows_of(folder / "short.rrd")["/decision/attention"])
+    records = write_run(tmp_path / "run.mcap", VECTOR, ITERATIONS)
+    build_view(tmp_path, tmp_path / "run.rrd")
+    found = scalars(View(tmp_path / "run.rrd").rows["/decision/attention"])
     streams = np.array([s.stream for s in records])
     for k in range(len(records)):
         recent = streams[max(0, k - 4) : k + 1]
-        share = np.bincount(recent, minlength=len(spec.streams)) / len(recent)
+        share = np.bincount(recent, minlength=len(VECTOR.streams)) / len(recent)
         np.testing.assert_allclose(found[k], share)
 
 
@@ -230,26 +174,9 @@ def test_the_summary_says_what_was_not_saved_and_why_it_ended(tmp_path):
 
 
 def test_the_file_has_a_layout_and_properties(shown):
-    *_, folder = shown
-    reader = RrdReader(str(folder / "run.rrd"))
-    assert len(reader.blueprints()) == 1
-    properties = {c.entity_path for c in reader.stream() if "__properties" in c.entity_path}
-    assert {"/__properties/learner", "/__properties/result"} <= properties
-
-
-def test_the_overview_of_the_first_version_shows_its_clustering_error(tmp_path):
-    names = {}
-    for algorithm in ("1.0", "2.0"):
-        run = tmp_path / algorithm
-        run.mkdir()
-        table = {"algorithm": algorithm, "roc_error": 0.25}
-        write_run(run / "run.mcap", VECTOR, 3, learner=table)
-        layout = run_layout(read_outline(run), WorldTab())
-        (names[algorithm],) = (
-            v.name for v in views_of(layout) if v.name.startswith("What it feels")
-        )
-    assert "clustering error's mean is below 0.25" in names["1.0"]
-    assert "below δ" in names["2.0"]
+    *_, view = shown
+    assert len(view.blueprints) == 1
+    assert {"/__properties/learner", "/__properties/result"} <= view.names
 
 
 def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):
@@ -257,7 +184,7 @@ def test_many_streams_show_the_most_watched(tmp_path, monkeypatch):
     spec = SourceSpec(tuple(f"s{i}" for i in range(70)), (2,), "float64", (), 50.0, 0)
     records = write_run(tmp_path / "run.mcap", spec, 30)
     build_view(tmp_path, tmp_path / "run.rrd")
-    rows = rows_of(tmp_path / "run.rrd")
+    rows = View(tmp_path / "run.rrd").rows
     lanes = {entity for entity in rows if entity.startswith("/policy/")}
     assert len(lanes) == 5
     visits = np.bincount([s.stream for s in records], minlength=70)
@@ -269,7 +196,7 @@ def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
     monkeypatch.setattr("replay.runs.writer.CHUNK_BYTES", 4096)
     write_run(tmp_path / "run.mcap", VECTOR, 0)
     build_view(tmp_path, tmp_path / "empty.rrd")
-    assert "/signals/y" not in rows_of(tmp_path / "empty.rrd")
+    assert "/signals/y" not in View(tmp_path / "empty.rrd").rows
     data = (tmp_path / "run.mcap").read_bytes()
     assert len(data) > 0
     torn = tmp_path / "torn"
@@ -279,7 +206,7 @@ def test_an_empty_and_a_torn_run_have_a_view_too(tmp_path, monkeypatch):
     (torn / "run.mcap").unlink()
     (torn / "run.mcap.partial").write_bytes(whole[: len(whole) // 2])
     build_view(torn, torn / "run.rrd")
-    assert 3 < len(rows_of(torn / "run.rrd")["/signals/xi"]["frame"]) < 20
+    assert 3 < len(View(torn / "run.rrd").rows["/signals/xi"]["frame"]) < 20
 
 
 def test_tensors_are_encoded_as_rerun_does():
@@ -304,26 +231,6 @@ def test_images_are_encoded_as_rerun_does():
     assert found.as_arrow_array().equals(theirs.as_arrow_array())
 
 
-def test_many_images_are_handed_over_in_pieces(monkeypatch):
-    """Of a few of them at once Rerun makes a view in half the time of very many."""
-    sent = []
-
-    def keep(self, times, values):
-        sent.append(([column.as_arrow_array().to_pylist() for column in times], values.copy()))
-
-    monkeypatch.setattr("replay.view.columns.Column.send", keep)
-    monkeypatch.setattr("replay.view.columns.MAX_BYTES", 3 * math.prod(IMAGE.frame_shape))
-    pixels = np.random.default_rng(0).integers(0, 256, (8, *IMAGE.frame_shape), np.uint8)
-    frames, iterations = np.arange(8) * 10, np.arange(8) // 2
-    with rr.RecordingStream("test") as recording:
-        column = image_column(recording, IMAGE, "world/watched")
-        column.add(frames, iterations, pixels)
-    assert [len(values) for _, values in sent] == [3, 3, 2]
-    np.testing.assert_array_equal(np.concatenate([values for _, values in sent]), pixels)
-    for place, expected in ((0, frames), (2, iterations)):
-        assert [t for times, _ in sent for t in times[place]] == expected.tolist()
-
-
 def test_private_names_of_rerun_are_taken_in_one_place():
     private = re.compile(r"\b(rerun_\w+|rerun\.experimental|rerun\._\w+|rrb?\.(\w+\.)*_\w+)\b")
     files = [file for room in ("view", "viewer") for file in (REPLAY / room).glob("*.py")]
@@ -340,24 +247,10 @@ def test_an_existing_view_is_kept_and_nothing_half_done_is_left(tmp_path):
     assert out.read_bytes() == b"mine"
     with pytest.raises(CdmisfaError, match="cannot be written"):
         build_view(tmp_path, tmp_path / "nowhere" / "run.rrd")
-    with pytest.raises(UsageError, match="does not exist"):
-        build_view(tmp_path / "nothing", tmp_path / "b.rrd")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
-
-
-def test_a_recording_has_a_view(tmp_path):
-    folder = tmp_path / "recording"
-    record_scene("oscillatory", folder, OscillatoryConfig(), frames=120)
-    build_view(folder, tmp_path / "r.rrd")
-    rows = rows_of(tmp_path / "r.rrd")
-    for name in ("1_x1", "2_x2", "3_x3"):
-        assert rows[f"/views/{name}"]["frame"] == list(range(120))
-    assert len(rows["/world/truth"]["frame"]) == 120
-
-
-def test_a_view_that_cannot_be_built_is_refused_with_the_reason(tmp_path):
-    write_run(tmp_path / "run.mcap", VECTOR, 2)
     with pytest.raises(UsageError, match=r"there is no folder .*nowhere$"):
         build_view(tmp_path, tmp_path / "nowhere" / "v.rrd")
+    with pytest.raises(UsageError, match="does not exist"):
+        build_view(tmp_path / "nothing", tmp_path / "b.rrd")
     with pytest.raises(UsageError, match="at least 1"):
-        build_view(tmp_path, tmp_path / "v.rrd", every=0)
+        build_view(tmp_path, tmp_path / "b.rrd", every=0)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import rerun as rr
 from run_data import IMAGE, block_of, having, run_of
-from test_view import rows_of
-from test_view_layout import Built
+from view_data import View
 
 from cdmisfa.core.modules import Module
 from recorder.config import RecordConfig
@@ -68,7 +67,7 @@ def shown(tmp_path_factory):
     writer.finish()
     save_modules(folder / "modules.npz", modules)
     build_view(folder, folder / "run.rrd", every=EVERY, all_views=recording)
-    return folder, records, rows_of(folder / "run.rrd")
+    return folder, records, View(folder / "run.rrd").rows
 
 
 def at(records, frame):
@@ -127,7 +126,7 @@ def test_axes_reach_to_the_end_of_the_run(shown):
     end = records[-1].t + TAU
     assert read_outline(folder).end == end
     assert rows["/attends"]["frame"][-1] == end
-    axes = {time["end"] for _, _, time, *_ in Built(folder / "run.rrd").views("TimeSeries")}
+    axes = {time["end"] for _, _, time, *_ in View(folder / "run.rrd").views("TimeSeries")}
     assert max(axes) >= end
     assert frame_at(folder, str(end - 1)) == end - 1
 

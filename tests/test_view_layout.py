@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import fnmatch
 import re
 from collections import defaultdict
 
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 from run_data import IMAGE, VECTOR, write_run
+from view_data import View
 
 from cdmisfa.core.errors import UsageError
 from recorder.recording import record_scene
@@ -24,69 +23,12 @@ from replay.view.layouts import WorldTab
 from replay.view.panels import run_layout
 
 ITERATIONS, TAU = 420, 40
-NOTHING = WorldTab()
 MIN_MAX = rr.components.AggregationPolicy.MinMax.value
 
 LEARNERS = {
     "2.0": {"algorithm": "2.0"},
     "progress": {"algorithm": "progress", "settled": 0.05, "agreement": 0.25},
 }
-
-
-class Built:
-    """A view as it stands in its file: rows and styles by entity, and its layout."""
-
-    def __init__(self, path):
-        reader = RrdReader(str(path))
-        self.rows, self.static = defaultdict(list), defaultdict(dict)
-        for chunk in reader.stream():
-            batch = chunk.to_record_batch()
-            if not chunk.is_static:
-                self.rows[chunk.entity_path].append(batch)
-                continue
-            for name in batch.schema.names:
-                self.static[chunk.entity_path][name] = batch.column(name).to_pylist()[-1]
-        self.layout = defaultdict(dict)
-        (store,) = reader.blueprints()
-        for chunk in reader.stream(store=store):
-            batch = chunk.to_record_batch()
-            for name in batch.schema.names:
-                if ":" in name:
-                    (value,) = batch.column(name).to_pylist()[-1][:1] or (None,)
-                    many = name in ("ViewContents:query", "ContainerBlueprint:contents")
-                    value = batch.column(name).to_pylist()[-1] if many else value
-                    self.layout[chunk.entity_path][name] = value
-
-    def views(self, kind):
-        """Name, entities, range of time and of values of the views of a class."""
-        found = []
-        for path, parts in list(self.layout.items()):
-            if parts.get("ViewBlueprint:class_identifier") == kind:
-                query = self.layout[f"{path}/ViewContents"]["ViewContents:query"]
-                origin = parts["ViewBlueprint:space_origin"]
-                wanted = [q.replace("$origin", origin).replace("**", "*") for q in query]
-                entities = [e for e in self.rows if any(fnmatch.fnmatchcase(e, w) for w in wanted)]
-                time = self.layout[f"{path}/TimeAxis"].get("TimeAxis:view_range")
-                values = self.layout[f"{path}/ScalarAxis"].get("ScalarAxis:range")
-                legend = self.layout[f"{path}/PlotLegend"].get("PlotLegend:visible")
-                name = parts["ViewBlueprint:display_name"]
-                found.append((name, entities, time, values, legend))
-        return found
-
-    def scalars(self, entity):
-        """All numbers of an entity that are numbers."""
-        batches = [b for b in self.rows[entity] if "Scalars:scalars" in b.schema.names]
-        parts = [np.asarray(b.column("Scalars:scalars").flatten(), float) for b in batches]
-        values = np.concatenate([np.empty(0), *parts])
-        return values[np.isfinite(values)]
-
-    def states(self, entity):
-        """The states of a lane in the order of time, with their frames."""
-        changes = []
-        for batch in self.rows[entity]:
-            states = [state[0] for state in batch.column("StateChange:state").to_pylist()]
-            changes += zip(batch.column("frame").to_pylist(), states, strict=True)
-        return sorted(changes)
 
 
 @pytest.fixture(scope="module", params=LEARNERS)
@@ -101,14 +43,12 @@ def built(request, tmp_path_factory):
     )
     assert (records[-1].saved, len(records[-1].y_frozen)) == (True, 2)
     build_view(folder, folder / "run.rrd")
-    return Built(folder / "run.rrd"), records, folder
+    return View(folder / "run.rrd"), records, folder
 
 
 def test_no_line_is_a_mean(built):
     view, *_ = built
-    drawn = [
-        e for e, rows in view.rows.items() if any("Scalars:scalars" in b.schema.names for b in rows)
-    ]
+    drawn = [e for e, columns in view.rows.items() if "Scalars:scalars" in columns]
     assert len(drawn) > 30
     marks = {e for e in drawn if "SeriesPoints:markers" in view.static[e]}
     for entity in set(drawn) - marks:
@@ -116,11 +56,12 @@ def test_no_line_is_a_mean(built):
     assert {e.rpartition("/")[2] for e in marks} == {"saved"}
 
 
-def test_a_recording_s_lines_are_no_means_either(tmp_path):
+def test_a_recording_has_every_frame_and_its_lines_are_no_means_either(tmp_path):
     record_scene("oscillatory", tmp_path / "r", OscillatoryConfig(), frames=50)
     build_view(tmp_path / "r", tmp_path / "r.rrd")
-    view = Built(tmp_path / "r.rrd")
-    for entity in ("/views/1_x1", "/world/truth"):
+    view = View(tmp_path / "r.rrd")
+    for entity in ("/views/1_x1", "/views/2_x2", "/views/3_x3", "/world/truth"):
+        assert view.rows[entity]["frame"] == list(range(50))
         assert view.static[entity]["SeriesLines:aggregation_policy"] == [MIN_MAX]
 
 
@@ -130,7 +71,7 @@ def test_axes_hold_what_is_drawn_and_leave_room_for_the_legend(built):
     for name, entities, time, values, legend in plots:
         assert entities, name
         if values is not None:
-            drawn = np.concatenate([view.scalars(e) for e in entities])
+            drawn = np.concatenate([view.numbers(e) for e in entities])
             assert values[0] <= drawn.min() <= drawn.max() <= values[1], name
             held += 1
         if time is not None and time["start"] == 0:
@@ -199,13 +140,13 @@ def test_many_modules_stand_on_pages(tmp_path):
 
     write_run(tmp_path / "run.mcap", VECTOR, 3)
     outline = dataclasses.replace(read_outline(tmp_path), modules=8)
-    layout = run_layout(outline, NOTHING, tab="modules")
+    layout = run_layout(outline, WorldTab(), tab="modules")
     tabs = layout.root_container.contents
     (modules,) = [tab for tab in tabs if tab.name == "Modules"]
     assert [page.name for page in modules.contents] == ["1 to 6", "7 to 8", "Events"]
     assert layout.root_container.active_tab == tabs.index(modules)
     with pytest.raises(UsageError, match=r"no tab 'nowhere': there are World, Overview, .*Table"):
-        run_layout(outline, NOTHING, tab="nowhere")
+        run_layout(outline, WorldTab(), tab="nowhere")
 
 
 def test_a_run_is_played_in_a_minute(built):
@@ -216,11 +157,9 @@ def test_a_run_is_played_in_a_minute(built):
 
 def test_the_picture_has_the_name_of_its_stream(built):
     view, records, _ = built
-    named = {}
-    for batch in view.rows["/world/watched/name"]:
-        labels = [text for (text,) in batch.column("Boxes2D:labels").to_pylist()]
-        named |= zip(batch.column("frame").to_pylist(), labels, strict=True)
-    stream = None
+    rows = view.rows["/world/watched/name"]
+    labels = [text for (text,) in rows["Boxes2D:labels"]]
+    named, stream = dict(zip(rows["frame"], labels, strict=True)), None
     for record in records:
         stream = named.get(record.t, stream)
         assert stream == IMAGE.streams[record.stream]

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
-from collections import defaultdict
 
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
 from conftest import Cdmisfa
-from rerun.chunk import RrdReader
 from run_data import IMAGE, VECTOR, parts_of, write_run
-from test_view_layout import Built
+from view_data import View, scalars, tabs_of, views_of
 
 from cdmisfa.core.signals import NO_STATE, SIGNALS
 from replay.runs.run import read_outline
-from replay.view import panels
 from replay.view.build import build_view
-from replay.view.layouts import WorldTab
-from replay.view.panels import run_layout
 from replay.view.summary import summary_text
 
 ITERATIONS = 30
@@ -63,24 +58,6 @@ def by_progress(signals):
     )
 
 
-def entities_of(path):
-    """Of each entity the batches of its rows, and the names of all entities."""
-    rows, names = defaultdict(list), set()
-    for chunk in RrdReader(str(path)).stream():
-        names.add(chunk.entity_path)
-        if not chunk.is_static:
-            rows[chunk.entity_path].append(chunk.to_record_batch())
-    return rows, names
-
-
-def column(rows, entity, name):
-    """A component of an entity in the order of frames, with the frames."""
-    frames = np.concatenate([batch.column("frame").to_numpy() for batch in rows[entity]])
-    values = [v for batch in rows[entity] for v in batch.column(name).to_pylist()]
-    order = np.argsort(frames, kind="stable")
-    return frames[order], [values[i][0] if values[i] else None for i in order]
-
-
 @pytest.fixture(scope="module", params=[IMAGE, VECTOR], ids=["images", "vectors"])
 def shown(request, tmp_path_factory):
     """The records of a run of the progress learner, its folder, and what its view holds."""
@@ -97,25 +74,24 @@ def shown(request, tmp_path_factory):
             edit=by_progress,
         )
         build_view(folder, folder / "run.rrd")
-    return records, folder, *entities_of(folder / "run.rrd")
+    return records, folder, View(folder / "run.rrd")
 
 
 def test_each_stream_has_a_lane_that_says_what_became_of_it(shown):
-    _, _, rows, _ = shown
-    expected = {
+    _, _, view = shown
+    told = {
         1: [(0, "learning"), (10, "learned")],
         2: [(0, "learning"), (10, "known by 1"), (22, "known by 2")],
         3: [(0, "learning"), (10, "given up"), (25, "learning")],
     }
-    for place, changes in expected.items():
-        (entity,) = [e for e in rows if e.startswith(f"/state/{place}_")]
-        frames, states = column(rows, entity, "StateChange:state")
-        assert frames.tolist() == [*(k * TAU for k, _ in changes), ITERATIONS * TAU]
-        assert states == [*(state for _, state in changes), ""]
+    for place, changes in told.items():
+        (entity,) = [e for e in view.rows if e.startswith(f"/state/{place}_")]
+        expected = [(k * TAU, state) for k, state in changes]
+        assert view.states(entity) == [*expected, (ITERATIONS * TAU, "")]
 
 
 def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
-    records, folder, rows, _ = shown
+    records, folder, view = shown
     names = read_outline(folder).names()
     for s, name in enumerate(names):
         own = [r for r in records if r.stream == s]
@@ -123,26 +99,26 @@ def test_each_stream_has_its_learning_error_where_it_was_watched(shown):
         assert 0 < tested.sum() < len(own) or s == 2
         for signal in ("learning_error", "tested", "fitted", "change"):
             entity = "log_change" if signal == "change" else signal
-            frames, found = column(rows, f"/streams/{entity}/{s + 1}_{name}", "Scalars:scalars")
-            assert frames.tolist() == [r.t for r in own]
+            rows = view.rows[f"/streams/{entity}/{s + 1}_{name}"]
+            assert rows["frame"] == [r.t for r in own]
             expected = np.where(tested, [getattr(r, signal) for r in own], np.nan)
             expected = np.log10(expected) if signal == "change" else expected
-            np.testing.assert_array_equal(np.array(found, dtype=float), expected)
-        _, found = column(rows, f"/streams/interest/{s + 1}_{name}", "Scalars:scalars")
+            np.testing.assert_array_equal(scalars(rows)[:, 0], expected)
+        found = view.numbers(f"/streams/interest/{s + 1}_{name}")
         np.testing.assert_array_equal(found, [r.interest[s] for r in records])
 
 
 def test_saves_and_thresholds_are_marked(shown):
-    records, _, rows, _ = shown
+    records, _, view = shown
     saved = [r for r in records if r.saved]
-    frames, stood = column(rows, "/streams/saved", "Scalars:scalars")
-    assert (frames.tolist(), stood) == ([r.t for r in saved], [r.learning_error for r in saved])
-    assert set(column(rows, "/streams/threshold", "Scalars:scalars")[1]) == {0.05 + 0.25}
-    assert set(column(rows, "/streams/settled", "Scalars:scalars")[1]) == {np.log10(0.05)}
+    assert view.rows["/streams/saved"]["frame"] == [r.t for r in saved]
+    assert view.numbers("/streams/saved").tolist() == [r.learning_error for r in saved]
+    assert set(view.numbers("/streams/threshold")) == {0.05 + 0.25}
+    assert set(view.numbers("/streams/settled")) == {np.log10(0.05)}
 
 
 def test_nothing_is_there_that_the_run_does_not_tell(shown):
-    _, _, _, names = shown
+    names = shown[-1].names
     of_2_0 = ("/policy/", "/gate/", "/decision/R", "/decision/Q", "/decision/adv", "/abstraction/d")
     of_2_0 += tuple(f"/signals/{name}" for name in (*UNTOLD, "R"))
     of_2_0 += ("/learns", "/novelty", "/mostly/novelty", "/does", "/explores", "/abstraction/s")
@@ -159,45 +135,23 @@ def test_what_2_0_tells_has_nothing_of_streams(tmp_path):
 
     write_run(tmp_path / "run.mcap", VECTOR, 12, edit=plain, learner={"algorithm": "2.0"})
     build_view(tmp_path, tmp_path / "run.rrd")
-    names = entities_of(tmp_path / "run.rrd")[1]
+    names = View(tmp_path / "run.rrd").names
     new = tuple(f"/signals/{name}" for name in (*missing, "interest", "state"))
     assert [n for n in names if n.startswith(("/streams", *new))] == []
     assert {"/signals/Q", "/signals/xi", "/novelty"} <= names
 
 
-def views_of(part):
-    """All views in a container, tabs too."""
-    if isinstance(part, rrb.View):
-        return [part]
-    return [view for inner in part.contents for view in views_of(inner)]
-
-
-def tabs_of(run, patch):
-    """Each tab of a run's layout."""
-    tabs = []
-    patch.setattr(panels, "blueprint", lambda *found, **_: tabs.extend(found))
-    run_layout(read_outline(run), WorldTab())
-    return {tab.name: tab for tab in tabs}
-
-
-def told(rows, statics, entity):
+def has_something(view, entity):
     """Whether an entity has anything to show."""
-    if entity not in rows:
-        return entity in statics and not entity.startswith(("/signals", "/streams"))
-    for batch in rows[entity]:
-        if "Scalars:scalars" not in batch.schema.names:
-            return True
-        values = np.array(batch.column("Scalars:scalars").flatten(), dtype=float)
-        if np.isfinite(values).any():
-            return True
-    return False
+    if entity not in view.rows:
+        return not entity.startswith(("/signals", "/streams"))
+    return "Scalars:scalars" not in view.rows[entity] or len(view.numbers(entity)) > 0
 
 
-def check_no_view_is_empty(run, patch):
+def check_no_view_is_empty(run):
     """Every view names entities that are there, each of them with something to show."""
-    rows, names = entities_of(run / "run.rrd")
-    checked = 0
-    for tab in tabs_of(run, patch).values():
+    shown, checked = View(run / "run.rrd"), 0
+    for tab in tabs_of(run).values():
         for view in views_of(tab):
             if isinstance(view, rrb.DataframeView):
                 query = view.properties["DataframeQuery"]
@@ -207,32 +161,28 @@ def check_no_view_is_empty(run, patch):
             else:
                 wanted = [view.origin]
             for entity in wanted:
-                found = [n for n in names if fnmatch.fnmatchcase(n, entity.replace("**", "*"))]
+                found = [
+                    n for n in shown.names if fnmatch.fnmatchcase(n, entity.replace("**", "*"))
+                ]
                 assert found, (tab.name, view.name, entity)
-                assert any(told(rows, names, n) for n in found), (tab.name, view.name, entity)
+                assert any(has_something(shown, n) for n in found), (tab.name, view.name, entity)
                 checked += 1
     return checked
 
 
-def test_the_gate_and_the_decision_have_no_tab(shown, monkeypatch):
-    _, folder, _, _ = shown
-    assert sorted(tabs_of(folder, monkeypatch)) == [
-        "Candidate",
-        "Modules",
-        "Overview",
-        "Table",
-        "World",
-    ]
+def test_the_gate_and_the_decision_have_no_tab(shown):
+    _, folder, _ = shown
+    assert list(tabs_of(folder)) == ["World", "Overview", "Candidate", "Modules", "Table"]
 
 
 @pytest.mark.parametrize("algorithm", ["2.0", "1.0", "progress"])
 def test_no_view_of_any_learner_is_empty(
-    algorithm, cdmisfa: Cdmisfa, tmp_path, monkeypatch, oscillatory_recording
+    algorithm, cdmisfa: Cdmisfa, tmp_path, oscillatory_recording
 ):
     run = tmp_path / "run"
     words = ["learn", oscillatory_recording, "--loop", "--algorithm", algorithm, "-o", run]
     assert cdmisfa(*words, "--max-iterations", 60).code == 0
-    assert check_no_view_is_empty(run, monkeypatch) > 25
+    assert check_no_view_is_empty(run) > 25
 
 
 def test_a_short_run_shows_its_weights_and_says_why_there_is_no_interest(
@@ -242,14 +192,14 @@ def test_a_short_run_shows_its_weights_and_says_why_there_is_no_interest(
     assert cdmisfa(*words, "--max-iterations", 8).code == 0
     *_, (t, phi) = parts_of(tmp_path / "run", "phi")
     assert (t, bool(phi.any())) == (7 * 40, True)
-    built = Built(tmp_path / "run" / "run.rrd")
-    assert max(n for b in built.rows["/abstraction/phi"] for n in b["frame"].to_pylist()) == t
-    titles = [name for name, *_ in built.views("TimeSeries")]
-    assert any(name.endswith("no line yet: none was watched long enough") for name in titles)
+    view = View(tmp_path / "run" / "run.rrd")
+    assert view.rows["/abstraction/phi"]["frame"][-1] == t
+    none = "no line yet: none was watched long enough"
+    assert any(name.endswith(none) for name in view.titles())
 
 
 def test_the_summary_says_what_became_of_each_stream(shown):
-    _, folder, _, _ = shown
+    _, folder, _ = shown
     first, second, third = read_outline(folder).names()
     events = [
         f"stream {first} is learned by module 1 after 9 blocks, slowness 0.0500",

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 from run_data import IMAGE, VECTOR, write_run
-from test_view import rows_of, scalars
+from view_data import View, scalars
 
 from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.config import section_table
@@ -46,19 +45,6 @@ def without_models(monkeypatch):
     monkeypatch.setitem(sys.modules, "icub_models", None)
 
 
-def layout_names(path):
-    """What the views and containers of a layout are called."""
-    reader = RrdReader(str(path))
-    (store,) = reader.blueprints()
-    names = []
-    for chunk in reader.stream(store=store):
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if name.endswith("Blueprint:display_name"):
-                names += [text for row in batch.column(name).to_pylist() for text in row]
-    return names
-
-
 @pytest.mark.parametrize("yaw", [45.0, 0.0, -20.0])
 def test_eyes_stand_where_those_of_the_simulator_stand(yaw):
     config = IcubConfig(eyes=dataclasses.replace(IcubConfig().eyes, yaw=(yaw,), views=("a",)))
@@ -77,7 +63,7 @@ def test_eyes_stand_where_those_of_the_simulator_stand(yaw):
 def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_watched(tmp_path):
     records = write_run(tmp_path / "run.mcap", SCENE, ITERATIONS, source=LIVE)
     build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
-    rows = rows_of(tmp_path / "run.rrd")
+    rows = View(tmp_path / "run.rrd").rows
     t = np.arange(0, ITERATIONS * TAU, EVERY)
     truth = np.sin(t[:, None] / 50 + np.arange(len(TRUTH)))
     for i, name in enumerate(("box", "cylinder", "ball")):
@@ -100,14 +86,14 @@ def test_objects_stand_where_the_world_knew_them_and_the_head_looks_at_what_is_w
         assert set(edges["LineStrips3D:colors"][i]) == {packed(colour(record.stream))}
         angle = 2 * math.acos(min(neck["Transform3D:quaternion"][i][0][3], 1.0))
         assert math.degrees(angle) == pytest.approx(abs(gaze.yaw), abs=0.1)
-    assert layout_names(tmp_path / "run.rrd").count("World") == 1
+    assert View(tmp_path / "run.rrd").titles().count("World") == 1
 
 
 def test_without_the_robots_models_there_is_the_rest_and_a_line_that_says_so(tmp_path, monkeypatch):
     without_models(monkeypatch)
     write_run(tmp_path / "run.mcap", SCENE, 3, source=LIVE)
     build_view(tmp_path, tmp_path / "run.rrd")
-    rows = rows_of(tmp_path / "run.rrd")
+    rows = View(tmp_path / "run.rrd").rows
     said = [text for (text,) in rows["/events"]["TextLog:text"]]
     assert "the robot's body is not shown: `pip install icub-models` for it" in said
     assert "/scene/box" in rows
@@ -143,14 +129,10 @@ def test_the_recording_says_what_stood_where(tmp_path):
 
 
 def test_what_was_learned_is_the_output_over_what_it_follows(tmp_path):
-    """Of a module whose stream is not watched after its save, it is what the module says.
-
-    A run that is too long to be kept is read again.
-    """
     records = write_run(tmp_path / "run.mcap", VECTOR, 30, saves=True)
     outline = read_outline(tmp_path)
     build_view(tmp_path, tmp_path / "run.rrd")
-    rows, names = rows_of(tmp_path / "run.rrd"), layout_names(tmp_path / "run.rrd")
+    rows, names = View(tmp_path / "run.rrd").rows, View(tmp_path / "run.rrd").titles()
     outputs = {o.module: o for o in read_outputs(tmp_path, outline, 6)}
     assert set(outputs) == {1, 2, 3}
     for number in (1, 2):
@@ -186,7 +168,7 @@ def test_a_module_that_said_nothing_later_is_asked_itself(tmp_path):
     modules = [dataclasses.replace(module, index=i) for i in (1, 2, 3)]
     save_modules(tmp_path / "modules.npz", modules)
     build_view(tmp_path, tmp_path / "run.rrd")
-    watched = rows_of(tmp_path / "run.rrd")["/world/watched"]
+    watched = View(tmp_path / "run.rrd").rows["/world/watched"]
     shown = dict(zip(watched["frame"], (v[0] for v in watched["Scalars:scalars"]), strict=True))
     *_, output = read_outputs(tmp_path, read_outline(tmp_path), 6)
     assert output.module == last.module
@@ -198,7 +180,7 @@ def test_streams_without_a_world_hang_on_a_wall(tmp_path, algorithm):
     learner = {"algorithm": algorithm, "settled": 0.05, "agreement": 0.25}
     records = write_run(tmp_path / "run.mcap", IMAGE, 15, saves=True, learner=learner)
     build_view(tmp_path, tmp_path / "run.rrd", every=EVERY)
-    rows = rows_of(tmp_path / "run.rrd")
+    rows = View(tmp_path / "run.rrd").rows
     height, width = IMAGE.frame_shape
     hang = places_of(3, width, height)
     for s, name in enumerate(IMAGE.streams):
@@ -239,7 +221,7 @@ def test_a_recording_shows_its_world(tmp_path, monkeypatch):
     without_models(monkeypatch)
     sample = Path(__file__).parents[1] / "sample_logs" / "icub"
     build_view(sample, tmp_path / "r.rrd", every=50)
-    rows = rows_of(tmp_path / "r.rrd")
+    rows = View(tmp_path / "r.rrd").rows
     with LogReader(sample / "left.mcap") as reader:
         truth = [entry.data for entry in reader.messages(["/truth"])]
     assert rows["/scene/ball"]["frame"] == list(range(0, len(truth), 50))
@@ -249,9 +231,8 @@ def test_a_recording_shows_its_world(tmp_path, monkeypatch):
         np.array([p for (p,) in rows["/scene/ball"]["Transform3D:translation"]]),
     )
     np.testing.assert_allclose(places[:, :2], known[:, [x, y]] * (1, -1), atol=1e-6)
-    assert {"World", "Views"} <= set(layout_names(tmp_path / "r.rrd"))
-    shown = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "r.rrd")).stream()}
-    assert not [entity for entity in shown if "watching" in entity]  # nothing is
+    assert {"World", "Views"} <= set(View(tmp_path / "r.rrd").titles())
+    assert not [entity for entity in View(tmp_path / "r.rrd").names if "watching" in entity]
     said = [text for (text,) in rows["/events"]["TextLog:text"]]
     assert any("icub-models" in text for text in said)
 
@@ -263,7 +244,7 @@ def test_views_without_the_robot_s_body_are_small(tmp_path):
         out = tmp_path / f"{body}.rrd"
         build_view(tmp_path, out, body=body)
         sizes.append(out.stat().st_size)
-        entities.append({c.entity_path for c in RrdReader(str(out)).stream()})
+        entities.append(View(out).names)
     assert sizes[0] - sizes[1] > 7_000_000
     assert {r"\/" in e for e in entities[0]} == {False}  # a part that was to be two
     assert {e.split("/")[2] for e in entities[0] - entities[1]} == {

@@ -198,10 +198,10 @@ def _matched(words: tuple[str, ...]) -> tuple[str, ...]:
     """Words with patterns as what matches them."""
     if not any(letter in word for word in words for letter in "*?["):
         return words
-    from replay.inputs import places
+    from replay.inputs import locations
     from replay.storage.location import Url
 
-    return tuple(p.address if isinstance(p, Url) else str(p) for p in places(words))
+    return tuple(p.address if isinstance(p, Url) else str(p) for p in locations(words))
 
 
 def _copy_of(ctx: click.Context, word: str) -> Path:

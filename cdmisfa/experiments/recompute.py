@@ -22,8 +22,13 @@ from cdmisfa.core.errors import (
 )
 from cdmisfa.core.learning import Keyframe, Learner, arithmetic_of
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.command import read_command, source_of
-from cdmisfa.experiments.resume import config_history, reconfigured, restore
+from cdmisfa.experiments.resume import (
+    config_history,
+    read_command,
+    reconfigured,
+    restore,
+    source_of,
+)
 from replay.runs.columns import SignalColumns, columns_of_records
 from replay.runs.compare import Difference, differing, first_differing
 from replay.runs.folders import run_log
@@ -360,16 +365,11 @@ def _first_element(
         return (), f"{a.dtype} of shape {a.shape}", f"{b.dtype} of shape {b.shape}"
     if a.tobytes() == b.tobytes():
         return None
-    if rounding and a.dtype.names:
+    if a.dtype.names:
         fields = (_first_element(a[name], b[name], rounding) for name in a.dtype.names)
         return next((found for found in fields if found is not None), None)
-    if rounding and a.dtype.kind == "f":
-        differ = differing(a, b, rounding).reshape(-1).tolist()
-    else:
-        pairs = zip(a.reshape(-1), b.reshape(-1), strict=True)
-        differ = [x.tobytes() != y.tobytes() for x, y in pairs]
-    if True not in differ:
+    differ = np.argwhere(differing(a, b, rounding))
+    if not len(differ):
         return None
-    i = differ.index(True)
-    place = tuple(int(n) for n in np.unravel_index(i, a.shape))
-    return place, repr(a.reshape(-1)[i].item()), repr(b.reshape(-1)[i].item())
+    place = tuple(differ[0].tolist())
+    return place, repr(a[place].item()), repr(b[place].item())

@@ -17,26 +17,30 @@ from cdmisfa.core.blocks import FrameSource, SeekableSource, description
 from cdmisfa.core.config import section_table
 from cdmisfa.core.errors import LogExhaustedError, LogWriteError, UsageError
 from cdmisfa.core.learning import ARITHMETIC, Keyframe, Learner, Sink, arithmetic_of
-from cdmisfa.experiments.command import COMMAND, SET_ASIDE, command_of, command_of_fork, source_of
 from cdmisfa.experiments.loop import Digest, Keyframes, learn
 from cdmisfa.experiments.recompute import Recomputation, check_run
 from cdmisfa.experiments.resume import (
+    COMMAND,
     FORK,
+    SET_ASIDE,
     changes,
+    command_of,
+    command_of_fork,
     continued,
     header_to_resume,
     refuse_difference,
     restore,
     restore_from,
+    source_of,
 )
 from cdmisfa.experiments.run_folder import (
     OpenLog,
     RunExhaustedError,
     RunResult,
     opened_log,
+    versions_used,
     write_results,
 )
-from cdmisfa.experiments.sources import versions_used
 from recorder.log.files import folder_here
 from replay.runs.folders import run_log
 from replay.runs.run import stated_source, states_whole
@@ -262,7 +266,8 @@ class Session:
             UsageError: the folder is not empty and is not to be replaced, or is in use.
             RunExhaustedError: a recording ended first; what was learned is saved.
         """
-        log, told = None, list[Sink]([digest := Digest()])
+        digest, log = Digest(), None
+        told: list[Sink] = [digest]
         with contextlib.ExitStack() as opened:
             if self.folder is not None:
                 log = opened.enter_context(
@@ -287,11 +292,7 @@ class Session:
                 told.append(opened.enter_context(view))
                 announce(view.address)
             if log is not None and self.before is not None:
-                if self._resumed:
-                    self.before = log.path.parent / SET_ASIDE
-                self._copy_log(log, self.before, digest)
-                if self._resumed:
-                    remove(self.before)
+                self._copy_log(log, digest)
                 if live:
                     view.earlier(log.path.parent)
             ended, exhausted = "log_exhausted", None
@@ -299,18 +300,8 @@ class Session:
                 ended = learn(self.source, self.learner, (*told, *sinks), stop=stop, **self._limits)
             except LogExhaustedError as error:
                 exhausted = error
-            result = RunResult(
-                run=str(self.folder) if self.folder is not None else None,
-                source=description(self.source, told=hashing),
-                streams=self.source.spec.streams,
-                seed=self.manifest["seed"],
-                iterations=self.learner.iteration,
-                frames=self.learner.iteration * self.learner.tau,
-                signals_sha256=digest.hexdigest(),
-                modules=tuple(self.learner.modules),
-                summary=self.learner.summary(),
-                ended=ended,
-            )
+            described = description(self.source, told=hashing)
+            result = self._result(described, digest.hexdigest(), ended)
             if log is not None:
                 stated = {**self.manifest, "versions": self._versions}
                 write_results(log, result, stated, view=rerun)
@@ -318,8 +309,25 @@ class Session:
             raise RunExhaustedError(exhausted, result) from exhausted
         return result
 
-    def _copy_log(self, log: RunWriter, before: Path, digest: Digest) -> None:
-        """Write what is kept of another log of the run, or its parent's; hash its signals."""
+    def _result(self, described: Mapping[str, Any], signals_sha256: str, ended: str) -> RunResult:
+        learner = self.learner
+        return RunResult(
+            run=str(self.folder) if self.folder is not None else None,
+            source=described,
+            streams=self.source.spec.streams,
+            seed=self.manifest["seed"],
+            iterations=learner.iteration,
+            frames=learner.iteration * learner.tau,
+            signals_sha256=signals_sha256,
+            modules=tuple(learner.modules),
+            summary=learner.summary(),
+            ended=ended,
+        )
+
+    def _copy_log(self, log: RunWriter, digest: Digest) -> None:
+        """Write what is kept of the log before, its own or its parent's; hash its signals."""
+        before = log.path.parent / SET_ASIDE if self._resumed else self.before
+        assert before is not None
         keyframe, self.keyframe = self.keyframe, None  # as large as what the learner holds
         if keyframe is not None:
             at, t, fork = keyframe.iteration, keyframe.t, self.manifest.get(FORK, {})
@@ -330,13 +338,22 @@ class Session:
                 changed = {k: (then.get(k), v) for k, v in now.items() if then.get(k) != v}
                 log.event(t, max(at - 1, 0), f"resumed at iteration {at}")
                 if changed:
-                    log.event(t, max(at - 1, 0), in_words(changed), "WARNING")
+                    log.event(t, max(at - 1, 0), "; ".join(_changes(changed)), "WARNING")
             else:
-                text = [f"fork of {fork['parent']} after {at} iterations"]
-                text += [in_words(fork["changed"])] if fork["changed"] else []
-                log.event(t, max(at - 1, 0), "; ".join(text))
+                text = f"fork of {fork['parent']} after {at} iterations"
+                log.event(t, max(at - 1, 0), "; ".join([text, *_changes(fork["changed"])]))
                 log.keyframe(keyframe, again=True)
         log.sync()
+        if self._resumed:
+            try:
+                before.unlink()
+            except OSError as error:
+                raise LogWriteError(f"{before} cannot be removed: {error.strerror}") from error
+
+
+def _changes(changed: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Values before and now, by name, in words."""
+    return [f"{name} is {now}, was {before}" for name, (before, now) in changed.items()]
 
 
 def run(
@@ -370,20 +387,3 @@ def run(
     else:
         session = Session(source, config, folder, force=force, **told)
     return session.learn(**how)
-
-
-def remove(log: Path) -> None:
-    """Remove a log that is not needed any more.
-
-    Raises:
-        LogWriteError: the disk does not let it go.
-    """
-    try:
-        log.unlink()
-    except OSError as error:
-        raise LogWriteError(f"{log} cannot be removed: {error.strerror}") from error
-
-
-def in_words(changed: Mapping[str, Sequence[Any]]) -> str:
-    """Values before and now, by name."""
-    return "; ".join(f"{name} is {now}, was {before}" for name, (before, now) in changed.items())

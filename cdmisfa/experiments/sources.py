@@ -6,20 +6,23 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
 from cdmisfa.core.config import LearnerConfig, build, load_preset, parse_settings, section_table
 from cdmisfa.core.errors import UsageError, are_for
 from cdmisfa.core.registry import did_you_mean
-from cdmisfa.experiments.documents import versions
 from recorder.cameras.options import LiveOptions
-from recorder.cameras.words import PACKAGES, is_live, open_live
-from recorder.config import RecordConfig, SceneConfig
+from recorder.cameras.words import is_live, open_live
+from recorder.config import RecordConfig, SceneConfig, view_names
 from recorder.images.options import ImageOptions
-from recorder.world.scenes import SCENES, open_scene, scene_of
+from recorder.recording import ViewRecording, record
+from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
+
+if TYPE_CHECKING:
+    from replay.camera_logs.source import ForeignSource
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""
@@ -213,25 +216,6 @@ def streams_of(described: Mapping[str, Any]) -> str:
     return "" if scene in SCENES else scene or str(described["kind"])
 
 
-def versions_used(
-    config: Any, source: FrameSource, described: Mapping[str, Any] | None = None
-) -> dict[str, str]:
-    """Versions of the packages that a run depends on, those of its plugins, too.
-
-    Args:
-        config: of the learner.
-        source: what it learns from.
-        described: what the source says of itself, where it may be of cameras.
-    """
-    scene = scene_of(source)
-    return {
-        **versions(),
-        **LEARNERS.versions(config.algorithm),
-        **(SCENES.versions(scene.name) if scene is not None else {}),
-        **(described or {}).get(PACKAGES, {}),
-    }
-
-
 def open_source(
     words: Sequence[str | Path],
     *,
@@ -321,7 +305,7 @@ def open_logs(
     scene = next((word for word in words if word in SCENES), None)
     if scene is not None and not Path(scene).exists():
         raise UsageError(f"{scene} is a scene, of which only one can be named, and nothing beside")
-    from replay.inputs import open_log, places
+    from replay.inputs import locations, open_log
     from replay.storage.location import Url
 
     if live := [str(word) for word in words if is_live(str(word))]:
@@ -329,7 +313,7 @@ def open_logs(
             f"{live[0]} is a live stream, which cannot go back: record it first, with cdmisfa "
             f"record {shlex.join(live)} -o REC"
         )
-    paths = places(words)
+    paths = locations(words)
     for path in paths:
         if not isinstance(path, Url) and not path.exists() and follow is None:
             raise UsageError(
@@ -389,3 +373,24 @@ def open_cameras_now(
         source.close()
         raise
     return source, configuration
+
+
+def convert(source: ForeignSource, folder: Path, **options: Any) -> list[ViewRecording]:
+    """Write every stream of a source as a view of a recording.
+
+    The recording has the source's frames at its times and rate; the logs they came from, with
+    their checksums and how images became frames, stand in its config.json.
+
+    Args:
+        source: does not loop; left open.
+        folder: made if it does not exist.
+        options: those of `record`.
+
+    Raises:
+        UsageError: the source loops, its images are too small, or as for `record`.
+        LogDamagedError: an image cannot be read.
+        LogWriteError: the disk does not take it.
+    """
+    if source.spec.length is None:
+        raise UsageError("a source that loops has no end: convert it without looping")
+    return record(source, folder, names=view_names(source.spec.streams), **options)

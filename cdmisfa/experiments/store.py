@@ -46,7 +46,7 @@ def code(*more: str) -> str:
     return f"{metadata.version('cdmisfa')}+{digest.hexdigest()[:12]}"
 
 
-def identity(*depends: Any) -> str:
+def trial_id(*depends: Any) -> str:
     """The name of a trial: a hash of what decides its result, as JSON values."""
     text = json.dumps(depends, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -34,8 +34,8 @@ from cdmisfa.experiments.store import (
     SweepReport,
     answer,
     code,
-    identity,
     run_trials,
+    trial_id,
 )
 from cdmisfa.experiments.trial import has_whole_trials, run_trial
 from recorder.log.files import atomic_write
@@ -183,7 +183,7 @@ def plan(
                 depends.append(used)
             if cameras != CameraOptions():
                 depends.append(dataclasses.asdict(cameras))
-            name = identity(depends, seed, recorded, [max_iterations, max_modules], code())
+            name = trial_id(depends, seed, recorded, [max_iterations, max_modules], code())
             trial = SweepTrial(
                 id=name,
                 source=paths,

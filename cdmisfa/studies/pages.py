@@ -29,6 +29,10 @@ DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)))
 """Lines that stay apart where they lie on each other; one for each stream."""
 
 
+Curves = Sequence[NDArray[Any]]
+"""A signal over iterations, (N, ...) a trial."""
+
+
 class Page:
     """A Markdown page, with a folder of its name beside it for its pictures.
 
@@ -62,13 +66,13 @@ class Page:
 
 
 def new_figure(
-    rows: int, columns: int, width: float, height: float, **subplots: Any
+    rows: int, columns: int, width: float = 3.4, height: float = 2.4, **subplots: Any
 ) -> tuple[Figure, Any]:
-    """A figure of so many inches, and its (rows, columns) axes."""
+    """A figure of panels of so many inches, and its (rows, columns) axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, squeeze=False, **subplots)
 
@@ -94,7 +98,7 @@ def letter_panel(axes: Axes, letter: str, x: str, y: str) -> None:
     axes.tick_params(labelsize=7)
 
 
-def stack(curves: Sequence[NDArray[Any]]) -> FloatArray:
+def stack(curves: Curves) -> FloatArray:
     """Curves of different lengths as one array (trials, longest, ...), NaN after their ends."""
     longest = max(len(c) for c in curves)
     out = np.full((len(curves), longest, *curves[0].shape[1:]), np.nan)
@@ -138,3 +142,73 @@ def stay_to_switch(axes: Axes) -> None:
     """Name the two ends of a policy's axis."""
     axes.set_ylim(-0.07, 1.07)
     axes.set_yticks([0, 1], ["stay", "switch"])
+
+
+def draw_eta_dot(axes: Axes, curves: Curves, delta: float, letter: str) -> None:
+    """Derivative of slowness, (N, J) a trial: each, their mean dashed, and delta."""
+    stacked = stack([np.max(curve, axis=-1) for curve in curves])
+    for row in stacked:
+        axes.plot(row, color=COLOURS[0], alpha=0.25, linewidth=0.5)
+    axes.plot(mean_sd(stacked)[0], color="black", linestyle="--", linewidth=0.9, label="mean")
+    axes.axhline(delta, color=COLOURS[1], linewidth=0.8, label=r"$\delta$")
+    axes.set_yscale("log")
+    axes.legend(fontsize=6)
+    letter_panel(axes, letter, "iteration", r"$|\dot\eta|$")
+
+
+def draw_rewards(axes: Axes, curves: Curves, letter: str, y: str) -> None:
+    """R of the stay entries, (N, S) a trial: each, and the mean."""
+    stacked = stack(curves)
+    mean, _ = mean_sd(stacked)
+    for s in range(stacked.shape[2]):
+        for row in stacked[:, :, s]:
+            axes.plot(row, color=COLOURS[s], alpha=0.25, linewidth=0.4)
+        axes.plot(mean[:, s], color=COLOURS[s], linewidth=1.0, label=STREAM_NAMES[s])
+    _finish_curves(axes, stacked, letter, y)
+
+
+def draw_value_gains(axes: Axes, curves: Curves, letter: str) -> None:
+    """By how much staying is worth more than switching, of Q (N, S, 2) a trial: mean and SD."""
+    stacked = stack([curve[:, :, 0] - curve[:, :, 1] for curve in curves])
+    mean, sd = mean_sd(stacked)
+    for s in range(stacked.shape[2]):
+        draw_band(axes, np.arange(len(mean)), mean[:, s], sd[:, s], COLOURS[s])
+        axes.plot(mean[:, s], color=COLOURS[s], linewidth=1.0, label=STREAM_NAMES[s])
+    _finish_curves(axes, stacked, letter, "Q(s, stay) - Q(s, switch)")
+
+
+def _finish_curves(axes: Axes, stacked: FloatArray, letter: str, y: str) -> None:
+    settled = stacked[:, 30:] if stacked.shape[1] > 60 else stacked
+    low, high = np.nanquantile(settled, 0.001), np.nanquantile(settled, 0.999)
+    if high > low:
+        axes.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
+    axes.legend(fontsize=6)
+    letter_panel(axes, letter, "iteration", y)
+
+
+def draw_policies(axes: Axes, curves: Curves, letter: str, y: str) -> None:
+    """Mean policy, of (N, S) a trial, a line a stream, and a band of one SD."""
+    mean, sd = mean_sd(stack(curves))
+    k = np.arange(len(mean))
+    for s in range(mean.shape[1]):
+        draw_band(axes, k, mean[:, s], sd[:, s], COLOURS[s], limits=(0, 1), alpha=0.15)
+        axes.plot(
+            mean[:, s],
+            color=COLOURS[s],
+            linewidth=1.4 if s else 1.8,
+            linestyle=DASHES[s],
+            label=STREAM_NAMES[s],
+        )
+    axes.legend(fontsize=6)
+    letter_panel(axes, letter, "iteration", y)
+    stay_to_switch(axes)
+
+
+def draw_policy_bars(axes: Axes, words: Sequence[str], letter: str, title: str) -> None:
+    """Share of trials whose policy, as "011", leaves each stream: 0 all stay, 1 all switch."""
+    for s, height in enumerate(np.mean([[*map(int, word)] for word in words], axis=0)):
+        axes.bar(s, height, color=COLOURS[s], width=0.7)
+        axes.plot([s - 0.35, s + 0.35], [height, height], color=COLOURS[s], linewidth=2)
+    axes.set_xticks(range(len(words[0])), STREAM_NAMES)
+    stay_to_switch(axes)
+    letter_panel(axes, letter, title, "policy, mean over trials")

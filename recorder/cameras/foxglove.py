@@ -19,8 +19,8 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.video import Steady
-from recorder.images.decoding import MessageKind, Taken, decoder_of
-from recorder.images.messages import holds_distances
+from recorder.images.decoding import MessageKind, decoder_of
+from recorder.images.messages import Decoder, holds_distances
 from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
 from recorder.images.videos import VideoPackets
@@ -137,10 +137,10 @@ class FoxgloveCamera:
         """The server and the topic."""
         return {"camera": f"{self._where}{self._topic}"}
 
-    def _find(self, connection: Any) -> tuple[int, MessageKind, Taken]:
+    def _find(self, connection: Any) -> tuple[int, MessageKind, Decoder]:
         """The channel of the topic, waited for, of what kind it is, and its decoder."""
         channels: dict[str, Mapping[str, Any]] = {}
-        images: dict[str, Taken] = {}
+        images: dict[str, Decoder] = {}
         said = False
         end = time.monotonic() + TOPIC_SECONDS
         while (left := end - time.monotonic()) > 0:
@@ -170,7 +170,7 @@ class FoxgloveCamera:
         remedy = f"; name one as {self._where}/TOPIC" if images else ""
         raise CdmisfaError(f"{self._lacking(images)}{remedy}")
 
-    def _lacking(self, images: Mapping[str, Taken]) -> str:
+    def _lacking(self, images: Mapping[str, Decoder]) -> str:
         """Message for a missing topic, with what the server has instead."""
         wanted = "messages with fields" if self._reading.fields else "images"
         known = ", ".join(sorted(images)) or "nothing"

@@ -1,4 +1,4 @@
-"""Streams of images on one clock: which image of each a frame shows, by their times alone."""
+"""Streams on one clock: which image of each a frame shows, by their times alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Rows = NDArray[np.int64]
 
 
 def counts(times: Times, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
-    """Images of a stream, frames that show one again, and images that no frame shows.
+    """Counts of a stream's images, of frames that repeat one, and of images in no frame.
 
     Frames within gaps, which are left out, are not counted.
     """
@@ -84,13 +84,13 @@ def overlap(streams: Sequence[Times]) -> tuple[int, int]:
 
 
 def of_other_rate(times: Times, fps: float) -> bool:
-    """Whether images tell a rate, and another one, by more than a hundredth."""
+    """Whether a stream has a rate that differs from another by more than a hundredth."""
     step = step_of(times)
     return step > 0 and abs(step * fps - 1) > _UNEVEN
 
 
 def unlike(first: Times, times: Times) -> str:
-    """Why the i-th images of two streams were not taken together, in words; "" if they were.
+    """Why the i-th images of two streams do not belong together, in words; "" if they do.
 
     They may be apart by half a step of the first stream.
     """
@@ -98,11 +98,6 @@ def unlike(first: Times, times: Times) -> str:
         return f"{len(first)} and {len(times)} images"
     apart = np.abs(times.astype(np.int64) - first.astype(np.int64)).max()
     return "images at different times" if apart > NANOSECONDS * step_of(first) / 2 else ""
-
-
-def by_index(streams: Sequence[Times]) -> list[Rows]:
-    """Show the i-th image of every stream in frame i, up to the end of the shortest."""
-    return [np.arange(min(map(len, streams)))] * len(streams)
 
 
 def by_time(streams: Sequence[Times], start: int, stop: int, fps: float) -> list[Rows]:
@@ -147,11 +142,11 @@ def _lacks(times: Times) -> NDArray[np.float64]:
 
 
 def retimed(times: Times, rows: Rows, fps: float) -> str:
-    """How frames that show images by their number are of other times than these, in words.
+    """A warning if frames taken by number are not at the times of their images.
 
     Args:
         times: of the images, nanoseconds.
-        rows: which of them each frame shows, each at least once; see `with_gaps`.
+        rows: which of them each frame shows, each at least once; see `by_index`.
         fps: frames a second.
 
     Returns:
@@ -170,32 +165,31 @@ def retimed(times: Times, rows: Rows, fps: float) -> str:
     return f"its rate uneven ({lost} missing): {lasts:.6g} s of it become {become:.6g} s of frames"
 
 
-def with_gaps(rows: Sequence[Rows], first: Times, fps: float) -> tuple[list[Rows], list[Span]]:
-    """Put frames that show the last image again where all streams pause together.
+def by_index(streams: Sequence[Times], fps: float, *, gaps: bool) -> tuple[Rows, list[Span]]:
+    """Show the i-th image of every stream together, up to the end of the shortest.
 
     Args:
-        rows: which image of each stream each frame shows, the i-th each.
-        first: the times of the first stream.
+        streams: the times of each.
         fps: frames a second.
+        gaps: show the last image longer where the first stream, and so all, pause.
 
     Returns:
-        As `rows`, so long as the streams last by their times; and the frames put in.
+        Which image of each stream each frame shows, and the frames of gaps.
 
     Raises:
         UsageError: that makes more frames than anybody can want.
     """
-    count = len(rows[0])
-    begins = [int(i) for i in pauses(first) if i < count]
+    first, count = streams[0], min(map(len, streams))
+    begins = [int(i) for i in pauses(first) if i < count] if gaps else []
     ticks = np.ones(count, np.int64)
     for i in begins:
         ticks[i] = max(round(int(first[i] - first[i - 1]) * fps / NANOSECONDS), 2)
     frame = np.cumsum(ticks) - ticks[0]
-    gaps = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
+    found = [(int(frame[i - 1]) + 1, int(frame[i])) for i in begins]
     if count and frame[-1] > MAX_FRAMES:
-        said = f"it has {in_words(gaps, fps)}, {frame[-1] + 1} frames in all"
+        said = f"it has {gaps_in_words(found, fps)}, {frame[-1] + 1} frames in all"
         raise UsageError(f"{said}: choose a part without, with --from or --to")
-    shows = np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1
-    return [stream[shows] for stream in rows], gaps
+    return np.searchsorted(frame, np.arange(frame[-1] + 1), side="right") - 1, found
 
 
 def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Span]:
@@ -218,7 +212,7 @@ def gaps_by_time(times: Times, start: int, frames: int, fps: float) -> list[Span
     return found
 
 
-def in_words(gaps: Sequence[Span], fps: float) -> str:
+def gaps_in_words(gaps: Sequence[Span], fps: float) -> str:
     """How many gaps there are, how long the longest is, and when it begins."""
     start, stop = max(gaps, key=lambda gap: gap[1] - gap[0])
     many = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"

@@ -1,4 +1,4 @@
-"""Tables read by PyArrow; CSV as it is met, with other separators and words among numbers."""
+"""Tables read by PyArrow; CSV also with other separators, and words among numbers."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ _NUMBER: Final = r"^[ \t]*[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI
 
 
 class Words(NamedTuple):
-    """Words in a column of numbers: the first one's row, from 0, and text; all of it in words."""
+    """Words in a column of numbers: the row, from 0, and text of the first; and the warning."""
 
     row: int
     text: str
     said: str
 
 
-class Table(NamedTuple):
+class LoadedTable(NamedTuple):
     """A table in memory.
 
     Attributes:
@@ -70,7 +70,7 @@ class Table(NamedTuple):
     notes: Sequence[str]
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> LoadedTable:
     """Read a CSV or a Parquet file.
 
     Columns of CSV are separated by commas or, where the line of names has none, by semicolons or
@@ -88,7 +88,7 @@ def read_table(path: Path) -> Table:
         else:
             import pyarrow.parquet
 
-            table = Table(path, pyarrow.parquet.ParquetFile(path).read(), {}, [])
+            table = LoadedTable(path, pyarrow.parquet.ParquetFile(path).read(), {}, [])
         rows, names = table.columns.num_rows, table.columns.column_names
         if rows > max(MAX_ROWS, path.stat().st_size):
             raise LogDamagedError(f"{path}: {rows} rows are too many for its few bytes")
@@ -99,7 +99,7 @@ def read_table(path: Path) -> Table:
 
 
 def called(path: Path, row: int) -> str:
-    """What a row is called: the line of a CSV file, from 1; of others the row, from 0."""
+    """How warnings name a row: the line of a CSV file, from 1; of others the row, from 0."""
     return f"line {line_of(path, row)}" if path.suffix.lower() == ".csv" else f"row {row}"
 
 
@@ -131,7 +131,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             line = reader.line_num + 1
 
 
-def _read_csv(path: Path) -> Table:
+def _read_csv(path: Path) -> LoadedTable:
     import pyarrow
     from pyarrow import csv
 
@@ -168,11 +168,11 @@ def _read_csv(path: Path) -> Table:
             f"{path}: its first line, {names[:80]}, holds numbers, no names: "
             "write a line before it with the name of each column"
         )
-    return _with_numbers(Table(path, table, {}, notes), missing)
+    return _with_numbers(LoadedTable(path, table, {}, notes), missing)
 
 
 def _cut_line(path: Path, separator: str) -> str | None:
-    """What the user should know of a last line that was cut; None where lines are alike.
+    """A warning that the last line was cut; None where all lines have as many cells.
 
     Raises:
         UsageError: the file begins with a comment.
@@ -202,7 +202,7 @@ def _in_words(count: int) -> str:
 
 
 def _written(path: Path, head: str) -> tuple[str, str]:
-    """What separates the columns of a CSV file, and what the decimals of its numbers."""
+    """The separator and the decimal sign of a CSV file."""
     names, *lines = head.splitlines() or [""]
     separator = _separator(names)
     if separator == ",":
@@ -219,12 +219,12 @@ def _written(path: Path, head: str) -> tuple[str, str]:
 
 
 def _separator(names: str) -> str:
-    """What separates the columns, by the line of their names."""
+    """The separator, by the line of names."""
     bare = _QUOTED.sub("", names)
     return next((s for s in (",", ";", "\t") if s in bare), ",")
 
 
-def _with_numbers(table: Table, missing: Sequence[str]) -> Table:
+def _with_numbers(table: LoadedTable, missing: Sequence[str]) -> LoadedTable:
     """Turn the columns of a table into numbers that were taken for text for a few words."""
     import pyarrow
     import pyarrow.compute as compute

@@ -1,4 +1,4 @@
-"""Camera logs of any kind opened: which logs paths mean, of what kind they are, what is there."""
+"""Camera logs of any format: found by path, opened, and described."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from replay.camera_logs.lerobot import (
 )
 from replay.camera_logs.mcap_log import McapImages, mcap_topics
 from replay.camera_logs.pictures import PICTURES, VIDEOS, FolderImages, VideoImages, by_number
-from replay.camera_logs.selected import VideoMessages, by_stamps, joined
+from replay.camera_logs.selected import VideoMessages, by_stamps, join_by_time
 from replay.camera_logs.stream import ChannelFacts, ImageStream, NothingLoggedError, holds_none
 from replay.camera_logs.table import TABLES, TableNumbers, table_channels
 from replay.storage.identity import FilesIdentity, Identity, log_identity
@@ -58,7 +58,7 @@ def log_format(path: Location) -> Format:
 
 
 def only_foreign(path: Location) -> bool:
-    """Whether a path can be no recording of ours, by its kind."""
+    """Whether a path cannot be one of our recordings, by its format."""
     return log_format(path) not in ("mcap", "split")
 
 
@@ -139,7 +139,7 @@ def _open_parts(path: Path, topic: str | None, *, salvage: bool, reading: Readin
         if len(topics := sorted({part.topic for part in parts})) > 1:
             raise UsageError(f"{path}: name one --topic or more; it has {', '.join(topics)}")
         opened.pop_all()
-    return joined(path, parts, [f"{error}: left out" for error in empty])
+    return join_by_time(path, parts, [f"{error}: left out" for error in empty])
 
 
 def identity_of(path: Location, streams: Sequence[ImageStream]) -> Identity:
@@ -241,5 +241,5 @@ def named_streams(
 
 
 def fits_topic(name: str, topic: str) -> bool:
-    """Whether a topic is the one that is asked for, or of the pattern."""
+    """Whether a name is the topic that is asked for, or matches the pattern."""
     return name == topic or fnmatch.fnmatchcase(name, topic)

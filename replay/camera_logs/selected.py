@@ -99,7 +99,7 @@ def selected(stream: ImageStream, rows: IntArray, times: NDArray[np.uint64]) -> 
     return Selected([stream], np.zeros(len(rows), np.int32), rows, times)
 
 
-def joined(
+def join_by_time(
     path: Location, streams: Sequence[ImageStream], warnings: Sequence[str] = ()
 ) -> ImageStream:
     """The images on one topic of several logs, by their times, ties in the order of the logs."""
@@ -126,7 +126,7 @@ def join_parts(streams: Sequence[ImageStream]) -> list[ImageStream]:
             len(one.times) and len(two.times) and int(one.times[-1]) < int(two.times[0])
             for one, two in itertools.pairwise(ordered)
         )
-        found += [joined(ordered[0].path, ordered)] if follow else own
+        found += [join_by_time(ordered[0].path, ordered)] if follow else own
     return found if len(found) < len(streams) else list(streams)
 
 
@@ -291,7 +291,7 @@ class WholeImages(Selected):
             return True  # the image that would tell is broken
 
     def said(self) -> str | None:
-        """That images are broken, as far as they were met; None where none was."""
+        """A line that counts the broken images met so far; None if there were none."""
         if not self.broken:
             return None
         first = min(self.broken)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from cdmisfa.core.blocks import Block, SourceSpec, freeze
-from cdmisfa.core.clock import RECORDED_FPS
 from cdmisfa.core.errors import LogDamagedError, UsageError
 from cdmisfa.core.options import option_words
 from recorder.images.fields import rounded
@@ -24,7 +23,7 @@ from replay.camera_logs.alignment import (
     by_time,
     counts,
     gaps_by_time,
-    in_words,
+    gaps_in_words,
     known_times,
     missing,
     of_other_rate,
@@ -34,7 +33,6 @@ from replay.camera_logs.alignment import (
     retimed,
     step_of,
     unlike,
-    with_gaps,
 )
 from replay.camera_logs.opening import identity_of, image_logs, named_streams, open_images
 from replay.camera_logs.options import Align, CameraOptions
@@ -57,7 +55,7 @@ class UnequalError(UsageError):
 
 
 class ForeignSource(LoggedSource):
-    """What others logged, on one clock: images of cameras, gray and small, or numbers.
+    """Other people's logs on one clock: images of cameras, gray and small, or numbers.
 
     Args:
         paths: one log, or one log, video, table or folder of pictures a stream. Logs that follow
@@ -98,7 +96,11 @@ class ForeignSource(LoggedSource):
             LogDamagedError: a log is damaged.
         """
         self._options = options = CameraOptions(topics=tuple(topics), **chosen)
-        _check(options)
+        if options.stop is not None and not options.start < options.stop:
+            raise UsageError(
+                f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in "
+                "seconds after the first image: no image lies between them"
+            )
         self._files = image_logs([paths] if isinstance(paths, str | Path | Url) else paths)
         self._loop, self._salvage, self._goal = loop, salvage, goal
         self._streams: list[ImageStream] = []
@@ -159,7 +161,7 @@ class ForeignSource(LoggedSource):
         held = "no block reaches across" if self.gaps else "the last image is shown"
         for images, own in zip(self._streams, self._gaps, strict=True):
             if own:
-                said = in_words(own, self._fps)
+                said = gaps_in_words(own, self._fps)
                 yield f"{images.path}: {images.topic} has {said}: {held}"
         if self._options.align is not None:
             return
@@ -194,7 +196,7 @@ class ForeignSource(LoggedSource):
         }
 
     def plan(self) -> list[dict[str, Any]]:
-        """What would be read of each stream, as JSON values."""
+        """The plan of --dry-run: what would be read of each stream, as JSON values."""
         rows: list[dict[str, Any]] = []
         for name, images, times in zip(self._spec.streams, self._streams, self._times, strict=True):
             step = step_of(times)
@@ -207,12 +209,12 @@ class ForeignSource(LoggedSource):
         return rows
 
     def salvaged(self) -> list[str]:
-        """For each stream of which broken images were met a line that says so."""
+        """A line for each stream of which broken images were replaced so far."""
         whole = [s.said() for s in self._streams if isinstance(s, WholeImages)]
         return [line for line in whole if line is not None]
 
     def _changes_size(self, stream: int) -> bool | None:
-        """Whether a stream's images change their size, as far as that is known unread."""
+        """Whether a stream's images change their size; None where only decoding would tell."""
         if not self._spec.images:
             return False
         images, framing = self._streams[stream], self._framings[stream]
@@ -226,7 +228,7 @@ class ForeignSource(LoggedSource):
         return False
 
     def _chosen(self) -> dict[str, Any]:
-        """What of the options changed the frames, as JSON values."""
+        """The options that changed the frames, as JSON values."""
         options = self._options
         chosen: dict[str, Any] = {}
         if any(self._gaps):
@@ -311,16 +313,15 @@ class ForeignSource(LoggedSource):
             rows = by_time(self._times, start, stop, self._fps)
             gaps = [gaps_by_time(t, start, len(rows[0]), self._fps) for t in self._times]
             return start, rows, gaps
-        rows = by_index(self._times)
-        if align == "index" and len(rows) > 1:
-            return int(first[0]), rows, [[] for _ in rows]
-        self._refuse_unequal()
+        as_asked = align == "index" and len(self._times) > 1
+        if not as_asked:
+            self._refuse_unequal()
         try:
-            rows, shared = with_gaps(rows, first, self._fps)
+            shows, shared = by_index(self._times, self._fps, gaps=not as_asked)
         except UsageError as error:
             one = self._streams[0]
             raise UsageError(f"{one.path}: {one.topic}: {error}") from None
-        return int(first[0]), rows, [shared for _ in rows]
+        return int(first[0]), [shows] * len(self._times), [shared] * len(self._times)
 
     def _refuse_unequal(self) -> None:
         """Refuse streams that are not on one clock, or not of the rate asked for."""
@@ -366,17 +367,3 @@ class ForeignSource(LoggedSource):
         words += option_words(replace(self._options, topics=(), align=None, rate=None))
         words += ["--align", align, "--rate", f"{self._fps:g}"]
         return shlex.join([*words, "-o", self._goal[1]])
-
-
-def _check(options: CameraOptions) -> None:
-    """Refuse what no log can be read with."""
-    slowest, fastest = RECORDED_FPS
-    if options.rate is not None and not slowest <= options.rate <= fastest:
-        raise UsageError(f"--rate is {options.rate}: it must be in [{slowest:g}, {fastest:.0f}]")
-    if options.size is not None and min(options.size) < 1:
-        raise UsageError(f"--size is {options.size[1]}x{options.size[0]}: it must be above 0")
-    if options.stop is not None and not options.start < options.stop:
-        raise UsageError(
-            f"--from {options.start:g} is no earlier than --to {options.stop:g}, both in seconds "
-            "after the first image: no image lies between them"
-        )

@@ -1,4 +1,4 @@
-"""Tables of numbers, CSV or Parquet, as a stream: a row is what an image is elsewhere."""
+"""Tables of numbers, CSV or Parquet, as streams: each row is a frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cdmisfa.core.errors import LogDamagedError, UsageError
 from recorder.images.fields import EXACT, NUMBERS_RECIPE, Field, bounded
 from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
-from replay.camera_logs.csv_table import Table, called, read_table
+from replay.camera_logs.csv_table import LoadedTable, called, read_table
 from replay.camera_logs.stream import (
     LAST_NS,
     ChannelFacts,
@@ -127,7 +127,7 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 
 
 def table_notes(path: Path) -> list[str]:
-    """What the user should know of a table; raises as `TableNumbers`, and where it was cut."""
+    """What `verify` says of a table; raises as `TableNumbers`, and where it was cut."""
     table = read_table(path)
     if table.notes:
         raise LogDamagedError(table.notes[0])
@@ -138,7 +138,7 @@ def table_notes(path: Path) -> list[str]:
     ]
 
 
-def _numeric(table: Table, of_times: str) -> tuple[str, ...]:
+def _numeric(table: LoadedTable, of_times: str) -> tuple[str, ...]:
     """The columns of numbers but that of the times; refuses a table without."""
     columns = table.columns
     found = [name for name in columns.column_names if _is_numeric(columns[name])]
@@ -150,13 +150,13 @@ def _numeric(table: Table, of_times: str) -> tuple[str, ...]:
 
 
 def _said_of_columns(
-    table: Table,
+    table: LoadedTable,
     used: Collection[str],
     columns: Mapping[str, FloatArray],
     whole: NDArray[np.bool_],
     reading: Reading,
 ) -> Iterator[str]:
-    """What the user should know of the columns that are used, of their rows that are whole."""
+    """Warnings about the columns that are used."""
     yield from (words.said for name, words in table.words.items() if name in used)
     if not reading.fields:
         for name in table.columns.column_names:
@@ -168,8 +168,8 @@ def _said_of_columns(
             yield f"{name} holds whole numbers beyond 2^53, which are rounded to float64"
 
 
-def _has_digits(table: Table, name: str) -> bool:
-    """Whether the file may hold a field more exactly than float64 does."""
+def _has_digits(table: LoadedTable, name: str) -> bool:
+    """Whether the file may hold a field in more digits than float64."""
     import pyarrow.types as kinds
 
     if table.path.suffix.lower() == ".csv":
@@ -181,8 +181,8 @@ def _has_digits(table: Table, name: str) -> bool:
     return not kinds.is_floating(kind)
 
 
-def _lacking(table: Table, columns: Mapping[str, FloatArray], row: int) -> str:
-    """What a row lacks, in words."""
+def _lacking(table: LoadedTable, columns: Mapping[str, FloatArray], row: int) -> str:
+    """Why a row is left out, in words."""
     for name, numbers in columns.items():
         words = table.words.get(name)
         if words is not None and words.row == row:
@@ -205,7 +205,7 @@ def _is_empty(column: Any) -> bool:
     return bool(column.null_count == len(column))
 
 
-def _column(table: Table, name: str) -> FloatArray:
+def _column(table: LoadedTable, name: str) -> FloatArray:
     """The numbers of a field in each row, (n, I) float64; NaN where there is none.
 
     Raises:
@@ -245,8 +245,8 @@ def _floats(column: Any) -> FloatArray:
     return found
 
 
-def _times(table: Table, named: str | None) -> tuple[IntArray | None, str]:
-    """When each row was, nanoseconds, -1 where that is missing; and the name of the column."""
+def _times(table: LoadedTable, named: str | None) -> tuple[IntArray | None, str]:
+    """The time of each row, nanoseconds, -1 where it is missing; and the name of the column."""
     if named is None:
         return None, ""
     path, names = table.path, table.columns.column_names

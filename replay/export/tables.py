@@ -26,6 +26,9 @@ from recorder.log.files import atomic_write, refuse_taken
 from replay.runs.columns import padded, whole_signals
 from replay.runs.log import RunHeader, read_columns, read_header
 
+TABLES = ("csv", "parquet", "npz", "arrow")
+"""What a run's signals can be written as."""
+
 CSV_LEAVES_OUT = tuple(s.name for s in SIGNALS.values() if "T" in s.dims)
 """Signals of every frame, for which a row an iteration has no room."""
 
@@ -48,8 +51,10 @@ def export_signals(run: Path, out: Path, form: str, *, force: bool = False) -> i
     if form == "csv":
         refuse_taken(notes, force=force)
     with atomic_write(out) as partial:
+        if form == "npz":
+            return _write_npz(run, header, partial)
         if form != "csv":
-            return _WRITERS[form](run, header, partial)
+            return _write_batches(run, header, partial, form)
         with atomic_write(notes) as about:
             columns, rows = _write_csv(run, header, partial)
             about.write_text(json.dumps(_notes(out, header, columns), indent=1), "utf-8")
@@ -90,22 +95,17 @@ def _nested(values: NDArray[Any]) -> pa.Array:
     return array
 
 
-def _write_parquet(run: Path, header: RunHeader, out: Path) -> int:
-    with pq.ParquetWriter(out, _arrow_schema(header), compression="zstd") as writer:
-        return _write_batches(run, header, writer)
-
-
-def _write_arrow(run: Path, header: RunHeader, out: Path) -> int:
-    with pa.OSFile(str(out), "wb") as file, pa.ipc.new_file(file, _arrow_schema(header)) as writer:
-        return _write_batches(run, header, writer)
-
-
-def _write_batches(run: Path, header: RunHeader, writer: Any) -> int:
+def _write_batches(run: Path, header: RunHeader, out: Path, form: str) -> int:
     rows, schema = 0, _arrow_schema(header)
-    for piece in read_columns(run, header):
-        arrays = [_nested(piece[name]) for name in SIGNALS]
-        writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
-        rows += len(piece)
+    if form == "parquet":
+        writer = pq.ParquetWriter(out, schema, compression="zstd")
+    else:
+        writer = pa.ipc.new_file(str(out), schema)
+    with writer:
+        for piece in read_columns(run, header):
+            arrays = [_nested(piece[name]) for name in SIGNALS]
+            writer.write_batch(pa.RecordBatch.from_arrays(arrays, schema=schema))
+            rows += len(piece)
     return rows
 
 
@@ -116,12 +116,6 @@ def _write_npz(run: Path, header: RunHeader, out: Path) -> int:
     with open(out, "wb") as file:
         np.savez_compressed(file, **arrays, **notes)  # type: ignore[arg-type]
     return len(arrays["iteration"])
-
-
-_WRITERS = {"parquet": _write_parquet, "npz": _write_npz, "arrow": _write_arrow}
-
-TABLES = ("csv", *_WRITERS)
-"""What a run's signals can be written as."""
 
 
 def _write_csv(run: Path, header: RunHeader, out: Path) -> tuple[list[tuple[str, Signal]], int]:

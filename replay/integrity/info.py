@@ -19,7 +19,7 @@ from recorder.mcap.reader import Check, LogReader
 from recorder.mcap.records import Channel, MalformedRecord, Problem, Segment
 from recorder.mcap.tables import MessageTable
 from replay.camera_logs.opening import channels_of, only_foreign
-from replay.inputs import places
+from replay.inputs import locations
 from replay.runs.codec import missing_signals
 from replay.runs.folders import RUN_FILE, RUN_METADATA, read_run_json
 from replay.runs.log import record_version
@@ -121,7 +121,7 @@ def describe(*words: str | Location) -> LogInfo:
         UsageError: no such log.
         LogDamagedError: not an MCAP file, or a camera log that cannot be read.
     """
-    named = places(words)
+    named = locations(words)
     files = [found for place in named for found in _describe_place(place)]
     kinds, states = {f.kind for f in files}, {f.crc for f in files}
     worst: tuple[Crc, ...] = ("bad", "unchecked", "absent", "ok")

@@ -1,4 +1,4 @@
-"""Plain arrays in files (.npz) and in bytes, of which nothing is believed."""
+"""Arrays in .npz files and in bytes, validated before they are used."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def stored_arrays(listed: Any, data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check_text(array: NDArray[Any]) -> None:
-    """Refuse text of what are no characters, which Python cannot take over."""
+    """Refuse text with code points that are no characters: Python cannot hold them."""
     for name in array.dtype.names or ("",):
         texts = np.ascontiguousarray(array[name] if name else array)
         if texts.dtype.kind == "U" and texts.nbytes:

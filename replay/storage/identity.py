@@ -33,7 +33,7 @@ Told = Callable[[int, int], None]
 
 
 class Identity(ABC):
-    """What tells a log from others.
+    """What identifies a log.
 
     Attributes:
         path: of the log.
@@ -212,7 +212,7 @@ class _RemoteIdentity(Identity):
 
 
 class LoggedSource(StoredSource):
-    """Frames that logs keep, whose bytes tell it from others."""
+    """A source of frames in logs, identified by their bytes."""
 
     _identities: Sequence[Identity] | None = None
 

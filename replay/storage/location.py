@@ -130,13 +130,13 @@ _LIMITS: Final = ContextVar("limits", default=Limits())  # noqa: B039 - it is fr
 
 
 def limits() -> Limits:
-    """Those that hold here."""
+    """The limits in force."""
     return _LIMITS.get()
 
 
 @contextlib.contextmanager
 def limited(chosen: Limits) -> Iterator[None]:
-    """Hold the servers that are connected to in the body to these limits."""
+    """Use these limits for the servers that are connected to in the body."""
     before = _LIMITS.set(chosen)
     try:
         yield

@@ -55,8 +55,8 @@ class UnreachableError(CdmisfaError):
     """A server that cannot be reached, or does not give parts of the log."""
 
 
-class Again(Exception):  # noqa: N818 - asks for another try
-    """What may go better the next time, after the seconds that the server asks for."""
+class RetryError(Exception):
+    """A fault that may pass: try again, after the seconds that the server asks for."""
 
     def __init__(self, reason: str = "", after: float = 0.0) -> None:
         super().__init__(reason)
@@ -85,11 +85,11 @@ class Server(ABC):
 
     @abstractmethod
     async def part(self, start: int, stop: int) -> Part:
-        """The bytes [start, stop), or up to the end; raises `Again` where it may go better."""
+        """The bytes [start, stop), fewer at the end; raises `RetryError` where a fault may pass."""
 
     def begin(self, start: int, stop: int) -> Future[Part]:
         """Ask for the bytes [start, stop), without waiting for them."""
-        asked = patiently(lambda: self.part(start, stop), self._limits.of(stop - start))
+        asked = with_retries(lambda: self.part(start, stop), self._limits.of(stop - start))
         return asyncio.run_coroutine_threadsafe(asked, self._files.loop)
 
     def wait(self, coming: Future[Part], count: int) -> Part:
@@ -138,9 +138,9 @@ class _HttpServer(Server):
         except aiohttp.ClientConnectorError as error:
             if not self._reached:  # a name that is wrong does not get better
                 raise
-            raise Again from error
+            raise RetryError from error
         except (aiohttp.ClientError, asyncio.IncompleteReadError, TimeoutError) as error:
-            raise Again from error
+            raise RetryError from error
 
 
 def _tag(headers: Any) -> str:
@@ -148,11 +148,11 @@ def _tag(headers: Any) -> str:
 
 
 def _stated(answer: Any, start: int, stop: int) -> tuple[int, int]:
-    """Total size, and bytes of the answer of a web server, which must be the part asked for."""
+    """Total size and number of bytes that the headers of a web server state, validated."""
     headers, status = answer.headers, answer.status
     said = f"the server answers {status} {answer.reason}"
     if _passing(status):
-        raise Again(said, asked_wait(headers.get("Retry-After", "")))
+        raise RetryError(said, retry_seconds(headers.get("Retry-After", "")))
     if status == 416 and _NOTHING.fullmatch(headers.get("Content-Range", "")):
         return 0, 0
     if status in (404, 410):
@@ -192,7 +192,7 @@ class _S3Server(Server):
         except Exception as error:
             if "InvalidRange" in f"{error} {error.__cause__!r}" and not start:
                 return Part(b"", 0, "")
-            _raise_again(error)
+            _raise_retry(error)
             raise
         return Part(bytes(data), total, answer.get("ETag", ""))
 
@@ -207,7 +207,7 @@ def connect(url: Url) -> Server:
 
 
 def s3_files() -> Any:
-    """What s3fs has for buckets; tries are counted and spread by `patiently` alone."""
+    """What s3fs has for buckets; tries are counted and spread by `with_retries` alone."""
     import fsspec
 
     seconds = limits().read
@@ -222,7 +222,7 @@ def s3_files() -> Any:
 
 
 def ask_s3(url: Url, ask: Callable[[Any], Awaitable[Value]], count: int = 0) -> Value:
-    """What is answered to a question about a bucket, asked again after a passing fault.
+    """Call s3fs about a bucket, again after a fault that may pass.
 
     Args:
         url: what the question is about, for messages.
@@ -240,10 +240,10 @@ def ask_s3(url: Url, ask: Callable[[Any], Awaitable[Value]], count: int = 0) -> 
         try:
             return await ask(files)
         except Exception as error:
-            _raise_again(error)
+            _raise_retry(error)
             raise
 
-    asked = asyncio.run_coroutine_threadsafe(patiently(once, seconds), files.loop)
+    asked = asyncio.run_coroutine_threadsafe(with_retries(once, seconds), files.loop)
     return _answer(url, asked, seconds)
 
 
@@ -256,12 +256,12 @@ def _importing(make: Callable[[], Value]) -> Value:
         ) from None
 
 
-async def patiently(ask: Callable[[], Awaitable[Value]], seconds: float) -> Value:
-    """Ask until there is an answer: up to `TRIES` times, and no longer than `seconds`.
+async def with_retries(ask: Callable[[], Awaitable[Value]], seconds: float) -> Value:
+    """Ask up to `TRIES` times, with waits between, and no longer than `seconds`.
 
     Raises:
         UnreachableError: there was none in time.
-        Again: the last try failed, too.
+        RetryError: the last try failed, too.
     """
     clock = asyncio.get_running_loop().time
     end = clock() + seconds
@@ -270,7 +270,7 @@ async def patiently(ask: Callable[[], Awaitable[Value]], seconds: float) -> Valu
             for attempt in range(TRIES - 1):
                 try:
                     return await ask()
-                except Again as error:
+                except RetryError as error:
                     wait = max(error.after, backoff(attempt))
                     if clock() + wait >= end:
                         if error.after < wait:
@@ -292,7 +292,7 @@ def backoff(attempt: int) -> float:
     return FIRST_WAIT * 2.0**attempt * _JITTER.uniform(0.5, 1.0)
 
 
-def asked_wait(retry_after: str) -> float:
+def retry_seconds(retry_after: str) -> float:
     """Seconds that a `Retry-After` header asks for: a number or a date; 0 where it is neither."""
     text = retry_after.strip()
     if text.isascii() and text.isdigit():
@@ -303,20 +303,20 @@ def asked_wait(retry_after: str) -> float:
 
 
 def _passing(status: int) -> bool:
-    """Whether what a server answers may go better the next time."""
+    """Whether a status is of a fault that may pass."""
     return status in (408, 429) or (status >= 500 and status != 501)
 
 
-def _raise_again(error: BaseException | None) -> None:
-    """Ask for another try after what may be a passing fault of an S3 server."""
+def _raise_retry(error: BaseException | None) -> None:
+    """Raise `RetryError` for an error of an S3 server that may pass."""
     while error is not None:
         facts = getattr(error, "response", None)
         said = facts.get("ResponseMetadata", {}) if isinstance(facts, dict) else {}
         if _passing(int(said.get("HTTPStatusCode", 0))):
-            wait = asked_wait(str(said.get("HTTPHeaders", {}).get("retry-after", "")))
-            raise Again(f"the server answers {said['HTTPStatusCode']}", wait) from error
+            wait = retry_seconds(str(said.get("HTTPHeaders", {}).get("retry-after", "")))
+            raise RetryError(f"the server answers {said['HTTPStatusCode']}", wait) from error
         if type(error).__name__ in _BROKEN_OFF:
-            raise Again from error
+            raise RetryError from error
         error = error.__cause__
 
 
@@ -332,7 +332,7 @@ def _range_of(text: str, start: int, stop: int) -> tuple[int, int]:
 
 
 def _answer(url: Url, coming: Future[Value], seconds: float) -> Value:
-    """What was asked for, or what the server has against us, in one line.
+    """The result of a request; an error becomes one line that names the URL.
 
     Raises:
         UsageError: there is no such object.
@@ -341,7 +341,7 @@ def _answer(url: Url, coming: Future[Value], seconds: float) -> Value:
     """
     try:
         return coming.result(seconds + _SPARE_SECONDS)
-    except Again as error:
+    except RetryError as error:
         kind, words = _refusal(error.__cause__ or error)
     except Exception as error:
         kind, words = _refusal(error)
@@ -350,7 +350,7 @@ def _answer(url: Url, coming: Future[Value], seconds: float) -> Value:
 
 
 def _refusal(error: BaseException) -> tuple[type[CdmisfaError], str]:
-    """What to raise instead of an error, and its words."""
+    """The class and the message of the error to raise for another one."""
     if isinstance(error, CdmisfaError):
         return type(error), str(error)
     if isinstance(error, FileNotFoundError):
@@ -360,7 +360,7 @@ def _refusal(error: BaseException) -> tuple[type[CdmisfaError], str]:
         return RemoteError, words
     if "Payload" in type(error).__name__:
         return RemoteError, "the server sent fewer bytes than it said, and went away"
-    if isinstance(error, Again):
+    if isinstance(error, RetryError):
         words = str(error)
     elif type(error).__name__ == "NoCredentialsError":
         words = (

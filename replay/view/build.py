@@ -32,7 +32,7 @@ from replay.view.columns import FRAME, MOST_STREAMS, frames_column, line_column
 from replay.view.labels import label, part
 from replay.view.layouts import blueprint, lines, time_axis
 from replay.view.panels import run_layout
-from replay.view.properties import APPLICATION, identity, properties_of, property_chunks
+from replay.view.properties import APPLICATION, properties_of, property_chunks, recording_id
 from replay.view.run import RunView
 from replay.view.scene import SceneView, gaze_view, scene_view, write_gaze, write_heads
 from replay.view.summary import summary_text
@@ -67,7 +67,7 @@ def build_view(
         tab: name of the tab that is open; by default the first.
         beside: more camera logs, or files of the recording.
         cameras: which streams of camera logs; by default all of images.
-        body: show the robot's, where there is one.
+        body: show the robot's body in a run's view.
 
     Raises:
         UsageError: there is no such run or recording, `every` is below 1, `out` exists and
@@ -133,7 +133,7 @@ def recording_to(
     refuse_taken(out, force=force)
     if not out.parent.is_dir():
         raise UsageError(f"{out} cannot be written: there is no folder {out.parent}")
-    recording = rr.RecordingStream(APPLICATION, recording_id=identity(name, source))
+    recording = rr.RecordingStream(APPLICATION, recording_id=recording_id(name, source))
     recording.set_log_time_enabled(False)
     with atomic_write(out) as partial:
         try:
@@ -217,19 +217,13 @@ def write_recording(
         first, count, spec = source.t, source.frames, source.spec
         ours = isinstance(source, RecordedSource)
         scenery = world_of_recording(paths[0]) if ours else None
-        scene = None if scenery is None else SceneView(recording, spec, scenery)
-        notes = [*source.warnings]
-        if scene is not None and (missing := scene.stand()) is not None:
-            notes.append(missing)
+        scene = None if scenery is None else SceneView(recording, spec, scenery, every)
+        notes = [*source.warnings, *(scene.notes if scene is not None else ())]
         write_views(recording, source, count, every, scene=scene)
         for note in notes:
             recording.set_time(FRAME, sequence=first)
             recording.log("events", rr.TextLog(label(note), level="WARN"))
-    properties: dict[str, Any] = {
-        "frames": count,
-        "streams": label(", ".join(spec.streams)),
-        "fps": spec.fps,
-    }
+    properties: Any = {"frames": count, "streams": label(", ".join(spec.streams)), "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))
     poses = {name: pose for p in paths for name, pose in head_poses(p).items()} if ours else {}
     head = write_heads(recording, spec.streams, poses)
@@ -257,9 +251,8 @@ def write_views(
     """
     first, spec = source.t, source.spec
     columns = [frames_column(recording, spec, view) for view in view_entities(spec)]
-    truth = None
-    if spec.truth and blocks is None:
-        truth = line_column(recording, spec, "world/truth", spec.truth, every_frame=True)
+    truth = line_column(recording, spec, "world/truth", spec.truth, every_frame=True)
+    has_truth = spec.truth and blocks is None
     for t in range(first, first + count, BLOCK):
         stop = min(t + BLOCK, first + count)
         for stream, column in enumerate(columns):
@@ -270,11 +263,11 @@ def write_views(
                 keep = frames % (every if spec.images else 1) == 0
                 iterations = None if blocks is None else blocks.iteration(frames[keep])
                 column.add(frames[keep], iterations, block.frames[keep])
-                if truth is not None and stream == 0:
+                if has_truth and stream == 0:
                     truth.add(frames, None, block.truth)
                 if scene is not None and stream == 0:
-                    scene.move(frames[keep], block.truth[keep])
-    for column in [*columns, *([truth] if truth is not None else [])]:
+                    scene.move(frames, block.truth)
+    for column in [*columns, truth]:
         column.flush()
     if scene is not None:
         scene.flush()

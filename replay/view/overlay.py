@@ -8,8 +8,8 @@ from pathlib import Path, PurePath
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
+from cdmisfa.core.arrays import FloatArray, IntArray
 from replay.palette import Rgb, colour
 from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
@@ -41,17 +41,14 @@ R_STAY = "R_stay"
 
 OF_STREAM, ERROR_OF = "learning_error_of", "Learning error of"
 
-Point = tuple[int, NDArray[np.float64]]
-"""An iteration, and the values of a curve there."""
-
 FORKED = "forked"
-"""Entities of the points where forks begin."""
-
-MARKER = 5.0
-"""Size of such a point."""
+"""Entities of the points from which on forks go their own way."""
 
 FIRST = 3
 """Streams of the first tab."""
+
+Curve = tuple[str, IntArray, FloatArray]
+"""Entity of a curve, which records it has values in, and these."""
 
 
 def build_overlay(
@@ -121,54 +118,42 @@ def _shortly(difference: Difference | None) -> str:
 
 
 def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number: int) -> None:
-    header = row.outline.header
+    header, rgb = row.outline.header, colour(number)
     shown = row.outline.streams(MOST_STREAMS)
     lines: dict[str, Column] = {}
-    fork, marked, last = row.outline.header.forked_at, set[str](), dict[str, Point]()
+    fork, marked = header.forked_at, set[str]()
     for columns in read_columns(run, header):
-        for entity, kept, values in _curves(columns, header.spec.streams, shown):
-            path, rows = f"{root}/{entity}", values.reshape(int(kept.sum()), -1)
-            if fork is not None and entity not in marked and len(rows):
-                at = columns.iterations[kept]
-                first = int(np.searchsorted(at, fork))
-                if first < len(at):
-                    before = (int(at[first - 1]), rows[first - 1]) if first else last.get(entity)
-                    there = _between(before, (int(at[first]), rows[first]), fork)
-                    place, color = f"{root}/{FORKED}/{entity}", colour(number)
-                    _mark(recording, place, row.name, color, *there)
-                    marked.add(entity)
-                last[entity] = int(at[-1]), rows[-1]
+        for entity, kept, found in _curves(columns, header.spec.streams, shown):
+            path, values = f"{root}/{entity}", found.reshape(len(kept), -1)
+            frames, iterations = columns.frames[kept], columns.iterations[kept]
             if path not in lines:
-                width = rows.shape[1]
-                names, rgbs = [row.name] * width, [colour(number)] * width
+                names, rgbs = [row.name] * values.shape[1], [rgb] * values.shape[1]
                 lines[path] = line_column(recording, header.spec, path, names, rgbs)
-            lines[path].add(columns.frames[kept], columns.iterations[kept], rows)
+            lines[path].add(frames, iterations, values)
+            if fork is not None and entity not in marked and iterations[-1] >= fork:
+                marked.add(entity)
+                first = int(np.searchsorted(iterations, fork))
+                place, name = f"{root}/{FORKED}/{entity}", f"fork {row.name}"
+                _mark(recording, place, name, rgb, int(iterations[first]), values[first])
     for line in lines.values():
         line.flush()
-
-
-def _between(before: Point | None, after: Point, iteration: int) -> Point:
-    """The point of a curve at an iteration, or the next one that there is."""
-    if before is None or iteration == after[0] or np.isnan(before[1]).any():
-        return after
-    share = (iteration - before[0]) / (after[0] - before[0])
-    return iteration, before[1] + share * (after[1] - before[1])
 
 
 def _mark(
     recording: rr.RecordingStream,
     path: str,
-    run: str,
+    name: str,
     rgb: Rgb,
     iteration: int,
-    values: NDArray[np.float64],
+    values: FloatArray,
 ) -> None:
-    """A point on a curve where a fork begins to differ from its parent."""
+    """A point on each of an entity's curves."""
+    count = len(values)
     style = rr.SeriesPoints(
-        names=[label(f"fork {run}")] * len(values),
-        colors=[rgb] * len(values),
-        markers=["diamond"] * len(values),
-        marker_sizes=[MARKER] * len(values),
+        names=[label(name)] * count,
+        colors=[rgb] * count,
+        markers=["diamond"] * count,
+        marker_sizes=[5.0] * count,
     )
     recording.log(path, style, static=True)
     recording.set_time(ITERATION, sequence=iteration)
@@ -176,19 +161,17 @@ def _mark(
     recording.reset_time()
 
 
-def _curves(
-    columns: SignalColumns, names: Sequence[str], shown: Sequence[int]
-) -> Iterator[tuple[str, NDArray[np.bool_], NDArray[np.float64]]]:
-    """Entity of every curve in some iterations, in which of them it has values, and these."""
-    every = np.ones(len(columns), dtype=bool)
+def _curves(columns: SignalColumns, names: Sequence[str], shown: Sequence[int]) -> Iterator[Curve]:
+    """Every curve in some iterations."""
+    every = np.arange(len(columns))
     for name in CURVES:
         values = columns[name].astype(np.float64)
         yield _entity(name), every, power_of_ten(values) if name in POWERS else values
     for s in shown:
         if columns["R"].size:
             yield f"{R_STAY}/{part(names, s)}", every, columns["R"][:, s, 0, s]
-        own = columns["stream"] == s
-        if own.any():
+        own = np.flatnonzero(columns["stream"] == s)
+        if len(own):
             untested = np.isnan(columns["tested"][own])
             error = np.where(untested, np.nan, columns["learning_error"][own])
             yield f"{OF_STREAM}/{part(names, s)}", own, error
@@ -200,42 +183,34 @@ def _entity(name: str) -> str:
 
 
 def _layout(rows: Sequence[Row], tab: str | None) -> rrb.Blueprint:
-    axis = time_axis(max(row.outline.iterations for row in rows))
-    outline, names = rows[0].outline, [row.name for row in rows]
+    length = max(row.outline.iterations for row in rows)
+    axis, outline, names = time_axis(length), rows[0].outline, [row.name for row in rows]
+    told = frozenset[str]().union(*(row.outline.told for row in rows))
     roots = [f"/compare/{part(names, i)}" for i in range(len(names))]
+    forks = [row.outline.header.forked_at is not None for row in rows]
+    roots += [f"{root}/{FORKED}" for root, fork in zip(roots, forks, strict=True) if fork]
 
     def panel(title: str, entity: str) -> rrb.View:
-        marks = [
-            f"{root}/{FORKED}/{entity}"
-            for root, row in zip(roots, rows, strict=True)
-            if row.outline.header.forked_at is not None
-        ]
-        return lines(title, [*(f"{root}/{entity}" for root in roots), *marks], axis)
-
-    told = frozenset[str]().union(*(row.outline.told for row in rows))
-    streams = outline.names()
+        return lines(title, [f"{root}/{entity}" for root in roots], axis)
 
     def by_stream(title: str, entity: str, most: int = MOST_STREAMS) -> list[rrb.View]:
-        shown = [(label(streams[s]), part(streams, s)) for s in outline.streams(most)]
-        return [panel(f"{title} {stream}", f"{entity}/{place}") for stream, place in shown]
+        streams = outline.names()
+        return [
+            panel(f"{title} {label(streams[s])}", f"{entity}/{part(streams, s)}")
+            for s in outline.streams(most)
+        ]
 
     def curves(names: Iterable[str]) -> list[rrb.View]:
         return [panel(CURVES[name], _entity(name)) for name in names if name in told]
 
     first = curves(FIRST_TAB) if "eta_dot" in told else by_stream(ERROR_OF, OF_STREAM, FIRST)
-    rewards = by_stream("R for staying on", R_STAY) if "R" in told else []
-    errors = by_stream(ERROR_OF, OF_STREAM) if "learning_error" in told else []
-    tabs = [
-        *([rrb.Vertical(*rewards, name="Rewards")] if rewards else []),
-        *([rrb.Vertical(*errors, name="Streams")] if errors else []),
-    ]
     table = rrb.TextDocumentView(origin="/summary", name="Runs")
-    return blueprint(
-        rrb.Horizontal(table, rrb.Vertical(*first), column_shares=[2, 4], name="Overview"),
-        *tabs,
-        rrb.Grid(*curves(CURVES), grid_columns=2, name="All curves"),
-        name="Comparison",
-        timeline=ITERATION,
-        length=max(row.outline.iterations for row in rows),
-        tab=tab,
-    )
+    tabs: list[rrb.Container] = [
+        rrb.Horizontal(table, rrb.Vertical(*first), column_shares=[2, 4], name="Overview")
+    ]
+    if "R" in told:
+        tabs.append(rrb.Vertical(*by_stream("R for staying on", R_STAY), name="Rewards"))
+    if "learning_error" in told:
+        tabs.append(rrb.Vertical(*by_stream(ERROR_OF, OF_STREAM), name="Streams"))
+    tabs.append(rrb.Grid(*curves(CURVES), grid_columns=2, name="All curves"))
+    return blueprint(*tabs, name="Comparison", timeline=ITERATION, length=length, tab=tab)

@@ -32,7 +32,7 @@ Cells = dict[tuple[str, str, Any], pa.Array]
 """Single values as Rerun stores them, by section, name, type and value."""
 
 
-def identity(name: str, source: Path) -> str:
+def recording_id(name: str, source: Path) -> str:
     """The name of a recording, which no other one has: Rerun merges those of the same name.
 
     Args:
@@ -50,7 +50,7 @@ def run_identity(run: Path) -> str:
         UsageError: there is no such run.
     """
     log = run_log(run)
-    return identity(log.resolve().parent.name, log)
+    return recording_id(log.resolve().parent.name, log)
 
 
 def properties_of(outline: Outline, folder: Path) -> Sections:

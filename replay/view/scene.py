@@ -26,6 +26,7 @@ from recorder.log.scenery import Eye, Gaze, Scenery, Thing
 from replay.palette import Rgb, colour, packed_all, pale
 from replay.recordings.poses import yaw_of
 from replay.runs.columns import SignalColumns
+from replay.runs.log import Batch
 from replay.runs.run import Outline
 from replay.view.columns import Column, line_column, time_columns
 from replay.view.labels import label, part
@@ -57,10 +58,24 @@ class SceneView:
         recording: where it goes.
         spec: what the source delivers.
         scenery: what stands where.
+        every: show where things are at every so many frames.
+        body: show the robot's, too.
+
+    Attributes:
+        notes: why the robot's body is not shown.
     """
 
-    def __init__(self, recording: rr.RecordingStream, spec: SourceSpec, scenery: Scenery) -> None:
-        self._recording, self._spec, self._scenery = recording, spec, scenery
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        spec: SourceSpec,
+        scenery: Scenery,
+        every: int,
+        *,
+        body: bool = True,
+    ) -> None:
+        self._recording, self._spec, self._every = recording, spec, every
+        self.notes: list[str] = []
         self._watched, self._turned = -1, False
         self._neck: Any = None
         recording.log(SCENE, rr.ViewCoordinates.BRU, static=True)
@@ -76,21 +91,26 @@ class SceneView:
         for s, gaze in enumerate(self._gazes):
             if gaze is not None:
                 _write_pyramid(recording, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
-
-    def stand(self) -> str | None:
-        """Show the robot's body, and return what to say where that cannot be."""
         try:
-            self._neck = write_body(self._recording, SCENE, self._scenery.robot)
+            self._neck = write_body(recording, SCENE, scenery.robot) if body else None
         except CdmisfaError as error:
-            return str(error)
-        return None
+            self.notes.append(str(error))
+
+    def take(self, batch: Batch) -> None:
+        """Take what a log holds of some iterations."""
+        for columns in batch.signals:
+            self._turn(columns)
+        for frames, truth in batch.truth:
+            self.move(frames, truth)
 
     def move(self, at: IntArray, truth: FloatArray) -> None:
         """Put the objects where (n, D) truth says they are at n frames."""
+        kept = at % self._every == 0
+        at, truth = at[kept], truth[kept]
         for thing, column in self._objects:
             column.add(at, None, thing.places(self._spec.truth, truth))
 
-    def turn(self, columns: SignalColumns) -> None:
+    def _turn(self, columns: SignalColumns) -> None:
         """Turn the head to what is watched."""
         streams = columns["stream"].astype(np.int64)
         turns = np.flatnonzero(np.diff(streams, prepend=self._watched))

@@ -5,19 +5,19 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from cdmisfa.core.arrays import FloatArray, IntArray
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError
 from cdmisfa.core.untrusted import parse_json
 from recorder.log.scenery import KIND, NECK, Scenery, scenery_of
 from recorder.log.viewlog import CONFIG_NAME
 from recorder.mcap.reader import LogReader
-from replay.following import Fit, read_outputs
+from replay.following import read_outputs
 from replay.palette import GREY, colour
 from replay.recordings.poses import first_pose
 from replay.runs.log import Batch, Frames, RunHeader
@@ -113,24 +113,11 @@ def _table(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def world_tab(
-    header: RunHeader,
-    scenery: Scenery | None,
-    streams: Sequence[int],
-    lessons: Sequence[Lesson] = (),
-) -> WorldTab:
-    """What the first tab of a run shows of its world.
-
-    Args:
-        header: of its log.
-        scenery: what stood where, as far as that is known.
-        streams: those that are shown.
-        lessons: what its modules have learned.
-    """
-    wall = None
-    if header.spec.images and scenery is None:
-        wall = bounds(len(streams), *header.spec.frame_shape)
-    return WorldTab(scenery is not None, wall, lessons)
+def world_tab(header: RunHeader, scenery: Scenery | None, streams: Sequence[int]) -> WorldTab:
+    """What the first tab of a run shows of its world, of which some scenery is known, or none."""
+    if scenery is not None or not header.spec.images:
+        return WorldTab(scene=scenery is not None)
+    return WorldTab(wall=bounds(len(streams), *header.spec.frame_shape))
 
 
 class WorldView:
@@ -160,38 +147,29 @@ class WorldView:
         *,
         body: bool = True,
     ) -> None:
-        self._header, self._streams, self._every = header, streams, every
-        self._scene: SceneView | None = None
-        self._wall: WallView | None = None
-        self._scenery, unsure = world_of_run(header, run, learned_from)
+        scenery, unsure = world_of_run(header, run, learned_from)
+        self._tab = world_tab(header, scenery, streams)
+        self._view: SceneView | WallView | None = None
         self.notes: list[str] = [] if unsure is None else [unsure]
-        if self._scenery is not None:
-            self._scene = SceneView(recording, header.spec, self._scenery)
-            missing = self._scene.stand() if body else None
-            self.notes += [] if missing is None else [missing]
+        if scenery is not None:
+            self._view = SceneView(recording, header.spec, scenery, every, body=body)
+            self.notes += self._view.notes
         elif header.spec.images:
-            self._wall = WallView(recording, header, streams)
+            self._view = WallView(recording, header, streams)
 
     def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
-        if self._wall is not None:
-            self._wall.take(batch)
-        if self._scene is not None:
-            for columns in batch.signals:
-                self._scene.turn(columns)
-            for frames, truth in batch.truth:
-                kept = frames % self._every == 0
-                self._scene.move(frames[kept], truth[kept])
+        if self._view is not None:
+            self._view.take(batch)
 
     def flush(self) -> None:
         """Hand over everything that waits."""
-        for view in (self._scene, self._wall):
-            if view is not None:
-                view.flush()
+        if self._view is not None:
+            self._view.flush()
 
     def tab(self, lessons: Sequence[Lesson] = ()) -> WorldTab:
         """What the first tab shows of it, and of what was learned of it."""
-        return world_tab(self._header, self._scenery, self._streams, lessons)
+        return replace(self._tab, lessons=lessons)
 
 
 LEARNED = "learned"
@@ -212,7 +190,7 @@ def write_learned(
     outline: Outline,
     truth: Sequence[Frames],
 ) -> list[Lesson]:
-    """Write each module's output where its stream was watched, and what it follows, everywhere.
+    """Write each module's output where its stream was watched, and what it follows at all frames.
 
     Args:
         recording: where it goes.
@@ -230,44 +208,23 @@ def write_learned(
         if found is None:
             continue
         followed = found(values[:, found.column])
-        said = _everywhere(frames, output.t, output.y)
-        root = f"{LEARNED}/{output.module}"
-        shown = (
-            (f"{root}/followed", found.function, GREY, BROAD, followed),
-            (
-                f"{root}/output",
-                f"module {output.module} on {names[output.stream]}",
-                colour(output.stream),
-                NARROW,
-                said,
-            ),
-        )
-        for path, name, rgb, width, line in shown:
-            column = line_column(recording, spec, path, [name], [rgb], width, every_frame=True)
+        said = np.full(len(frames), np.nan)
+        said[np.isin(frames, output.t)] = output.y[np.isin(output.t, frames)]
+        stream, root = names[output.stream], f"{LEARNED}/{output.module}"
+        whose = f"module {output.module} on {stream}"
+        for path, name, rgb, width, line in (
+            ("followed", found.function, GREY, BROAD, followed),
+            ("output", whose, colour(output.stream), NARROW, said),
+        ):
+            place, how = f"{root}/{path}", ([name], [rgb], width)
+            column = line_column(recording, spec, place, *how, every_frame=True)
             column.add(frames, iterations, line)
             column.flush()
         both = np.concatenate([followed, output.y])
-        lessons.append(
-            Lesson(
-                _title(output.module, names[output.stream], found),
-                tuple(f"/{path}" for path, *_ in shown),
-                (float(both.min()), float(both.max())),
-            )
+        title = (
+            f"What module {output.module} has learned: where {label(stream)} is watched, "
+            f"its output over {label(found.function)}, |r| = {found.r:.2f}"
         )
+        entities = (f"/{root}/followed", f"/{root}/output")
+        lessons.append(Lesson(title, entities, (float(both.min()), float(both.max()))))
     return lessons
-
-
-def _title(module: int, stream: str, found: Fit) -> str:
-    return (
-        f"What module {module} has learned: where {label(stream)} is watched, "
-        f"its output over {label(found.function)}, |r| = {found.r:.2f}"
-    )
-
-
-def _everywhere(frames: IntArray, t: IntArray, y: FloatArray) -> FloatArray:
-    """An output at all frames: NaN where its stream was not watched."""
-    line = np.full(len(frames), np.nan)
-    at = np.searchsorted(frames, t)
-    there = (at < len(frames)) & (frames[np.minimum(at, len(frames) - 1)] == t)
-    line[at[there]] = y[there]
-    return line

@@ -31,7 +31,7 @@ from replay.viewer.program import (
     open_privately,
     private_host,
     running,
-    until,
+    wait_until,
 )
 from replay.viewer.web import page_of, page_server, served
 
@@ -196,7 +196,7 @@ def _created(address: str, name: str, server: Program) -> Any:
     def create() -> Any:
         return CatalogueClient(address).create_dataset(name)
 
-    return until(create, START_SECONDS, "the server did not start", server)
+    return wait_until(create, START_SECONDS, "the server did not start", server)
 
 
 def set_layout(runs: Sequence[Path], dataset: Any, place: Path, tab: str | None = None) -> None:

@@ -25,7 +25,7 @@ from replay.viewer.program import (
     missing_driver,
     private_host,
     running,
-    until,
+    wait_until,
 )
 
 ITERATION = re.compile(r"(?:iteration|iter|i)\s*(\d+)", re.IGNORECASE)
@@ -153,7 +153,7 @@ class HeadlessViewer:
             CdmisfaError: it did not answer in time, or the viewer has ended.
         """
         what = f"the viewer did not {what}"
-        answer = until(lambda: question(self._client), seconds, what, self._process)
+        answer = wait_until(lambda: question(self._client), seconds, what, self._process)
         if answer is None:
             raise CdmisfaError(f"the viewer ended: {self._process.last_words()}")
         return answer

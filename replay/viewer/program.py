@@ -175,16 +175,16 @@ def open_privately(address: str, memory_limit: str = "2GB") -> None:
 
     def tell() -> None:
         with contextlib.suppress(CdmisfaError):
-            until(open_it, TOLD_SECONDS, "the viewer did not start", viewer)
+            wait_until(open_it, TOLD_SECONDS, "the viewer did not start", viewer)
         viewer.wait()
 
     threading.Thread(target=tell, daemon=True).start()
 
 
-def until(
+def wait_until(
     question: Callable[[], Any], seconds: float, what: str, process: subprocess.Popen[bytes]
 ) -> Any:
-    """Ask until there is an answer: what is starting, or not painted yet, raises or has none.
+    """Repeat a question to a program until it is answered: while it starts, it raises or has none.
 
     Args:
         question: gives the answer.
@@ -212,7 +212,7 @@ def until(
 
 
 def private_host() -> str:
-    """An address of this machine for a port that asks nobody who he is.
+    """A loopback address that cannot be guessed, for a server without authentication.
 
     On Linux all of 127.0.0.0/8 is this machine; by chance one is taken that no page of somebody
     else's can guess and have its name lead to.

@@ -1,4 +1,4 @@
-"""Serving runs, and the viewer's web page, on this machine to who was given the address alone.
+"""Runs and the viewer's web page, served on this machine to those who have the address.
 
 A page of somebody else's that has its name lead to this machine (DNS rebinding) is refused by
 that name, which the browser says in the Host header; a program of another user by the token in

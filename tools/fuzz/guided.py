@@ -147,7 +147,7 @@ def hunt(name: str, seconds: float) -> int:
 
 def _now(name: str) -> Path:
     """The input that is being decoded, for when the process does not survive it."""
-    return logs.STATE / f"{name}.now"
+    return logs.STATE / f"{name}.now".replace("/", "-")
 
 
 def keep(name: str, data: bytes) -> Path:

@@ -120,7 +120,7 @@ def _recording(folder: Path, compression: str) -> bytes:
     truth = np.arange(FRAMES * 2, dtype=np.float64).reshape(FRAMES, 2)
     log.write(Block(0, 0, pixels.reshape(FRAMES, *SHAPE), truth))
     log.finish()
-    return log.file.path.read_bytes()
+    return (folder / "left.mcap").read_bytes()
 
 
 def _other(**options: object) -> bytes:

@@ -22,7 +22,7 @@ from camera_files import write_cameras
 
 from cdmisfa.cli import run
 from cdmisfa.core.errors import CdmisfaError
-from cdmisfa.experiments.command import log_to_resume
+from cdmisfa.experiments.resume import log_to_resume
 from cdmisfa.experiments.store import read_rows
 from recorder.log.resume import frames_held
 from recorder.mcap.reader import LogReader

@@ -120,8 +120,8 @@ def learn_command(
     if not source:
         learn_as_begun(ctx, out if resume else None)
         return
-    from cdmisfa.experiments.command import command_of
     from cdmisfa.experiments.loop import INTERRUPTED
+    from cdmisfa.experiments.resume import command_of
     from cdmisfa.experiments.session import run
     from recorder.cameras.words import is_live
 
@@ -247,7 +247,7 @@ def settings_of(told: Mapping[str, Any]) -> tuple[str, ...]:
 
 def learn_as_begun(ctx: click.Context, run: Path | None) -> None:
     """Resume a run with the command that began it; options that are given win."""
-    from cdmisfa.experiments.command import read_command
+    from cdmisfa.experiments.resume import read_command
 
     if run is None:
         source = next(param for param in ctx.command.params if param.name == "source")

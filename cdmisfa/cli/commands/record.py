@@ -295,10 +295,10 @@ def convert_command(
     'logs/*.mcap'. What was interrupted is resumed with --resume. Live streams are recorded, as by
     cdmisfa record.
     """
-    from cdmisfa.experiments.convert import convert
+    from cdmisfa.experiments.sources import convert
     from recorder.cameras.words import is_live
     from recorder.log.files import refuse_existing
-    from replay.inputs import open_cameras, places, refuse_what_is_no_log
+    from replay.inputs import locations, open_cameras, refuse_what_is_no_log
 
     out = Path("REC") if out is None and dry_run else _folder(out)
     writing: dict[str, Any] = {"fsync_every": fsync_every, "force": force}
@@ -309,7 +309,7 @@ def convert_command(
             )
         record_streams(ctx, source, out, live, cameras, as_json=as_json, **writing)
         return
-    named = places(source)
+    named = locations(source)
     for place in named:
         refuse_what_is_no_log(place)
     if not resume and not dry_run:

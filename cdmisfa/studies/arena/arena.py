@@ -19,7 +19,7 @@ from cdmisfa.core.processes import WorkerDied, run_all
 from cdmisfa.core.registry import Registry
 from cdmisfa.experiments.documents import plain
 from cdmisfa.experiments.sources import configure
-from cdmisfa.experiments.store import SweepReport, answer, code, identity, run_trials
+from cdmisfa.experiments.store import SweepReport, answer, code, run_trials, trial_id
 from cdmisfa.studies.arena.library import Library
 from cdmisfa.studies.arena.streams import SETS, SUITE, parse
 from cdmisfa.studies.arena.trial import ArenaTrial, run_arena_trial
@@ -123,7 +123,7 @@ def plan_arena(
             point = {"set": name, "learner": learner, **more}
             for seed in each:
                 trial = ArenaTrial(
-                    id=identity(shown, section_table(config), seed, version),
+                    id=trial_id(shown, section_table(config), seed, version),
                     point=point,
                     seed=seed,
                     code=version,

@@ -36,39 +36,6 @@ HEAD_CHANGED: Final = ("learner", "after the change shows", "learned", "blocks o
 Entry = Mapping[str, Any]
 Sets = Mapping[str, Sequence[Entry]]
 
-INTRODUCTION: Final = f"""\
-# The arena
-
-Learners compared on sets of streams. Made by `cdmisfa arena --page`; do not edit.
-
-```
-pip install 'cdmisfa[arena]'
-cdmisfa arena all -o arena --page docs/arena.md
-```
-
-- *Learned*: the share of the learnable streams of a set of which a module was saved whose slowest
-  output is, on held-out frames, at most {SLOW_ENOUGH} times as fast as that of batch SFA with as
-  many components, fitted on all {LEARNED_FROM:,} frames that the stream consists of
-  ({SLOW_ENOUGH_LOOPED} times for clips and recordings that loop, which are judged on themselves;
-  their cut is shown to batch SFA, too). The {HELD_OUT:,} frames that follow are held out. Where no
-  module was learned on a stream, one that was learned on another, and slow enough there, counts
-  if it is so here and its output is that of batch SFA (correlation above {KNOWS:g}).
-- *Modules*: how many a run saved; *not learnable*: how many of them on streams that have nothing
-  slow. There should be none.
-- *Twice*: modules a run saved on a stream that had one already and still shows the same, or on
-  the same stream shown once more, if the outputs are the same (correlation above {THE_SAME:g}).
-- *Ends*: the share of runs that ended by themselves; *blocks*: after how many, of those that did.
-  Others are stopped when their frames are over, the same number for every learner.
-- *All learned*: blocks until the last learnable stream was learned, of the runs that learned all.
-- *R²*: of the world's true state (positions, angles, bytes of a game's memory), told by ridge
-  regression from the modules' outputs, and in brackets from as many principal components, on the
-  last quarter of the frames; only streams that a module was saved on.
-
-Numbers are means over seeds with 95 % intervals (Student; Wilson for *ends*). Figures are of seeds
-below 100; constants may be tuned on seeds from 100 on only. Seed s makes the learner's choices and
-the streams.
-"""
-
 
 def arena_table(document: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Head and rows of all results, for a terminal."""
@@ -120,7 +87,7 @@ def draw_curves(document: Mapping[str, Any], folder: Path) -> list[Path]:
     sets = _by_set(document)
     rows, columns = -(-len(sets) // COLUMNS), min(COLUMNS, len(sets))
     with matplotlib.rc_context(STYLE):
-        size = 2.4 * columns + 0.6, 1.8 * rows + 0.8
+        size = 2.4 + 0.6 / columns, 1.8 + 0.8 / rows
         figure, axes = new_figure(rows, columns, *size, sharey=True)
         for panel in axes.ravel()[len(sets) :]:
             panel.set_visible(False)
@@ -170,7 +137,17 @@ def write_arena_page(document: Mapping[str, Any], figure: Path, path: Path) -> N
     """Write a Markdown page of all results, with their figure."""
     sets = _by_set(document)
     page = Page(path)
-    page.add(INTRODUCTION)
+    introduction = Path(__file__).with_name("introduction.md").read_text("utf-8")
+    page.add(
+        introduction.format(
+            learned_from=LEARNED_FROM,
+            held_out=HELD_OUT,
+            slow_enough=SLOW_ENOUGH,
+            slow_enough_looped=SLOW_ENOUGH_LOOPED,
+            knows=KNOWS,
+            the_same=THE_SAME,
+        )
+    )
     page.picture(figure, "Share of the learnable streams that each learner has learned, by frames")
     page.add("*Mean and standard deviation over seeds.*", "")
     if rows := _together(_learners(document), sets):

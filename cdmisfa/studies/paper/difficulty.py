@@ -20,7 +20,7 @@ from cdmisfa.experiments.statistics import correlation, stays_above
 from cdmisfa.features.incsfa import IncSFA
 from cdmisfa.features.sfa import batch_sfa, leading_directions, slowness
 from cdmisfa.studies import pages
-from cdmisfa.studies.paper import icub, panels
+from cdmisfa.studies.paper import icub
 from cdmisfa.studies.paper.experiment import (
     Experiment,
     Findings,
@@ -147,7 +147,7 @@ class Difficulty(Experiment):
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Direction cosine over frames, a colour a stream."""
         scenes = groups(trials, "scene")
-        figure, axes = panels.figure_of_panels(1, len(scenes))
+        figure, axes = pages.new_figure(1, len(scenes))
         for panel, ((scene,), alone), letter in zip(axes[0], scenes.items(), "ab", strict=False):
             for (stream,), group in groups(alone, "stream").items():
                 mean, sd = pages.mean_sd(pages.stack([t.arrays["cosine"] for t in group]))

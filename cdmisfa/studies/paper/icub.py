@@ -22,7 +22,6 @@ from cdmisfa.experiments.documents import write_json
 from cdmisfa.experiments.loop import learn
 from cdmisfa.experiments.statistics import correlation
 from cdmisfa.studies import pages
-from cdmisfa.studies.paper import panels
 from cdmisfa.studies.paper.experiment import (
     Experiment,
     Findings,
@@ -111,12 +110,13 @@ class Icub(Experiment):
     def draw(self, trials: Sequence[Trial], folder: Path) -> list[Path]:
         """Value function, policy, eta-dot; the modules' outputs over time and the objects."""
         trials = [t for t in trials if t.settings["algorithm"] == "2.0"]
-        figure, axes = panels.figure_of_panels(1, 3)
-        panels.value_gains(axes[0, 0], trials, "c")
-        panels.policies(axes[0, 1], trials, "d", "policy, mean and SD")
-        panels.eta_dot(axes[0, 2], trials, paper_config("icub").delta, "e")
+        figure, axes = pages.new_figure(1, 3)
+        Q, policy, eta_dot = ([t.arrays[k] for t in trials] for k in ("Q", "policy", "eta_dot"))
+        pages.draw_value_gains(axes[0, 0], Q, "c")
+        pages.draw_policies(axes[0, 1], policy, "d", "policy, mean and SD")
+        pages.draw_eta_dot(axes[0, 2], eta_dot, paper_config("icub").delta, "e")
         paths = pages.save_figure(figure, folder, "icub")
-        outputs, axes = panels.figure_of_panels(2, 2)
+        outputs, axes = pages.new_figure(2, 2)
         for i, name in enumerate(OBJECTS):
             one = next((t for t in trials if f"truth{i + 1}" in t.arrays), None)
             if one is None:

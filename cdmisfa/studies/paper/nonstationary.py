@@ -13,7 +13,6 @@ import numpy as np
 from cdmisfa.experiments.statistics import MeanSd, Midpoint, logistic_midpoint
 from cdmisfa.experiments.trial import Swap, run_trial
 from cdmisfa.studies import pages
-from cdmisfa.studies.paper import panels
 from cdmisfa.studies.paper.experiment import (
     Experiment,
     Findings,
@@ -147,7 +146,7 @@ class NonStationary(Experiment):
             if key == "sigma" and start == STARTS[0]
         }
         smallest = PICTURED[1] if PICTURED[1] in by_sigma else min(by_sigma)
-        figure, axes = panels.figure_of_panels(1, 2)
+        figure, axes = pages.new_figure(1, 2)
         for panel, sigma, letter in zip(axes[0], (smallest, max(by_sigma)), "ab", strict=True):
             _draw_policies(panel, by_sigma[sigma])
             axis = rf"$\epsilon^c$   ($\sigma$ = {sigma:g})"

@@ -22,14 +22,13 @@ from cdmisfa.core.errors import CdmisfaError, NotReproducedError, UsageError
 from cdmisfa.core.registry import did_you_mean
 from cdmisfa.core.untrusted import MAX_LIST, read_json
 from cdmisfa.experiments.documents import markdown, plain, versions, write_json
-from cdmisfa.experiments.store import StoredTrial, answer, code, identity, read_rows, run_trials
+from cdmisfa.experiments.store import StoredTrial, answer, code, read_rows, run_trials, trial_id
 from cdmisfa.studies.pages import Page
-from cdmisfa.studies.paper.comparison import Costs, Stability
 from cdmisfa.studies.paper.difficulty import Difficulty
 from cdmisfa.studies.paper.experiment import Experiment, Findings, Request, Settings, Trial
 from cdmisfa.studies.paper.icub import Icub
 from cdmisfa.studies.paper.nonstationary import NonStationary
-from cdmisfa.studies.paper.oscillatory import FiveStreams, Oscillatory
+from cdmisfa.studies.paper.oscillatory import Costs, FiveStreams, Oscillatory, Stability
 from recorder.log.files import atomic_write
 
 EXPERIMENTS: Mapping[str, Experiment] = {
@@ -80,7 +79,7 @@ def reproduce(
     version = code()
     tasks = [
         PaperTrial(
-            id=identity(name, settings, version),
+            id=trial_id(name, settings, version),
             point=settings,
             seed=int(settings["seed"]),
             code=version,

@@ -1,0 +1,170 @@
+"""What the command line refuses: one line that says what is wrong, and nothing is written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import Cdmisfa
+from folders import contents
+from test_cli import assert_one_line
+
+LOGS = Path(__file__).parents[1] / "sample_logs" / "icub"
+
+NO_MCAP = "numbers.npz is no MCAP file: name a recording"
+URLS = ("gs://bucket/there", "https://there.org/x")
+ONE = "is a scene, of which only one can be named"
+VAIN = "is for live scenes, and {} is none: leave it out"
+SIZED = "oscillatory is a scene: --size and --rate are for cameras; its rate is --set rec"
+FOLDER = "file is a file: name a folder"
+TAKEN = "taken exists: choose another folder"
+
+CASES: dict[str, tuple[str, ...]] = {
+    # words: what the line says. RUN, REC and LOGS are a run, a recording, and logs.
+    "learn no/such.mcap": ("no/such.mcap", "icub, oscillatory"),
+    "learn oscilatory": ("oscilatory", "icub, oscillatory"),
+    "record icubs -o x": ("icubs", "did you mean icub?"),
+    "record icub": ("-o",),
+    "record oscillatory --scene-picture x.png": ("icub",),
+    "record oscillatory -o x --view x9": ("x9", "x1, x2, x3"),
+    **{f"{command} no/such": ("no/such",) for command in ("info", "verify", "view", "plot")},
+    "compare no/such neither": ("no/such",),
+    "recover no/such -o x": ("no/such",),
+    "export no/such -o x.csv": ("no/such: no such file or folder",),
+    "export no/such --to images -o x": ("no/such: no such file or folder",),
+    "export no/such --to mp4 -o x": ("no/such: no such file or folder",),
+    "learn oscillatory --set learner.nuu=1": ("did you mean learner.nu?",),
+    "learn oscillatory --set lerner.nu=1": ("did you mean learner?",),
+    "learn oscillatory --set learner.nu=x": ("learner.nu", "number"),
+    "learn oscillatory --set nu": ("section.key=value",),
+    "learn oscillatory --set scene.kind=icub": ("scene.kind",),
+    "learn oscillatory --preset icubs": ("did you mean icub?",),
+    "learn oscillatory --preset icub": ("for the scene icub",),
+    "record icub -o x --preset oscillatory": ("for the scene oscillatory, this is icub",),
+    "record oscillatory -o x --set scene.eyes.width=9": (
+        "scene.eyes.width means nothing",
+        "scene.streams",
+    ),
+    "learn oscillatory --preset no.toml": ("no.toml",),
+    "learn": ("SOURCE", "cdmisfa learn --help"),
+    "learn oscillatory --sead 1": ("--seed",),
+    "learn oscillatory --seed x": ("--seed",),
+    "learn oscillatory --resume": ("-o",),
+    "learnn": ("did you mean learn?",),
+    "view x --web --save y.rrd": ("--save",),
+    "view x --at 3": ("--screenshot",),
+    # a scene is one, and has no options of cameras
+    "learn oscillatory icub": (ONE,),
+    "learn here oscillatory": (ONE,),
+    **{f"{c} oscillatory -o o --size 8x8 --rate 9": (SIZED,) for c in ("learn", "record", "sweep")},
+    # what only a live scene can be told; the manifest would state it, whatever was recorded
+    "learn REC --set scene.seed=9": ("scene.seed " + VAIN.format("REC"),),
+    "learn numbers.csv --rate 10 --set record.fps=9": ("record.fps " + VAIN.format("numbers.csv"),),
+    "learn av:lavfi:testsrc=rate=30 --set record.fps=9": (
+        "record.fps " + VAIN.format("av:lavfi:testsrc=rate=30"),
+    ),
+    "sweep REC --grid scene.seed=9,10 -o sweep": ("scene.seed " + VAIN.format("REC"),),
+    # a file of another kind is a wrong word and no damage
+    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("info", "verify", "learn", "play")},
+    **{f"{command} numbers.npz": (NO_MCAP,) for command in ("check", "plot")},
+    "recover -o out.mcap numbers.npz": (NO_MCAP,),
+    "convert -o out numbers.npz": (NO_MCAP,),
+    "view --save out.rrd numbers.npz": (NO_MCAP,),
+    "compare numbers.npz numbers.npz": (NO_MCAP,),
+    "export --to csv -o out.csv numbers.npz": (NO_MCAP,),
+    "export --to images -o out numbers.npz": (NO_MCAP,),
+    **{
+        f"recover {name} -o out.mcap": (
+            f"{name} is no MCAP file, and others are not recovered",
+            "--salvage",
+        )
+        for name in ("numbers.csv", "pictures")
+    },
+    # what is written goes to no URL but those of s3
+    **{
+        f"{words} {URLS[number % 2]}": (
+            f"{URLS[number % 2]} is a URL: name a path on this machine",
+        )
+        for number, words in enumerate(
+            (
+                "learn oscillatory --max-iterations 3 -o",
+                "record oscillatory --frames 20 -o",
+                "record icub --scene-picture",
+                "convert no.mcap -o",
+                "sweep oscillatory --seeds 0 --max-iterations 3 -o",
+                "export RUN --to csv -o",
+                "recover RUN/run.mcap -o",
+                "plot RUN -o",
+                "reproduce stability --trials 1 -o",
+                "reproduce --page",
+                "demo --frames 400 -o",
+                "view RUN --save",
+                "view RUN --screenshot",
+                "compare RUN RUN --save",
+            )
+        )
+    },
+    # a file is not taken for a folder
+    "learn oscillatory --force -o file": (FOLDER,),
+    "learn oscillatory --force -o file/below": (FOLDER,),
+    "record oscillatory -o file": (FOLDER,),
+    "record oscillatory --resume -o file/below": (FOLDER,),
+    "sweep oscillatory --seeds 0 -o file": (FOLDER,),
+    "fork RUN --at 3 --force -o file": (FOLDER,),
+    "plot RUN -o file/below": (FOLDER,),
+    "sweep oscillatory -o RUN --seeds 0:1": ("run.mcap",),
+    "export RUN -o - --to csv": ("name another",),
+    "view RUN --screenshot x.jpg": ("the picture is a PNG, name it x.png",),
+    # no name is not the folder one is in
+    "learn oscillatory -o EMPTY": ("is empty: name a",),
+    "record oscillatory --frames 20 -o EMPTY": ("is empty: name a",),
+    "view RUN --save EMPTY": ("is empty: name a",),
+    "fork EMPTY --at 3 -o fork": ("is empty: name a",),
+    **{f"{command} EMPTY": ("is empty: name a",) for command in ("learn", "view", "info", "play")},
+    # a conversion needs a folder
+    "convert LOGS/left.mcap": ("say -o FOLDER, where the recording goes",),
+    "convert LOGS/left.mcap LOGS/right.mcap --rate 9 --dry-run": ("-o REC\n",),
+    # resuming is advised only where it can be
+    "learn oscillatory -o taken": (TAKEN, "go on with --resume"),
+    "record oscillatory -o taken": (TAKEN, "go on with --resume"),
+    "fork RUN --at 3 -o taken": (TAKEN,),
+    "learn gym:Pendulum-v1 -o taken": (TAKEN,),
+    "record gym:Pendulum-v1 -o taken": (TAKEN,),
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The folder that a command runs in, which it leaves as it is."""
+    monkeypatch.chdir(tmp_path)
+    Path("numbers.npz").write_bytes(b"PK" + bytes(100))
+    Path("numbers.csv").write_text("a,b\n" + "1,2\n" * 200)
+    Path("file").write_bytes(b"kept")
+    for name in ("pictures/0.png", "taken/there"):
+        Path(name).parent.mkdir()
+        Path(name).touch()
+    before = contents(tmp_path)
+    yield tmp_path
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_refused_in_one_line(
+    cdmisfa: Cdmisfa, oscillatory_run: Path, oscillatory_recording: Path, case: str
+) -> None:
+    places = {"RUN": oscillatory_run, "REC": oscillatory_recording, "LOGS": LOGS, "EMPTY": ""}
+    words = case
+    said = list(CASES[case])
+    for name, place in places.items():
+        words = " ".join(
+            word.replace(name, str(place), 1) if word.split("/")[0] == name else word
+            for word in words.split(" ")
+        )
+        said = [line.replace(f"and {name} ", f"and {place} ") for line in said]
+    kept = contents(oscillatory_run)
+    done = cdmisfa(*words.split(" "))
+    assert_one_line(done, 2, *said)
+    assert "--resume" in "".join(said) or "go on with --resume" not in done.err
+    assert contents(oscillatory_run) == kept
