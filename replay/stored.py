@@ -123,8 +123,8 @@ class StoredSource(ClockedSource):
         )
 
 
-def joined(spans: Iterable[Span]) -> list[Span]:
-    """Spans in their order, with those that touch made one."""
+def merged(spans: Iterable[Span]) -> list[Span]:
+    """Ranges in their order, with those that touch merged."""
     found: list[Span] = []
     for start, stop in spans:
         if found and found[-1][1] == start:
@@ -141,7 +141,7 @@ def outside(gaps: Iterable[Span], count: int) -> list[Span]:
 
 
 def in_laps(held: Sequence[Span], first: int, count: int, start: int, stop: int) -> list[Span]:
-    """The unbroken stretches of the frames [start, stop) where the same come in every lap.
+    """The unbroken ranges of the frames [start, stop), where every lap has the same gaps.
 
     Args:
         held: the frames that are there of the first lap.
@@ -156,4 +156,4 @@ def in_laps(held: Sequence[Span], first: int, count: int, start: int, stop: int)
         for lap in laps
         for low, high in held
     )
-    return joined((low, high) for low, high in there if low < high)
+    return merged((low, high) for low, high in there if low < high)

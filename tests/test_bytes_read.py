@@ -17,7 +17,6 @@ from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 from recorder.mcap.reader import LogReader
-from recorder.mcap.store import FileStore, OnePass
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
@@ -115,21 +114,3 @@ def test_a_changed_fact_is_found_by_who_reads_all(noise: Path, tmp_path: Path) -
     with pytest.raises(LogDamagedError, match="data section"):
         RecordedSource(path).describe()
     assert not check_log(path).ok
-
-
-def test_a_pass_knows_the_checksum_wherever_reading_went(tmp_path: Path) -> None:
-    data = np.random.default_rng(1).integers(0, 256, 100_000, np.uint8).tobytes()
-    (tmp_path / "file").write_bytes(data)
-    store = FileStore(tmp_path / "file")
-    one_pass = OnePass(store)
-    for place, reads in [(10, [(12, 5), (500, 700)]), (600, [(600, 9), (1100, 50)]), (9, [])]:
-        one_pass.pass_to(place)
-        for at, count in reads:
-            assert one_pass.read(at, count) == data[at : at + count]
-    assert one_pass.read(0, 20) == data[:20]
-    one_pass.pass_to(1120)
-    one_pass.pass_to(90_000)
-    assert one_pass.read(99_990, 50) == data[99_990:]
-    for stop in (90_000, 100_000):
-        one_pass.pass_to(stop)
-        assert one_pass.crc(0, stop) == store.crc(0, stop)

@@ -122,7 +122,7 @@ class Chunks:
             self._file = before
 
     def forget(self, but: Collection[int] = ()) -> None:
-        """Let go of the chunks that were decoded, but those at some places of the file."""
+        """Drop the decoded chunks, except those at some places of the file."""
         for key in self._cache.keys() - set(but):
             self._drop(key)
 

@@ -52,7 +52,7 @@ class DataSection:
             self.check()
 
     def confirm(self) -> None:
-        """Ask again for the beginning of a log behind a URL, and the checksums it states.
+        """Check that a log behind a URL is still the one that was opened.
 
         Raises:
             LogDamagedError: it was replaced while it was read.

@@ -1,4 +1,4 @@
-"""What stands twice in a log, made right again where one of the two is damaged.
+"""Repairing what a log states twice, where one of the two is damaged.
 
 The head of a chunk also stands in the summary, and its message indexes follow from its messages.
 The checksum over all data says whether that is all that was wrong.
@@ -31,11 +31,11 @@ _MOST_CHANNELS: Final = 64
 _ALIKE: Final = 0.5
 """Share of an index's bytes by which one is known to stand at a place."""
 _MOST_BYTES: Final = 64 * 1024 * 1024
-"""Of what is made right again."""
+"""Most bytes that are repaired."""
 
 
 class MendedStore(Store):
-    """A log of which some bytes are others; its `mended` says what was wrong."""
+    """A log with some bytes replaced; `mended` lists what was wrong."""
 
     def __init__(self, store: Store) -> None:
         super().__init__(store.path)
@@ -47,7 +47,7 @@ class MendedStore(Store):
         self._bytes = 0
 
     def put(self, at: int, right: bytes, where: str, what: str) -> None:
-        """Have other bytes at a place behind those of the last call, where it has not got them."""
+        """Replace the bytes at a place, behind those of the last call, where they differ."""
         there = self._store.read(at, len(right))
         if self._places and at < self._places[-1] + len(self._parts[-1]):
             return
@@ -75,7 +75,7 @@ class MendedStore(Store):
 
 
 def mended(file: Store) -> MendedStore:
-    """A damaged log with its chunks' heads and message indexes as they must have been."""
+    """A damaged log with the headers and message indexes of its chunks repaired."""
     store = MendedStore(file)
     structure = LogStructure(file, lambda *_: None, resync=True)
     stated = structure.summary.sound_chunks() if structure.summary else []
@@ -94,7 +94,7 @@ def mended(file: Store) -> MendedStore:
 
 
 def _mend_head(store: MendedStore, chunk: Segment) -> int:
-    """Have the head of a chunk as the summary states it; its CRC, which stands there alone."""
+    """Write a chunk's header as the summary states it; return its CRC, which only it states."""
     crc = int.from_bytes(store.read(chunk.offset + CHUNK_HEADER.size - 4, 4), "little")
     put = "its first bytes were damaged, and are made again from the summary"
     store.put(chunk.offset, chunk.head(crc), chunk.name, put)

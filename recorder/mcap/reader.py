@@ -282,11 +282,11 @@ class LogReader:
         return self._file.is_at(path)
 
     def moved(self, path: Path) -> None:
-        """Hear that the very file that was opened has another name now."""
+        """Note that the file that was opened was renamed."""
         self.path = self._file.path = path
 
     def refresh(self) -> bool:
-        """Look for what a recorder wrote since; whether the file grew.
+        """Read what a recorder wrote since; return whether the file grew.
 
         What was read before is not read again, but for one pass over a file that got its end,
         whose checksum says whether all of it is as it was.
@@ -309,7 +309,7 @@ class LogReader:
         return True
 
     def close(self) -> None:
-        """Let go of the file; harmless when called twice."""
+        """Close the file; harmless when called twice."""
         self._chunks.forget()
         self._file.close()
 

@@ -228,7 +228,7 @@ class Segment:
 
     @classmethod
     def of_chunk(cls, offset: int, content: bytes | memoryview) -> Segment:
-        """A chunk whose record stands at a place in the file, by what it says of itself."""
+        """Parse the header of a chunk at a place in the file."""
         fields = Fields(content, "a chunk")
         start, end, size = fields.integer(8), fields.integer(8), fields.integer(8)
         crc, compression, stored = fields.integer(4), fields.text(), fields.integer(8)
@@ -236,7 +236,7 @@ class Segment:
         return cls(offset, data, stored, size, compression, crc, start, end, chunked=True)
 
     def head(self, crc: int) -> bytes:
-        """What stands before a chunk's records if their CRC is this."""
+        """The bytes of a chunk before its records, given their CRC."""
         name = self.compression.encode()
         length = self.data_end - self.offset - RECORD_HEADER.size
         fixed = (Opcode.CHUNK, length, self.start, self.end, self.size, crc)

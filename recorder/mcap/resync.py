@@ -1,4 +1,4 @@
-"""Where a damaged log goes on: the next chunk that agrees with itself."""
+"""Finding the next sound chunk of a damaged log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OVERLAP: Final = 64
 
 
 def stands(file: Store, at: int, stop: int) -> bool:
-    """Whether a record of the format, which ends before a place, stands at another."""
+    """Whether a known record begins at `at` and ends before `stop`."""
     head = file.read(at, RECORD_HEADER.size)
     if len(head) < RECORD_HEADER.size:
         return at == stop
@@ -60,7 +60,7 @@ def leave_chunks(named: list[int], opcode: int, at: int, end: int) -> None:
 
 
 def next_chunk(file: Store, at: int, stop: int) -> int | None:
-    """The first place in [at, stop) at which a chunk stands whose lengths agree, or None."""
+    """The first place in [at, stop) where a chunk with consistent lengths begins, or None."""
     while at < stop:
         block = file.read(at, min(_BLOCK + _OVERLAP, stop - at))
         for found in _CHUNK.finditer(block):

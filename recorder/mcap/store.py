@@ -22,7 +22,7 @@ OPEN_FILES = 24
 """Files of recordings that are open at once; a recording in parts has thousands."""
 
 _MARK: Final = 4096
-"""Bytes at both ends of a file by which one that grows is known again."""
+"""Bytes at both ends of a growing file by which it is recognised."""
 
 _PEEK: Final = 4096
 _PEEK_FAR: Final = 256
@@ -53,17 +53,17 @@ class Store(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go; harmless when called twice."""
+        """Close it; harmless when called twice."""
 
     def expect(self, spans: Sequence[tuple[int, int]]) -> None:  # noqa: B027 - a hint
-        """Hear which spans [start, stop) will be read, one after the other."""
+        """Announce the ranges [start, stop) that will be read, one after the other."""
 
     def forget(self) -> None:
-        """Let go of what was read, so that it is read again."""
+        """Drop what was read, so that it is read again."""
         self._window = b""
 
     def grow(self) -> bool:
-        """Look at the size again; whether it grew.
+        """Update the size; return whether it grew.
 
         Raises:
             LogDamagedError: it is smaller.
@@ -75,7 +75,7 @@ class Store(ABC):
         return False
 
     def changed(self) -> bool:
-        """Whether it was written to since it was opened, but to go on with it."""
+        """Whether it was written to since it was opened, other than by its recorder."""
         return False
 
     def peek(self, offset: int, count: int) -> bytes:
@@ -140,7 +140,7 @@ class Store(ABC):
 
 
 class FileStore(Store):
-    """A file of this machine, closed and opened again where many others are open."""
+    """A local file, closed and reopened when many others are open."""
 
     def __init__(self, path: Path) -> None:
         """Open the file.
@@ -314,7 +314,7 @@ class OnePass(Store):
         return count
 
     def pass_to(self, place: int) -> int:
-        """Go on to a place, if that is farther; the checksum up to there, if it is no farther."""
+        """Read on to a place; return the checksum of all bytes up to where reading got."""
         for block in self._store.blocks(self._at, place):
             self._take(self._at, block)
         return self._crc

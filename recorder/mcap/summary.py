@@ -43,7 +43,7 @@ _INDEXES: Final = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_
 
 @dataclass(slots=True)
 class Summary:
-    """What stands between the data and the end of a log.
+    """The records between the data and the footer of a log.
 
     Attributes:
         begin: place in the file where the data ends.
@@ -113,7 +113,7 @@ class Summary:
 
 
 def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summary | None:
-    """Read the footer and the summary of a log, and take in what this defines.
+    """Read the footer and the summary of a log, and add its definitions.
 
     Returns:
         The summary as far as it can be read, or None where the file has no end.

@@ -131,7 +131,7 @@ def walked_table(
 
 
 def _no_record(data: ByteArray, at: int) -> str:
-    """Why no record of a chunk stands at a place."""
+    """Why the bytes at a place of a chunk are no record."""
     left = len(data) - at
     if left < RECORD_HEADER.size:
         return f"{left} bytes at its end are no record"

@@ -1,4 +1,4 @@
-"""Where everything stands in a log: one walk over its outer records, trusting none of them.
+"""The structure of a log: found by a walk over its outer records, or stated by its summary.
 
 The walk needs no index: it finds chunks, loose messages, metadata and attachments in
 whole files, in files without a summary, and in files that were cut anywhere. What the
@@ -147,7 +147,7 @@ class LogStructure:
         return True
 
     def _record_at(self, start: int, stop: int | None, opcode: Opcode) -> None:
-        """Take in a record that the summary names."""
+        """Read a record that the summary names."""
         head = self._file.peek(start, RECORD_HEADER.size).ljust(RECORD_HEADER.size, b"\0")
         found, length = RECORD_HEADER.unpack(head)
         if found != opcode or stop not in (None, start + RECORD_HEADER.size + length):

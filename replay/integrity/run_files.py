@@ -1,4 +1,4 @@
-"""Does a run prove itself: its signals, and the files beside its log."""
+"""Checking a run: its signals, and the files beside its log."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from replay.storage.identity import file_sha256
 
 
 class RunPass:
-    """Looks at what a run states of itself while the chunks of its log are decoded.
+    """Checks a run against what it states while the chunks of its log are decoded.
 
     Args:
         log: of the run, whole.
@@ -38,22 +38,22 @@ class RunPass:
         self._hash, self._expected = SignalsHash(), 0
         self._batches: BatchReader | None = None
         self._found: list[Problem] = []
-        with self._telling():
+        with self._catching():
             header = read_header(log)
             if self._stated is not None and header.schema == SCHEMA_VERSION:
                 self._batches = BatchReader(log, header, reader.channels, topics=(SIGNALS_TOPIC,))
 
     def add(self, segment: Segment) -> None:
-        """Take in the next chunk of the log."""
+        """Check the next chunk of the log."""
         table = self._reader.table(segment)
-        with self._telling():
+        with self._catching():
             if self._batches is not None and table is not None:
                 for batch in self._batches.take(table):
                     self._add(batch)
 
     def finish(self) -> None:
-        """Hear that there is no further chunk."""
-        with self._telling():
+        """Compare the signals with what the run states, after the last chunk."""
+        with self._catching():
             if self._batches is not None:
                 self._add(self._batches.rest())
                 if self._hash.hexdigest() != self._stated:
@@ -100,7 +100,7 @@ class RunPass:
             self._hash.add(signals)
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _catching(self) -> Iterator[None]:
         try:
             yield
         except CdmisfaError as error:

@@ -134,27 +134,27 @@ def _broken(images: ImageStream) -> Iterator[Problem]:
 
 
 class _ViewPass:
-    """Looks at the frames of one file of a recording while its chunks are decoded."""
+    """Checks the frames of one file of a recording while its chunks are decoded."""
 
     def __init__(self, path: Location, reader: LogReader) -> None:
         self.path = path
         self.view: ViewFile | None = None
         self.error: LogDamagedError | None = None
-        with self._telling():
-            self.view = ViewFile(path, passing=reader)
+        with self._catching():
+            self.view = ViewFile(path, reader=reader)
 
     def add(self, segment: Segment) -> None:
-        with self._telling():
+        with self._catching():
             if self.view is not None and self.error is None:
-                self.view.pass_over(segment)
+                self.view.check_chunk(segment)
 
     def finish(self) -> None:
-        with self._telling():
+        with self._catching():
             if self.view is not None:
-                self.view.passed()
+                self.view.finish()
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _catching(self) -> Iterator[None]:
         try:
             yield
         except LogDamagedError as error:
@@ -186,7 +186,7 @@ def _check_file(
 
 
 def _pass_of(path: Location, reader: LogReader, beside: bool) -> _ViewPass | RunPass | None:
-    """What looks at a log's content while it is decoded, where it is one of ours."""
+    """The check of a log's content while it is decoded, if it is a recording or a run."""
     kind = kind_of(reader)
     if kind == "run" and isinstance(path, Path) and reader.complete:
         return RunPass(path, reader, beside=beside)

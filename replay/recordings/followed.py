@@ -18,7 +18,7 @@ from replay.recordings.source import RecordedSource
 from replay.storage.opening import log_files
 
 POLL: Final = 0.1
-"""Seconds between two looks at the files."""
+"""Seconds between polls of the files."""
 
 
 class ReplacedError(CdmisfaError):
@@ -28,7 +28,7 @@ class ReplacedError(CdmisfaError):
 
 
 class FollowedSource(ClockedSource):
-    """The views of a recording, of which more frames come while it is read.
+    """The views of a recording that grows while it is read.
 
     A recorder hands over whole seconds of frames; a block that is not there yet is waited
     for, until the recorder finishes its files. One that is resumed writes its unfinished files
@@ -184,7 +184,7 @@ class FollowedSource(ClockedSource):
         _add(self._sha256, block)
 
     def _wait(self, there: Callable[[], bool], what: str) -> None:
-        """Look at the files until something is there, they are finished or nothing comes."""
+        """Poll the files until something is there, they are finished, or the timeout is over."""
         if there():
             return
         deadline = time.monotonic() + self._timeout
@@ -214,7 +214,7 @@ class FollowedSource(ClockedSource):
         return self._source.frames if self._source is not None else 0
 
     def _look(self) -> CdmisfaError | None:
-        """Take in what was added to the files; give why that cannot be (yet)."""
+        """Read what was added to the files; return why that is not possible (yet)."""
         try:
             seen = [(path, _state(path)) for path in log_files(self._path)]
             if seen == self._seen:

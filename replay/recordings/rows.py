@@ -20,7 +20,7 @@ from recorder.mcap.records import Channel, MalformedRecord, Segment
 from recorder.mcap.tables import MessageTable
 
 
-class Run(NamedTuple):
+class RowRange(NamedTuple):
     """The frames [start, stop), as the messages of a channel from `row` on."""
 
     start: int
@@ -71,13 +71,13 @@ class ChannelRows:
         facts: the clock of the recording.
 
     Attributes:
-        runs: the frames that are there; one, except where gaps and damage are left out.
+        row_ranges: the frames that are there; one, except where gaps and damage are left out.
         layout: where the messages hold their values, once a message is known.
     """
 
     def __init__(self, reader: LogReader, channel: Channel, facts: ViewMetadata) -> None:
         self.channel = channel
-        self.runs: list[Run] = []
+        self.row_ranges: list[RowRange] = []
         self.layout: RowLayout | None = None
         self._reader = reader
         self._facts = facts
@@ -105,7 +105,7 @@ class ChannelRows:
                 if self._take(segment):
                     self._unconfirmed.add(len(self._segments) - 1)
             first, count = self._facts.first_frame, self._starts[-1]
-            self.runs = [Run(first, first + count, 0)] if count else []
+            self.row_ranges = [RowRange(first, first + count, 0)] if count else []
             return
         for segment in new:
             self.add(segment)
@@ -116,7 +116,7 @@ class ChannelRows:
             return
         number = len(self._segments) - 1
         if not (self._reader.salvage and self._reader.table(segment) is None):
-            self._number(self._times(number), self._starts[number], self.runs)
+            self._number(self._times(number), self._starts[number], self.row_ranges)
 
     def check_last(self, segment: Segment) -> None:
         """Check how messages are laid out in the chunk that was added last, if it is whole.
@@ -132,7 +132,7 @@ class ChannelRows:
     @property
     def ranges(self) -> list[tuple[int, int]]:
         """The frames [start, stop) that there are messages of."""
-        return [(run.start, run.stop) for run in self.runs]
+        return [(one.start, one.stop) for one in self.row_ranges]
 
     def payload(self, frame: int) -> bytes:
         """The message of a frame."""
@@ -140,13 +140,15 @@ class ChannelRows:
         return self._table(number).payload(low)
 
     def pieces(self, frame: int, count: int) -> Iterator[tuple[int, int, int]]:
-        """Where the messages of `count` frames of one run are, from a frame on.
+        """Where the messages of `count` frames of one range are, from a frame on.
 
         Returns:
             Of each chunk its number among those of the channel, the first message, and how many.
         """
-        run = self.runs[bisect.bisect_right(self.runs, frame, key=lambda run: run.start) - 1]
-        row = run.row + frame - run.start
+        one = self.row_ranges[
+            bisect.bisect_right(self.row_ranges, frame, key=lambda one: one.start) - 1
+        ]
+        row = one.row + frame - one.start
         stop, number = row + count, bisect.bisect_right(self._starts, row) - 1
         while row < stop:
             start, end = self._starts[number], min(self._starts[number + 1], stop)
@@ -200,12 +202,12 @@ class ChannelRows:
             self._segments.pop()
             self._starts.pop()
             stop = self._starts[-1]
-            runs = [run for run in self.runs if run.row < stop]
-            self.runs = [r._replace(stop=min(r.stop, r.start + stop - r.row)) for r in runs]
+            kept = [one for one in self.row_ranges if one.row < stop]
+            self.row_ranges = [r._replace(stop=min(r.stop, r.start + stop - r.row)) for r in kept]
             self._own = None
 
-    def _number(self, times: NDArray[np.uint64], row: int, found: list[Run]) -> None:
-        """Add the frames of messages from `row` on to the runs found."""
+    def _number(self, times: NDArray[np.uint64], row: int, found: list[RowRange]) -> None:
+        """Add the frames of messages from `row` on to the ranges found."""
         frames = self._facts.frames_at(times)
         exact = self._facts.times(frames) == times
         before = found[-1].stop if found else self._facts.first_frame
@@ -225,7 +227,7 @@ class ChannelRows:
             if last and last.stop == start and last.row + start - last.start == row + low:
                 found[-1] = last._replace(stop=start + count)
             else:
-                found.append(Run(start, start + count, row + low))
+                found.append(RowRange(start, start + count, row + low))
 
     def _remedy(self) -> str:
         if self._reader.salvage:
@@ -265,7 +267,7 @@ class ChannelRows:
             )
         if number in self._unconfirmed:
             first = self._facts.first_frame
-            self._number(own.log_time, row, [Run(first, first + row, 0)] if row else [])
+            self._number(own.log_time, row, [RowRange(first, first + row, 0)] if row else [])
             self._unconfirmed.remove(number)
         self._own = number, own
         return own

@@ -21,7 +21,7 @@ from replay.recordings.view_file import ViewFile, intersection
 from replay.storage.identity import Identity, LoggedSource, log_identity
 from replay.storage.location import Location, Url
 from replay.storage.opening import log_files
-from replay.stored import joined
+from replay.stored import merged
 
 _FURTHER_PART: Final = re.compile(rf".+-(?!000)\d{{3,}}\.mcap{re.escape(PARTIAL)}")
 _SMALLEST: Final = 64
@@ -83,12 +83,12 @@ class RecordedSource(LoggedSource):
         self._t = self._first
 
     def refresh(self) -> bool:
-        """Take in what a recorder wrote since: more frames, and further parts of a view.
+        """Read what a recorder wrote since: more frames, and further parts of a view.
 
         What is there already is not read again.
 
         Returns:
-            False, and nothing was taken in, where a file was removed or replaced.
+            False, and nothing was read, where a file was removed or replaced.
 
         Raises:
             UsageError: no such recording any more.
@@ -114,7 +114,8 @@ class RecordedSource(LoggedSource):
             for view in added:
                 view.close()
             raise
-        self._files, self._known, self._views = [v.path for v in opened + added], None, views
+        self._files, self._views = [v.path for v in opened + added], views
+        self._identities = None
         self._set_clock()
         return True
 
@@ -177,12 +178,12 @@ class RecordedSource(LoggedSource):
         """Find the frames that every view has, whole."""
         coverage = self.coverage()
         covered = list(coverage.values())
-        self._held = [joined(ranges) for ranges in covered]
+        self._held = [merged(ranges) for ranges in covered]
         self.gaps = self._views[0][0].facts.gaps
         common = self._whole() if self.gaps else functools.reduce(intersection, covered)
         if not common:
             raise LogDamagedError(f"{self._name()}: no frame is there, whole, in every view")
-        self._ranges = joined(common)
+        self._ranges = merged(common)
         lengths = (stop - start for start, stop in self._ranges)
         self._range_starts = list(itertools.accumulate(lengths, initial=0))
         self._first = self._ranges[0][0]

@@ -52,25 +52,26 @@ class ViewFile:
         path: Location,
         *,
         salvage: bool = False,
-        passing: LogReader | None = None,
+        reader: LogReader | None = None,
     ) -> None:
         """Open one view's file and check the times of its frames.
 
         Args:
             path: the file.
             salvage: leave out what is damaged.
-            passing: its reader, where `pass_over` is told of the chunks that this gives.
+            reader: of the file, which the caller closes; then no frame is known until
+                `check_chunk` was called with each chunk, and `finish`.
 
         Raises:
             LogDamagedError: it is damaged, or no view of a recording.
         """
         self.path = path
-        self._passing = passing is not None
-        self.reader = passing or LogReader(open_store(path), salvage=salvage)
+        self._by_chunk = reader is not None
+        self.reader = reader or LogReader(open_store(path), salvage=salvage)
         try:
             self._open()
         except BaseException:
-            if passing is None:
+            if reader is None:
                 self.reader.close()
             raise
 
@@ -89,11 +90,11 @@ class ViewFile:
         if facts.truth:
             self._channels.append(self._channel(TRUTH_TOPIC, TRUTH_SCHEMA))
         self.ranges: list[tuple[int, int]] = []
-        if not self._passing:
+        if not self._by_chunk:
             self._number()
 
     def refresh(self, path: Path) -> None:
-        """Take in the frames that a recorder wrote since; it may have renamed the file."""
+        """Read the frames that a recorder wrote since; it may have renamed the file."""
         self.path = path
         self.reader.moved(path)
         if self.reader.refresh():
@@ -135,8 +136,8 @@ class ViewFile:
         for _, which, number, low, at, stop in sorted(pieces):  # each chunk is decoded once
             self._channels[which].read(number, low, outs[which][at:stop])
 
-    def pass_over(self, segment: Segment) -> None:
-        """Look at every frame of the next chunk of the file, and copy none.
+    def check_chunk(self, segment: Segment) -> None:
+        """Check every frame of the next chunk of the file, without copying any.
 
         Raises:
             LogDamagedError: a time is no frame's, or a message is laid out unlike the others.
@@ -147,20 +148,20 @@ class ViewFile:
         for rows in self._channels:
             rows.check_last(segment)
 
-    def passed(self) -> None:
-        """Hear that there is no further chunk: `ranges` are known."""
+    def finish(self) -> None:
+        """Set `ranges`, after the last chunk was checked."""
         self._find_ranges()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self.reader.close()
 
     def _find_layouts(self) -> None:
-        """Find where messages hold their values, once there is a frame to look at."""
+        """Determine where messages hold their values, from the first frame."""
         frames = self._channels[0]
-        if frames.layout is not None or not frames.runs:
+        if frames.layout is not None or not frames.row_ranges:
             return
-        payload = self._find_payload(frames.payload(frames.runs[0].start))
+        payload = self._find_payload(frames.payload(frames.row_ranges[0].start))
         place = payload.tail + payload.size
         marks = {place + len(payload.before) - i: b for i, b in enumerate(payload.before)}
         least = place + len(payload.before)
