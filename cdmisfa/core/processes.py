@@ -66,26 +66,18 @@ class Workers:
 
     Args:
         jobs: how many.
-        start: called first in each process; importable by name, as is all that they compute.
-        arguments: of `start`.
         environment: variables of the processes, set before they import anything.
     """
 
-    def __init__(
-        self,
-        jobs: int,
-        start: Callable[..., None] | None = None,
-        arguments: tuple[Any, ...] = (),
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
-        self._setup = dict(environment or {}), start, arguments
+    def __init__(self, jobs: int, environment: Mapping[str, str] | None = None) -> None:
+        self._environment = dict(environment or {})
         self._threads = ThreadPoolExecutor(jobs)
         self._own = threading.local()
         self._processes: list[BaseProcess] = []
         self._closed = False
 
     def submit(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
-        """Have one of them call a function."""
+        """Have one of them call a function, which is importable by name."""
         return self._threads.submit(self._call, function, arguments)
 
     def close(self) -> None:
@@ -122,7 +114,7 @@ class Workers:
             if self._closed:
                 raise BrokenProcessPool("the worker processes were closed")
             ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, *self._setup), daemon=True)
+            process = context.Process(target=_serve, args=(theirs, self._environment), daemon=True)
             process.start()
             self._processes.append(process)
         theirs.close()
@@ -147,20 +139,13 @@ def _without_main_and_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(
-    pipe: Connection,
-    environment: Mapping[str, str],
-    start: Callable[..., None] | None,
-    arguments: tuple[Any, ...],
-) -> None:
+def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
     """Answer calls from a pipe until its other end is gone; the main function of a worker."""
     os.environ.update(environment)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            message = pipe.recv_bytes()
-            pipe.send_bytes(_answer(message, start, arguments))
-            start = None
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
 
 
 def _end_with_parent() -> None:
@@ -169,11 +154,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _answer(message: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> bytes:
+def _answer(message: bytes) -> bytes:
     """The pickled pair (failed, result or exception) of a pickled call."""
     try:
-        if start is not None:
-            start(*arguments)
         function, given = pickle.loads(message)
         return pickle.dumps((False, function(*given)))
     except BaseException as error:
@@ -296,7 +279,7 @@ class LocalPool(Workers):
     attempts = ATTEMPTS
 
     def __init__(self, jobs: int) -> None:
-        super().__init__(jobs, environment=ONE_THREAD)
+        super().__init__(jobs, ONE_THREAD)
         self.width = jobs + 1
 
 
