@@ -23,14 +23,15 @@ from recorder.images.options import Depth
 from recorder.images.pixels import (
     DISTANCES,
     MalformedImage,
+    Shown,
     compressed_image,
     compressed_words,
     raw_image,
 )
 from recorder.images.videos import Packet, VideoPackets
 
-Decoder = Callable[[bytes | memoryview], ByteArray]
-"""Turns a message into a gray image, (height, width) uint8; raises MalformedImage.
+Decoder = Callable[[bytes | memoryview], Shown]
+"""Turns a message into an image or numbers; raises MalformedImage.
 
 One that is `VideoPackets` has to be called with the messages in their order.
 """
@@ -108,7 +109,7 @@ def holds_distances(schema: str, encoding: str, data: bytes | memoryview) -> boo
 
 
 def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
-    """What opens Foxglove's images, of which logs need not state a definition; None of others."""
+    """The parser of Foxglove's images in protobuf, which need no definition; None of others."""
     for kind in (RawImage, CompressedImage, CompressedVideo):
         if (schema, encoding) == (kind.DESCRIPTOR.full_name, "protobuf"):
             return partial(_protobuf, kind)
@@ -181,7 +182,7 @@ class _RosFields:
 
 
 def _foxglove(opened: Callable[[Any, bytes | memoryview], Any], kind: Any) -> Callable[..., Any]:
-    """What reads messages of Foxglove in protobuf, or in JSON."""
+    """The reader of messages of Foxglove in protobuf, or in JSON."""
 
     def read(data: bytes | memoryview) -> Pixels | Compressed | Packet:
         m = opened(kind, data)

@@ -1,4 +1,4 @@
-"""Tables read by PyArrow; CSV as it is met, with other separators and words among numbers."""
+"""Tables read by PyArrow; CSV also with other separators, and words among numbers."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _NUMBER: Final = r"^[ \t]*[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI
 
 
 class Words(NamedTuple):
-    """Words in a column of numbers: the first one's row, from 0, and text; all of it in words."""
+    """Words in a column of numbers: the row, from 0, and text of the first; and the warning."""
 
     row: int
     text: str
@@ -99,7 +99,7 @@ def read_table(path: Path) -> LoadedTable:
 
 
 def called(path: Path, row: int) -> str:
-    """What a row is called: the line of a CSV file, from 1; of others the row, from 0."""
+    """How warnings name a row: the line of a CSV file, from 1; of others the row, from 0."""
     return f"line {line_of(path, row)}" if path.suffix.lower() == ".csv" else f"row {row}"
 
 
@@ -172,7 +172,7 @@ def _read_csv(path: Path) -> LoadedTable:
 
 
 def _cut_line(path: Path, separator: str) -> str | None:
-    """What the user should know of a last line that was cut; None where lines are alike.
+    """A warning that the last line was cut; None where all lines have as many cells.
 
     Raises:
         UsageError: the file begins with a comment.
@@ -202,7 +202,7 @@ def _in_words(count: int) -> str:
 
 
 def _written(path: Path, head: str) -> tuple[str, str]:
-    """What separates the columns of a CSV file, and what the decimals of its numbers."""
+    """The separator and the decimal sign of a CSV file."""
     names, *lines = head.splitlines() or [""]
     separator = _separator(names)
     if separator == ",":
@@ -219,7 +219,7 @@ def _written(path: Path, head: str) -> tuple[str, str]:
 
 
 def _separator(names: str) -> str:
-    """What separates the columns, by the line of their names."""
+    """The separator, by the line of names."""
     bare = _QUOTED.sub("", names)
     return next((s for s in (",", ";", "\t") if s in bare), ",")
 

@@ -14,7 +14,7 @@ import rerun as rr
 
 from replay.playing.feed import Playback, Played, frames_feed, opened_source, paced
 from replay.view.build import recording_layout, view_entities
-from replay.view.columns import frames_column, line_column
+from replay.view.columns import Target
 from replay.view.labels import label
 from replay.view.properties import APPLICATION
 from replay.viewer.broadcast import Broadcast
@@ -55,11 +55,10 @@ def play_in_rerun(
         stack.callback(broadcast.close)
         recording.send_recording_name(label(paths[0].resolve().stem))
         recording.send_blueprint(recording_layout(spec, first + source.frames))
-        columns = [frames_column(recording, spec, entity) for entity in view_entities(spec)]
+        target = Target(recording, spec)
+        columns = [target.frames(entity) for entity in view_entities(spec)]
         if spec.truth:
-            columns.append(
-                line_column(recording, spec, "world/truth", spec.truth, every_frame=True)
-            )
+            columns.append(target.lines("world/truth", spec.truth, every_frame=True))
         broadcast.hand_over()
         announce(broadcast.address)
         next_time = 0.0
