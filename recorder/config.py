@@ -124,7 +124,7 @@ def check_view_names(names: tuple[str, ...], key: str) -> None:
 
 
 def view_names(streams: Sequence[str]) -> tuple[str, ...]:
-    """Streams of others as names of views, which are those of files: "/cam/left" is cam_left.
+    """Names of views, valid as file names, from names of streams: "/cam/left" is cam_left.
 
     Letters lose their accents, those of other scripts stay.
     """
