@@ -1,4 +1,4 @@
-"""What a source shows, recorded while it is watched."""
+"""Record a source while it is learned from."""
 
 from __future__ import annotations
 

@@ -246,7 +246,7 @@ class ViewLogs:
         self._logs[block.stream].write(block)
 
     def add_metadata(self, stream: int, name: str, values: Mapping[str, str]) -> None:
-        """Write what is known only now of a stream, as a metadata record."""
+        """Add a metadata record to the log of a stream."""
         self._logs[stream].add_metadata(name, values)
 
     def finish(self) -> list[ViewRecording]:
@@ -339,7 +339,7 @@ def recording_spec(
     settings: RecordConfig,
     scene: OpenScene | None,
 ) -> RecordingSpec:
-    """What a recording of a source states.
+    """What is recorded of a source.
 
     Raises:
         UsageError: no recording can hold it.

@@ -1,4 +1,4 @@
-"""What words of a command line name, opened: recordings of ours, and camera logs of others."""
+"""Logs that words of a command line name: found, and opened as sources of frames."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def open_log(
     salvage: bool = False,
     goal: tuple[str, str] = ("learn", "RUN"),
 ) -> Logged:
-    """Open a recording of ours, or what else holds images.
+    """Open one of our recordings, or camera logs of others.
 
     Args:
         paths: the folder of a recording or its views' files, or camera logs of others.
@@ -62,7 +62,7 @@ def open_log(
 def open_to_look(
     paths: Sequence[Location], cameras: CameraOptions | None = None, *, salvage: bool = False
 ) -> Logged:
-    """Open what `open_log` does, with every topic of images; those that differ by their times.
+    """Open logs to view, export or play: every topic of images, aligned by time if need be.
 
     What `cameras` choose is opened as they say.
 
@@ -110,7 +110,7 @@ def holds_run(path: Path) -> bool:
 
 
 def refuse_what_is_no_log(path: Location) -> None:
-    """Refuse a run, and a file of another kind, neither of which is a damaged recording.
+    """Refuse a run, or a file that is no log.
 
     Raises:
         UsageError: it is one of them.

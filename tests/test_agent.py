@@ -46,15 +46,6 @@ class Bench(KernelAgent):
         return float((self.agent.recent_square - self.agent.recent_mean**2)[0])
 
 
-def test_it_begins_with_nothing_known_and_the_stream_it_is_told() -> None:
-    bench = Bench(first=2)
-    told = bench.memory
-    assert (told["stream"], told["module"], told["iteration"]) == (2, 1, 0)
-    assert (told["epsilon"], told["share"]) == (1.2, 1.0)
-    assert not bench.agent.policy.any()
-    assert np.isnan(bench.agent.eta).all()
-
-
 def test_rewards_begin_after_the_warm_up() -> None:
     bench = Bench(warm_up=2)
     outs = [bench.step(xi) for xi in (0.5, 0.3, 0.2, 0.1)]
@@ -280,13 +271,6 @@ def test_the_next_stream_follows_from_the_action(
         assert bench.memory["stream"] == stream
         assert (stream == out["stream"]) == (out["action"] == 0 or n == 1)
         assert np.isfinite(bench.values()).all()
-
-
-def test_without_exploration_the_policy_decides() -> None:
-    bench = Bench(epsilon_start=1e-6, warm_up=0)
-    bench.agent.policy[:] = [1, 1, 1]
-    out = bench.step(draws=(0.5, 0.0, 0.6))
-    assert (out["action"], out["explored"], out["next_stream"]) == (1, False, 2)
 
 
 def test_ten_thousand_streams_need_memory_in_proportion() -> None:

@@ -56,72 +56,84 @@ def values(source: FrameSource, n: int) -> list[tuple[int, int, list[int]]]:
     return [(b.stream, b.t, b.frames[:, 0, 0].tolist()) for b in blocks]
 
 
-def test_steady_cameras_show_each_picture_once() -> None:
-    source = opened([*steady(0, 0, 40), *steady(1, 0.01, 40)], 2)
+def late() -> list[Arrival]:
+    """Pictures 10 to 25 are taken in time, but half a second on their way."""
+    script = steady(0, 0, 60)
+    for k in range(10, 26):
+        script[k] = script[k]._replace(comes=10 / FPS + 0.5 + (k - 10) * 1e-6, taken=k / FPS)
+    return script
+
+
+def disordered() -> list[Arrival]:
+    script = steady(0, 0, 30)
+    script[8] = script[8]._replace(comes=9.5 / FPS, taken=8 / FPS)
+    return script
+
+
+PAUSED = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
+EACH_TICK = {
+    "steady": (
+        [steady(0, 0, 40), steady(1, 0.01, 40)],
+        {},
+        [(0, 0, [*range(13)]), (1, 0, [*range(13)])],
+        {"left repeated": 0, "left dropped": 0, "left missing": 0, "right repeated": 0},
+    ),
+    "a slower one repeats, a faster one drops": (
+        [steady(0, 0, 60), steady(1, 0, 20, 10), steady(2, 0, 120, 60)],
+        {},
+        [(0, 0, [0, 1, 2, 3, 4, 5]), (1, 0, [0, 0, 0, 1, 1, 1]), (2, 0, [1, 3, 5, 7, 9, 11])],
+        {"right repeated": 4, "third dropped": 6},
+    ),
+    "a stall is a gap, no picture that stands still": (
+        [PAUSED, steady(1, 0, 90)],
+        {"hold": 0.1},
+        [(0, 0, [*range(31), 30, 30]), (0, 60, [*range(60, 70)]), (1, 0, [*range(70)])],
+        {"left missing": 27, "left repeated": 2},
+    ),
+    # it waits 0.21 s for picture 10, 11 ... of which those are late whose ticks had to be decided
+    "too late a picture changes no tick and keeps its time": (
+        [late(), steady(1, 0, 60)],
+        {"hold": 0.02, "patience": 0.21},
+        [(0, 0, [*range(10)]), (0, 19, [*range(19, 40)]), (1, 0, [*range(40)])],
+        {"left late": 9, "left missing": 9},
+    ),
+    "in the wrong order they are not shown": (
+        [disordered()],
+        {"hold": 1.0},
+        [(0, 0, [0, 1, 2, 3, 4, 5, 6, 7, 7, 9, 10, 11])],
+        {"left disordered": 1},
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("scripts", "options", "shown", "counts"), EACH_TICK.values(), ids=EACH_TICK
+)
+def test_each_tick_shows_the_last_picture_at_or_before_it(
+    scripts: list[list[Arrival]], options: Any, shown: Any, counts: dict[str, int]
+) -> None:
+    source = opened([arrival for script in scripts for arrival in script], len(scripts), **options)
     assert isinstance(source, FrameSource)
     assert not isinstance(source, SeekableSource)
-    # the clock begins half a tick after the first picture of the last camera
+    ticks = max(t + len(frames) for _, t, frames in shown)
+    assert values(source, ticks) == shown
+    assert source.t == ticks
+    for what, count in counts.items():
+        stream, counted = what.split()
+        assert source.alignment[stream][counted] == count
+
+
+def test_the_clock_begins_half_a_tick_after_the_first_picture_of_the_last_camera() -> None:
+    source = opened([*steady(0, 0, 40), *steady(1, 0.01, 40)], 2)
     assert source.spec.start_ns == BEGIN + 10**7 + round(1e9 / 60)
-    assert values(source, 3) == [(0, 0, [0, 1, 2]), (1, 0, [0, 1, 2])]
-    block = source.take(1, 10)
-    assert (block.t, block.frames[:, 0, 0].tolist()) == (3, list(range(3, 13)))
-    assert source.t == 13
-    assert {c["repeated"] + c["dropped"] + c["missing"] for c in source.alignment.values()} == {0}
-
-
-def test_a_slower_camera_repeats_and_a_faster_one_drops() -> None:
-    source = opened([*steady(0, 0, 60), *steady(1, 0, 20, 10), *steady(2, 0, 120, 60)], 3)
-    shown = values(source, 6)
-    assert shown[0] == (0, 0, [0, 1, 2, 3, 4, 5])
-    assert shown[1] == (1, 0, [0, 0, 0, 1, 1, 1])
-    assert shown[2] == (2, 0, [1, 3, 5, 7, 9, 11])
-    counts = source.alignment
-    assert (counts["right"]["repeated"], counts["third"]["dropped"]) == (4, 6)
-
-
-def test_a_stall_is_a_gap_and_not_a_picture_that_stands_still() -> None:
-    script = [*steady(0, 0, 90)]
-    script = [arrival for arrival in script if not 1 < arrival.comes < 2]
-    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.1)
-    shown = values(source, 70)
-    held = [30, 30]
-    assert shown[0] == (0, 0, [*range(31), *held])
-    assert shown[1] == (0, 60, list(range(60, 70)))
-    assert shown[2] == (1, 0, list(range(70)))
-    assert source.alignment["left"]["missing"] == 27
-    assert source.alignment["left"]["repeated"] == 2
 
 
 def test_a_block_is_unbroken_and_the_clock_goes_on_behind_it() -> None:
-    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
-    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+    source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
     assert source.take(0, 20).t == 0
     block = source.take(0, 20)
     assert (block.t, source.t) == (60, 80)
     assert block.frames[:, 0, 0].tolist() == list(range(60, 80))
-
-
-def test_a_picture_that_comes_too_late_changes_no_tick_and_keeps_its_time() -> None:
-    script = steady(0, 0, 60)
-    # taken in time, but half a second on its way
-    script[10] = script[10]._replace(comes=10 / FPS + 0.5, taken=10 / FPS)
-    for k in range(11, 26):
-        script[k] = script[k]._replace(comes=10 / FPS + 0.5 + k * 1e-6, taken=k / FPS)
-    source = opened([*script, *steady(1, 0, 60)], 2, hold=0.02, patience=0.21)
-    shown = values(source, 40)
-    # it waits 0.21 s for picture 10, 11 ... of which those are late whose ticks had to be decided
-    assert shown[0] == (0, 0, list(range(10)))
-    assert shown[1] == (0, 19, list(range(19, 40)))
-    counts = source.alignment["left"]
-    assert (counts["late"], counts["missing"]) == (9, 9)
-
-
-def test_pictures_in_the_wrong_order_are_counted_and_not_shown() -> None:
-    script = steady(0, 0, 30)
-    script[8] = script[8]._replace(comes=9.5 / FPS, taken=8 / FPS)
-    source = opened(script, hold=1.0)
-    assert values(source, 12)[0][2] == [0, 1, 2, 3, 4, 5, 6, 7, 7, 9, 10, 11]
-    assert source.alignment["left"]["disordered"] == 1
 
 
 def test_the_rate_is_stated_or_measured_or_asked_for() -> None:
@@ -236,8 +248,7 @@ def test_a_recording_of_cameras_is_learned_from_while_it_is_written(tmp_path: Pa
 
 
 def test_a_gap_of_a_followed_recording_is_known_once_a_later_frame_came(tmp_path: Path) -> None:
-    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
-    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+    source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
     record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
     with contextlib.closing(FollowedSource(tmp_path / "rec")) as followed:
         whole = RecordedSource(tmp_path / "rec")
@@ -424,8 +435,7 @@ def test_waiting_for_a_camera_can_be_stopped() -> None:
 
 
 def test_recording_goes_on_until_it_is_stopped(tmp_path: Path) -> None:
-    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
-    source = opened([*script, *steady(1, 0, 300)], 2)
+    source = opened([*PAUSED, *steady(1, 0, 300)], 2)
     recorded = RecordedWhileWatched(source, tmp_path / "rec")
     seen: list[float] = []
     record_watched(recorded, stop=lambda: len(seen) == 80, progress=seen.append)
@@ -443,8 +453,7 @@ def test_recording_ends_with_the_cameras_and_says_why(tmp_path: Path) -> None:
 
 
 def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Path) -> None:
-    script = [arrival for arrival in steady(0, 0, 90) if not 1 < arrival.comes < 2]
-    source = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+    source = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
     record_watched(RecordedWhileWatched(source, tmp_path / "rec"), frames=90)
     assert check_log(tmp_path / "rec").ok
     assert export(tmp_path / "rec", tmp_path / "png", "images") == 90 - 29 + 90
@@ -456,7 +465,7 @@ def test_a_recording_with_gaps_is_shown_and_exported_with_its_gaps(tmp_path: Pat
         block = looped.take(0, 10)
         # it goes on at its beginning without a cut, as a programme that starts again
         assert (block.t, block.frames[:, 0, 0].tolist()) == (85, [*range(85, 90), *range(5)])
-        live = opened([*script, *steady(1, 0, 90)], 2, hold=0.02)
+        live = opened([*PAUSED, *steady(1, 0, 90)], 2, hold=0.02)
         looped.seek(0)
         for n in (1, 40, 30):
             for one, two in zip(live.take_all(n), looped.take_all(n), strict=True):

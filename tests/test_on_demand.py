@@ -81,15 +81,7 @@ def test_a_view_is_written_without_most_of_rerun(tmp_path: Path) -> None:
         "from cdmisfa.cli import main\n"
         "main()\n"
     )
-    words = [
-        "learn",
-        "oscillatory",
-        "--max-iterations",
-        "1",
-        "-o",
-        str(tmp_path / "run"),
-        "--force",
-    ]
+    words = ["learn", "oscillatory", "--max-iterations", "1", "-o", str(tmp_path / "run")]
     done = subprocess.run(
         [sys.executable, "-c", program, *words], capture_output=True, text=True, check=True
     )

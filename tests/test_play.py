@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from camera_files import pictures, write_cameras
 from conftest import Cdmisfa
-from test_view import rows_of
+from view_data import View
 from waiting import Clock
 
 from cdmisfa.core.errors import UsageError
@@ -253,7 +253,7 @@ def test_the_viewer_is_handed_every_frame(
     for number, piece in enumerate(taken[0].split(b"RRF2\0")[1:]):  # each is whole
         file = tmp_path / f"{number}.rrd"
         file.write_bytes(b"RRF2\0" + piece)
-        for entity, columns in rows_of(file).items():
+        for entity, columns in View(file).rows.items():
             if "Image:buffer" in columns:
                 rows = zip(columns["frame"], columns["Image:buffer"], strict=True)
                 shown[entity] += [(t, bytes(row[0])) for t, row in rows]

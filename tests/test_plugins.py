@@ -21,7 +21,9 @@ from PIL import Image
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.errors import UsageError
 from cdmisfa.core.registry import Registry
-from cdmisfa.experiments.sweep import plan
+from cdmisfa.experiments.sources import configure
+from cdmisfa.experiments.store import read_rows
+from cdmisfa.experiments.sweep import plan, sweep
 from recorder import RecordConfig, open_scene, record, record_scene
 from recorder.cameras.words import CAMERAS
 from recorder.world.scenes import SCENES
@@ -180,6 +182,17 @@ def test_a_plugins_learner_learns_and_goes_on_where_it_was(
     cdmisfa(*words, "-o", tmp_path / "parts", "--max-iterations", 4, "--keyframes", 2)
     resumed = cdmisfa(*words, "-o", tmp_path / "parts", "--resume").json
     assert resumed["signals_sha256"] == whole["signals_sha256"]
+    assert resumed["mean"] == whole["mean"]
+    assert (tmp_path / "parts" / "run.mcap").is_file()
+    settings = ("learner.algorithm=watcher", "learner.patience=4")
+    swept = tmp_path / "swept"
+    sweep("oscillatory", swept, seeds=[0], settings=settings, grid={"learner.tau": [10, 20]})
+    assert [row["result"]["frames"] for row in read_rows(swept)] == [40, 80]
+    with pytest.raises(UsageError, match=r"learner\.tua: did you mean learner\.tau\?"):
+        configure("oscillatory", settings=("learner.algorithm=watcher", "learner.tua=3"))
+    preset = tomllib.loads((TOY / "cdmisfa_toy" / "watcher.toml").read_text())["learner"]
+    own = configure("oscillatory", settings=settings[:1]).learner
+    assert {key: getattr(own, key) for key in preset} == preset
 
 
 @pytest.mark.usefixtures("environment")

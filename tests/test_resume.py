@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import Cdmisfa
 from folders import contents
@@ -22,9 +21,9 @@ from waiting import wait_for
 
 from cdmisfa.agents.learner import CuriousLearner
 from cdmisfa.core.blocks import Block, FrameSource
-from cdmisfa.core.config import LearnerConfig, differences
+from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
-from cdmisfa.core.learning import Keyframe, Learner, LearnerState, Sink
+from cdmisfa.core.learning import Keyframe, Learner, Sink
 from cdmisfa.core.signals import BlockSignals
 from cdmisfa.experiments.loop import Keyframes
 from cdmisfa.experiments.resume import SET_ASIDE
@@ -99,15 +98,8 @@ def test_a_stopped_run_goes_on_bit_for_bit(whole: Path, tmp_path: Path, stopped:
     assert first_difference(whole, out) is None
     assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
     assert not list(out.glob("*.partial"))
-    kept = keyframes(out)
-    assert kept == sorted({*range(EVERY, LENGTH + 1, EVERY), stopped, LENGTH})
-
-
-def test_a_run_says_that_it_was_resumed(tmp_path: Path) -> None:
-    go(OscillatorySource(), tmp_path / "run", 30)
-    go(OscillatorySource(), tmp_path / "run", 40, resume=True)
-    texts = [event.text for event in parts_of(tmp_path / "run", "events")]
-    assert "resumed at iteration 30" in texts
+    assert keyframes(out) == sorted({*range(EVERY, LENGTH + 1, EVERY), stopped, LENGTH})
+    assert f"resumed at iteration {stopped}" in [e.text for e in parts_of(out, "events")]
 
 
 def test_the_first_algorithm_goes_on_too(tmp_path: Path) -> None:
@@ -195,52 +187,59 @@ def test_kill_9_anywhere_loses_nothing(whole: Path, tmp_path: Path) -> None:
     assert result.signals_sha256 == go(OscillatorySource(), None, LENGTH).signals_sha256
 
 
-def test_a_kill_while_resuming_loses_nothing(whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
+def cut(share: float) -> Callable[[Path], None]:
+    """Leave a part of the log, as a kill or a crash does."""
+
+    def left(out: Path) -> None:
+        go(OscillatorySource(), out, 57)
+        log = (out / "run.mcap").read_bytes()
+        (out / "run.mcap").unlink()
+        (out / "run.mcap.partial").write_bytes(log[: int(len(log) * share)])
+
+    return left
+
+
+def killed_while_resuming(out: Path) -> None:
     go(OscillatorySource(), out, 50)
     half = (out / "run.mcap").read_bytes()
     (out / "run.mcap").rename(out / SET_ASIDE)
     (out / "run.mcap.partial").write_bytes(half[: len(half) // 3])
-    go(OscillatorySource(), out, LENGTH, resume=True)
-    assert first_difference(whole, out) is None
 
 
-@pytest.mark.parametrize("part", [0.2, 0.5, 0.8, 0.95])
-def test_a_log_that_lost_its_end_goes_on_from_an_older_keyframe(
-    whole: Path, tmp_path: Path, part: float
-) -> None:
-    out = tmp_path / "run"
-    go(OscillatorySource(), out, 57)
-    log = (out / "run.mcap").read_bytes()
-    (out / "run.mcap").unlink()
-    (out / "run.mcap.partial").write_bytes(log[: int(len(log) * part)])
-    found = read_keyframe(out)
-    go(OscillatorySource(), out, LENGTH, resume=True)
-    assert first_difference(whole, out) is None
-    texts = [event.text for event in parts_of(out, "events")]
-    assert (found is not None) == (part > 0.2)
-    assert found is None or f"resumed at iteration {found.iteration}" in texts
+def killed_at_once(out: Path) -> None:
+    out.mkdir()
+    (out / "run.mcap.partial").write_bytes(b"")
 
 
-def test_a_run_from_before_keyframes_goes_on_from_its_beginning(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "run"
-    with monkeypatch.context() as before:
+def of_a_version_without_keyframes(out: Path) -> None:
+    with pytest.MonkeyPatch.context() as before:
         before.setattr(RunWriter, "keyframe", lambda *_: None)
         go(OscillatorySource(), out, 57)
     (out / "checkpoint-000000000057.npz").write_bytes(b"")
-    go(OscillatorySource(), out, LENGTH, resume=True)
-    assert first_difference(whole, out) is None
-    assert not list(out.glob("checkpoint*"))
 
 
-def test_a_kill_before_the_log_says_anything_starts_anew(whole: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("leave", "resumed_at"),
+    [
+        (cut(0.2), None),
+        (cut(0.5), 20),
+        (cut(0.8), 40),
+        (cut(0.95), 57),
+        (killed_while_resuming, 50),
+        (killed_at_once, None),
+        (of_a_version_without_keyframes, None),
+    ],
+)
+def test_whatever_is_left_of_a_run_goes_on_from_its_newest_keyframe(
+    whole: Path, tmp_path: Path, leave: Callable[[Path], None], resumed_at: int | None
+) -> None:
     out = tmp_path / "run"
-    out.mkdir()
-    (out / "run.mcap.partial").write_bytes(b"")
+    leave(out)
     go(OscillatorySource(), out, LENGTH, resume=True)
     assert first_difference(whole, out) is None
+    said = [event.text for event in parts_of(out, "events") if "resumed" in event.text]
+    assert said == ([] if resumed_at is None else [f"resumed at iteration {resumed_at}"])
+    assert not list(out.glob("checkpoint*"))
 
 
 @pytest.mark.parametrize(
@@ -343,23 +342,6 @@ def test_a_kill_while_a_run_is_replaced_leaves_none_or_says_how_to_go_on(
     assert cdmisfa("verify", run).code == 0
 
 
-def test_a_keyframe_gives_the_state_back(tmp_path: Path) -> None:
-    source = OscillatorySource()
-    out = tmp_path / "run"
-    go(source, out, 60)
-    found = read_keyframe(out)
-    assert found is not None
-    assert (found.iteration, found.t) == (60, 60 * CONFIG.tau)
-    state = found.state
-    learner = CuriousLearner(CONFIG, source.spec, 3)
-    learner.restore(state)
-    again = learner.state
-    assert again.policy_rng == state.policy_rng
-    assert len(again.modules) == len(state.modules) > 0
-    for name, array in state.arrays.items():
-        assert again.arrays[name].tobytes() == array.tobytes()
-
-
 @pytest.mark.parametrize(("last", "expected"), [(19, None), (20, 20), (59, 40), (10**6, 60)])
 def test_the_keyframe_at_or_before_an_iteration(
     tmp_path: Path, last: int, expected: int | None
@@ -405,22 +387,6 @@ def test_keyframes_wait_until_the_log_has_room_for_them(
         log.size += block
         keep.block(shown, signals, learner)
     assert [iteration for iteration, _ in log.kept] == expected
-
-
-def test_a_state_of_another_shape_is_refused() -> None:
-    source = OscillatorySource()
-    learner = CuriousLearner(CONFIG, source.spec, 0)
-    state = learner.state
-    arrays = {**state.arrays, "agent.eta": np.zeros(7)}
-    with pytest.raises(ValueError, match=r"agent\.eta"):
-        learner.restore(LearnerState(arrays, (), state.policy_rng))
-
-
-def test_differences_name_the_key() -> None:
-    assert list(differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}, "d": 4})) == [
-        ("a.c", 2, 3),
-        ("d", None, 4),
-    ]
 
 
 class TestWithoutItsSource:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
-import importlib
 import io
 import json
 import os
@@ -16,7 +15,6 @@ import socket
 import subprocess
 import sys
 import threading
-import tomllib
 from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -29,11 +27,9 @@ from camera_files import write_cameras
 from click.testing import CliRunner
 from conftest import Cdmisfa
 from engine_tasks import trace
-from pyarrow import parquet
 from waiting import wait_for
 
-from cdmisfa.cli.app import run as cdmisfa
-from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, results_command, sweep_command
+from cdmisfa.cli.commands.trials import parse_grid, parse_seeds, results_command, sweep_command
 from cdmisfa.core import processes
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError
@@ -95,20 +91,6 @@ def test_the_world_has_the_seed_of_the_trial_unless_it_was_given_one() -> None:
     assert free[1].id != fixed[1].id
 
 
-def test_a_preset_is_parsed_once_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    parsed: list[str] = []
-    parse = tomllib.loads
-    monkeypatch.setattr(tomllib, "loads", lambda text: parsed.append(text) or parse(text))
-    preset = tmp_path / "mine.toml"
-    preset.write_text("[learner]\nnu = 0.03\n")
-    grid = {"learner.sigma": [0, 0.0009]}
-    trials = plan("oscillatory", grid=grid, seeds=range(4), preset=str(preset))
-    assert (len(trials), len(parsed)) == (8, 1)
-    preset.write_text("[learner]\nnu = 0.04\n")
-    (changed,) = plan("oscillatory", grid={}, seeds=[0], preset=str(preset))
-    assert [t.configuration.learner.nu for t in (trials[0], changed)] == [0.03, 0.04]
-
-
 def test_a_worker_with_other_code_refuses() -> None:
     (trial,) = plan("oscillatory", grid={}, seeds=[0], max_iterations=5)
     assert "error" not in sweeping.compute(trial)
@@ -116,11 +98,17 @@ def test_a_worker_with_other_code_refuses() -> None:
     assert "not 0.0.0+another" in refused["error"]
 
 
-def test_a_recording_is_named_by_its_bytes(tmp_path: Path) -> None:
-    for name, frames in (("a", 200), ("b", 200), ("c", 300)):
+def test_a_recording_is_named_by_its_bytes_and_swept_as_its_scene_is(tmp_path: Path) -> None:
+    for name, frames in (("a", 3000), ("b", 3000), ("c", 300)):
         record_scene("oscillatory", tmp_path / name, frames=frames)
     a, b, c = (plan(tmp_path / n, grid={}, seeds=[0])[0] for n in ("a", "b", "c"))
     assert a.id == b.id != c.id
+    found = []
+    for source in (tmp_path / "a", "oscillatory"):
+        folder = tmp_path / f"sweep{len(found)}"
+        sweep(source, folder, seeds=[0, 1], max_iterations=30)
+        found.append([row["result"] for row in read_rows(folder)])
+    assert found[0] == found[1]
 
 
 def test_the_grid_is_checked_before_anything_runs(tmp_path: Path) -> None:
@@ -131,33 +119,18 @@ def test_the_grid_is_checked_before_anything_runs(tmp_path: Path) -> None:
     assert not (tmp_path / "s").exists()
 
 
-def test_a_trial_is_a_run(tmp_path: Path) -> None:
-    report = sweep("oscillatory", tmp_path, seeds=[5], keep_logs=True, max_iterations=600)
+def test_a_trial_is_a_run_and_its_log_is_made_up_for(tmp_path: Path) -> None:
+    sweep("oscillatory", tmp_path, seeds=[5], max_iterations=600)
+    bare = rows_of(tmp_path)
+    kept = {"seeds": [5], "max_iterations": 600, "keep_logs": True}
+    report = sweep("oscillatory", tmp_path, **kept)
+    assert (report.skipped, report.computed) == (0, 1)
+    assert rows_of(tmp_path) == bare
+    assert sweep("oscillatory", tmp_path, **kept).skipped == 1
     (row,) = read_rows(tmp_path)
     result = run(OscillatorySource(), LearnerConfig(), seed=5, max_iterations=600).as_json()
     assert row["result"] == {key: result[key] for key in row["result"]}
     assert (Path(row["run"]) / "run.mcap").is_file()
-    assert report.computed == 1
-
-
-def test_logs_change_nothing_and_are_made_up_for(tmp_path: Path) -> None:
-    sweep("oscillatory", tmp_path, seeds=[1], max_iterations=60)
-    bare = rows_of(tmp_path)
-    report = sweep("oscillatory", tmp_path, seeds=[1], max_iterations=60, keep_logs=True)
-    assert (report.skipped, report.computed) == (0, 1)
-    assert rows_of(tmp_path) == bare
-    again = sweep("oscillatory", tmp_path, seeds=[1], max_iterations=60, keep_logs=True)
-    assert again.skipped == 1
-
-
-def test_a_recording_is_swept_as_the_scene_is(tmp_path: Path) -> None:
-    record_scene("oscillatory", tmp_path / "log", frames=3000)
-    found = []
-    for source in (tmp_path / "log", "oscillatory"):
-        folder = tmp_path / f"sweep{len(found)}"
-        sweep(source, folder, seeds=[0, 1], max_iterations=30)
-        found.append([row["result"] for row in read_rows(folder)])
-    assert found[0] == found[1]
 
 
 def test_cameras_are_swept_with_the_learner_that_learn_takes(tmp_path: Path) -> None:
@@ -204,33 +177,22 @@ def test_live_streams_are_to_be_recorded_before_a_sweep(tmp_path: Path, cdmisfa:
 # Going on
 
 
-def test_trials_of_other_code_are_computed_again_and_it_is_said(
+def test_only_trials_of_other_code_are_computed_again_and_it_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30)
-    assert sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30).outdated == 0
-    monkeypatch.setattr(sweeping, "code", lambda: "0.0+other")
-    words = ["oscillatory", "--seeds", "0:3", "--max-iterations", "30", "-o", str(tmp_path)]
-    said = CliRunner().invoke(sweep_command, words)
-    assert said.exit_code == 0
-    assert "2 trials that were finished before are computed again: the code" in said.stderr
-    again = CliRunner().invoke(sweep_command, words)
-    assert "computed again" not in again.stderr
-
-
-def test_finished_trials_are_skipped(tmp_path: Path) -> None:
     calls: list[tuple[int, int, int]] = []
+    quick: dict[str, Any] = {"max_iterations": 30, "progress": lambda *n: calls.append(n)}
     sweep("oscillatory", tmp_path, seeds=[0, 1], max_iterations=30)
-    report = sweep(
-        "oscillatory",
-        tmp_path,
-        seeds=range(4),
-        max_iterations=30,
-        progress=lambda *numbers: calls.append(numbers),
-    )
-    assert (report.trials, report.skipped, report.computed) == (4, 2, 2)
+    report = sweep("oscillatory", tmp_path, seeds=range(4), **quick)
+    assert (report.trials, report.skipped, report.computed, report.outdated) == (4, 2, 2, 0)
     assert calls == [(3, 0, 4), (4, 0, 4)]
     assert len((tmp_path / ROWS).read_bytes().splitlines()) == 4
+    monkeypatch.setattr(sweeping, "code", lambda: "0.0+other")
+    words = ["oscillatory", "--seeds", "0:5", "--max-iterations", "30", "-o", str(tmp_path)]
+    said = CliRunner().invoke(sweep_command, words)
+    assert said.exit_code == 0
+    assert "4 trials that were finished before are computed again: the code" in said.stderr
+    assert "computed again" not in CliRunner().invoke(sweep_command, words).stderr
 
 
 def test_failed_trials_are_listed_and_retried_when_asked(
@@ -264,16 +226,15 @@ def test_a_trial_that_raises_fails_alone(tmp_path: Path) -> None:
     assert report.computed == 1
 
 
-def test_a_row_that_was_cut_short_is_computed_again(tmp_path: Path) -> None:
+def test_a_row_that_was_cut_short_is_computed_again_and_a_damaged_one_named(
+    tmp_path: Path,
+) -> None:
     sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30)
     whole = (tmp_path / ROWS).read_bytes()
     (tmp_path / ROWS).write_bytes(whole[:-10])
     assert len(list(read_rows(tmp_path))) == 2
     assert sweep("oscillatory", tmp_path, seeds=range(3), max_iterations=30).computed == 1
     assert (tmp_path / ROWS).read_bytes() == whole
-
-
-def test_a_damaged_row_is_named(tmp_path: Path) -> None:
     (tmp_path / ROWS).write_text('{"id": "a", "status": "done", "point": {}}\n{"id": 3}\n')
     with pytest.raises(LogDamagedError, match=r"rows\.jsonl line 2"):
         list(read_rows(tmp_path))
@@ -352,21 +313,14 @@ def test_a_stopped_sweep_says_how_to_go_on(tmp_path: Path, jobs: str) -> None:
 # Engines
 
 
-def test_a_killed_worker_costs_a_retry(tmp_path: Path) -> None:
-    tasks = [(str(tmp_path), n, "once" if n == 2 else "") for n in range(8)]
-    assert dict(run_all(trace, tasks, jobs=2)) == {n: n * n for n in range(8)}
-    attempts = {n: (tmp_path / str(n)).stat().st_size for n in range(8)}
-    assert attempts[2] == 2
-    assert sum(attempts.values()) <= 8 + 3
-
-
-def test_a_task_that_always_kills_its_worker_is_given_up_alone(tmp_path: Path) -> None:
-    tasks = [(str(tmp_path), n, "always" if n == 1 else "") for n in range(6)]
+def test_a_task_whose_worker_dies_is_tried_again_and_given_up_alone(tmp_path: Path) -> None:
+    modes = {1: "always", 2: "once"}
+    tasks = [(str(tmp_path), n, modes.get(n, "")) for n in range(8)]
     found = dict(run_all(trace, tasks, jobs=2))
-    given_up = found.pop(1)
-    assert isinstance(given_up, WorkerDied)
-    assert found == {n: n * n for n in (0, 2, 3, 4, 5)}
-    assert (tmp_path / "1").stat().st_size == processes.ATTEMPTS
+    assert isinstance(found.pop(1), WorkerDied)
+    assert found == {n: n * n for n in range(8) if n != 1}
+    attempts = [(tmp_path / str(n)).stat().st_size for n in range(8)]
+    assert attempts == [1, processes.ATTEMPTS, 2, 1, 1, 1, 1, 1]
 
 
 def busiest_worker() -> int:
@@ -452,23 +406,6 @@ def test_dask_gives_the_same_rows_though_a_worker_is_killed(
     assert rows_of(tmp_path / "dask") == local
 
 
-def reproduced(folder: Path, *words: str) -> list[dict[str, Any]]:
-    """Rows of a quick reproduction by the command."""
-    asked = ["reproduce", "stability", "--quick", "-o", str(folder), *words]
-    assert cdmisfa(asked) == 0
-    table = parquet.read_table(folder / "stability" / "rows.parquet")
-    rows: list[dict[str, Any]] = table.to_pylist()
-    return rows
-
-
-def test_a_reproduction_on_dask_is_the_one_made_here(
-    tmp_path: Path, cluster: tuple[str, list[subprocess.Popen[bytes]]]
-) -> None:
-    there = reproduced(tmp_path / "dask", "--engine", "dask", "--scheduler", cluster[0])
-    assert len(there) == 6
-    assert there == reproduced(tmp_path / "here")
-
-
 def test_a_silent_scheduler_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(processes, "CONNECT_SECONDS", 0.5)
@@ -499,22 +436,20 @@ def test_a_scheduler_that_goes_away_ends_the_sweep_in_words(
         list(run_all(trace, [("", n, "") for n in range(3)], engine="dask"))
 
 
-def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> Any:
-        raise ImportError(name)
-
-    monkeypatch.setattr(importlib, "import_module", missing)
-    with pytest.raises(UsageError, match=r"pip install 'cdmisfa\[dask\]'"):
-        list(run_all(trace, [("", 0, "")], engine="dask"))
-
-
-def test_engines_are_refused_by_name() -> None:
-    with pytest.raises(UsageError, match="no engine 'slurm'"):
-        list(run_all(trace, [("", 0, "")], engine="slurm"))
-    with pytest.raises(UsageError, match="no engine 'ray'"):
-        list(run_all(trace, [("", 0, "")], engine="ray"))
-    with pytest.raises(UsageError, match="needs --engine dask"):
-        list(run_all(trace, [("", 0, "")], scheduler="tcp://localhost:8786"))
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"engine": "slurm"}, "no engine 'slurm'"),
+        ({"scheduler": "tcp://localhost:8786"}, "needs --engine dask"),
+        ({"engine": "dask"}, r"pip install 'cdmisfa\[dask\]'"),
+    ],
+)
+def test_an_engine_that_is_not_there_is_refused(
+    monkeypatch: pytest.MonkeyPatch, asked: dict[str, str], why: str
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UsageError, match=why):
+        list(run_all(trace, [("", 0, "")], **asked))
 
 
 # Results

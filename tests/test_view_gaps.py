@@ -20,7 +20,7 @@ from replay.runs.modules import save_modules
 from replay.runs.run import read_outline
 from replay.runs.writer import RunWriter
 from replay.view.build import build_view
-from replay.view.columns import Column, line_column
+from replay.view.columns import Column, Target
 from replay.viewer.headless import frame_at
 
 ITERATIONS, TAU, EVERY = 15, 40, 20
@@ -152,7 +152,7 @@ def test_a_gap_between_two_handfuls_of_rows_ends_a_line(monkeypatch: pytest.Monk
     sent = []
     monkeypatch.setattr(Column, "send", lambda self, times, values: sent.append(values[:, 0]))
     with rr.RecordingStream("test") as recording:
-        column = line_column(recording, IMAGE, "a", ["a"], every_frame=True)
+        column = Target(recording, IMAGE).lines("a", ["a"], every_frame=True)
         for frames in ([0, 1], [2], [5, 6, 9]):
             column.add(np.array(frames), None, np.array(frames)[:, None])
             column.flush()

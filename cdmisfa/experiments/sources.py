@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cdmisfa.agents.learners import LEARNERS
 from cdmisfa.core.blocks import FrameSource, SeekableSource, SourceSpec, description
@@ -20,7 +20,9 @@ from recorder.images.options import ImageOptions
 from recorder.recording import ViewRecording, record
 from recorder.world.scenes import SCENES, open_scene
 from replay.camera_logs.options import CameraOptions
-from replay.camera_logs.source import ForeignSource
+
+if TYPE_CHECKING:
+    from replay.camera_logs.source import ForeignSource
 
 OF_CAMERAS = "progress"
 """The learner of streams that are no scene of ours, nor recorded from one."""

@@ -19,8 +19,8 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.cameras.video import Steady
-from recorder.images.decoding import MessageKind, Taken, decoder_of
-from recorder.images.messages import holds_distances
+from recorder.images.decoding import MessageKind, decoder_of
+from recorder.images.messages import Decoder, holds_distances
 from recorder.images.options import IMAGES, Reading
 from recorder.images.pixels import Shown
 from recorder.images.videos import VideoPackets
@@ -31,7 +31,7 @@ PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 _SUBSCRIPTION: Final = 1
 _DATA: Final = 1
 TOPIC_SECONDS: Final = 5.0
-"""For which a topic is waited for that the server does not have yet."""
+"""Seconds to wait for a topic that the server does not have yet."""
 
 _QUIET: Final = 0.5
 """Seconds without a further topic after which the server is taken to have named those it has."""
@@ -43,7 +43,7 @@ _AGAIN: Final = 0.2
 """Seconds before each."""
 
 _HEADER: Final = struct.Struct("<BIQ")
-"""Of a message: what it is, the subscription it is for, and its log time."""
+"""Header of a message: opcode, subscription, log time in nanoseconds."""
 
 
 class FoxgloveCamera:
@@ -137,10 +137,10 @@ class FoxgloveCamera:
         """The server and the topic."""
         return {"camera": f"{self._where}{self._topic}"}
 
-    def _find(self, connection: Any) -> tuple[int, MessageKind, Taken]:
+    def _find(self, connection: Any) -> tuple[int, MessageKind, Decoder]:
         """The channel of the topic, waited for, of what kind it is, and its decoder."""
         channels: dict[str, Mapping[str, Any]] = {}
-        images: dict[str, Taken] = {}
+        images: dict[str, Decoder] = {}
         said = False
         end = time.monotonic() + TOPIC_SECONDS
         while (left := end - time.monotonic()) > 0:
@@ -170,8 +170,8 @@ class FoxgloveCamera:
         remedy = f"; name one as {self._where}/TOPIC" if images else ""
         raise CdmisfaError(f"{self._lacking(images)}{remedy}")
 
-    def _lacking(self, images: Mapping[str, Taken]) -> str:
-        """That the topic is not there, and what is."""
+    def _lacking(self, images: Mapping[str, Decoder]) -> str:
+        """Message for a missing topic, with what the server has instead."""
         wanted = "messages with fields" if self._reading.fields else "images"
         known = ", ".join(sorted(images)) or "nothing"
         what = f"has no topic {self._topic}" if self._topic else "has not one such topic"
@@ -179,7 +179,7 @@ class FoxgloveCamera:
 
 
 def _kind(channel: Mapping[str, Any]) -> MessageKind:
-    """Of what kind the messages of a channel are, as the server says."""
+    """The kind of a channel's messages, as the server states it."""
     schema, language = channel.get("schema"), str(channel.get("schemaEncoding", ""))
     definition = schema.encode() if isinstance(schema, str) else b""
     encoding = str(channel.get("encoding"))
@@ -190,7 +190,7 @@ def _kind(channel: Mapping[str, Any]) -> MessageKind:
 
 
 def _told(message: str | bytes) -> Mapping[str, Any]:
-    """What a server says in words; nothing where it says it in bytes."""
+    """A text message of the server as JSON; {} for binary ones."""
     try:
         told = parse_json(message) if isinstance(message, str) else {}
     except ValueError:

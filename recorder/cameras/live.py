@@ -60,7 +60,7 @@ class _Stream:
         self._shown = True
 
     def put(self, picture: Picture, decided: int) -> None:
-        """Take in a picture; the ticks until the time `decided` are decided."""
+        """Add a picture; ticks up to `decided` (ns) do not change any more."""
         self.counts["messages"] += 1
         if picture.time_ns <= self.newest:
             self.counts["disordered"] += 1

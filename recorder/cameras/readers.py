@@ -206,7 +206,7 @@ class Readers:
         return time.monotonic_ns() + self._offset
 
     def take(self, camera: int) -> Picture | None:
-        """The oldest picture of a camera that waits; None where none does."""
+        """Remove and return the oldest queued picture of a camera; None if there is none."""
         reading = self._readings[camera]
         with self._lock:
             if not reading.waiting:
@@ -222,7 +222,7 @@ class Readers:
         self._news.clear()
 
     def over(self, camera: int) -> str:
-        """Why a camera shows nothing more than what waits; "" while it may."""
+        """Why a camera has ended; "" while it has not."""
         return self._readings[camera].over
 
     def lost(self, camera: int) -> int:
@@ -288,7 +288,7 @@ class Readers:
         return reading.connection == connection and not self._closed.is_set()
 
     def _put(self, reading: _Reading, connection: int, picture: Picture) -> bool:
-        """Let a picture wait; false where its thread was given up on."""
+        """Queue a picture; false if its thread was abandoned."""
         name = reading.camera.name
         with self._lock:
             if not self._is_on(reading, connection):
@@ -314,7 +314,7 @@ class Readers:
         self._news.set()
 
     def _look_for_stalls(self) -> None:
-        """Do what is to be done about cameras of which nothing came for long."""
+        """Handle cameras that showed nothing for too long."""
         now = self.now()
         for number, reading in enumerate(self._readings):
             read = reading.came and not reading.away and not reading.over

@@ -1,4 +1,4 @@
-"""Streams that show as much as is asked for: arrays of the caller's, and Gymnasium's environments.
+"""Streams that wait for their reader: arrays of the caller's, and Gymnasium's environments.
 
 They are iterators of frames, one step at a time together.
 """
@@ -112,7 +112,7 @@ class ArraySource(SteppedSource):
         super().__init__(spec, ((frames, np.empty(0)) for frames in zip(*alike, strict=False)))
 
     def describe(self) -> Mapping[str, Any]:
-        """That the frames are the caller's."""
+        """The kind of source, and its streams."""
         return {"kind": "arrays", "streams": list(self._spec.streams)}
 
 

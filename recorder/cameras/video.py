@@ -104,7 +104,7 @@ class VideoCamera:
         return _SECRET.sub("", self._word)
 
     def _open(self) -> Any:
-        """Open it within the budget; what decodes it later does so beside others, without one."""
+        """Open it within the memory budget; decoding runs beside other cameras, without one."""
         options = {"max_pixels": str(2 * MAX_PIXELS)}  # of which a decoder may pad some
         if self._address.startswith("rtsp"):
             options["rtsp_transport"] = "tcp"
@@ -125,7 +125,7 @@ class VideoCamera:
             raise CdmisfaError(f"{self._shown_word} cannot be opened: {reason}") from None
 
     def _check(self, shown: Any, codec: Any) -> None:
-        """Refuse pictures, of what states a width, a height and a format, that take too much."""
+        """Refuse pictures that take too much memory, by a stated width, height and format."""
         most = most_pixels(shown.format, codec)
         if not 0 < shown.width * shown.height <= most:
             raise CdmisfaError(
@@ -135,7 +135,7 @@ class VideoCamera:
 
 
 class Steady:
-    """When frames were taken, by their presentation times: coming, they jitter, and these do not.
+    """When frames were taken, from presentation times, which do not jitter as arrivals do.
 
     A frame that came with the least delay so far sets how the two clocks stand to one another;
     that least delay is forgotten slowly, as clocks drift.
@@ -169,7 +169,7 @@ class Steady:
 
 
 def _form_and_address(word: str, formats: Collection[str]) -> tuple[str | None, str]:
-    """The format that FFmpeg takes what a word names for, None to find out, and its address."""
+    """FFmpeg's format for a word (None: to be found out), and its address."""
     head, _, rest = word.partition(":")
     if head not in ("camera", "av"):
         return None, word
@@ -186,7 +186,7 @@ def _form_and_address(word: str, formats: Collection[str]) -> tuple[str | None, 
 
 
 def _reason(error: Exception) -> str:
-    """What an error of FFmpeg says, without the address, in which a password may be."""
+    """Text of an error of FFmpeg without the address, which may hold a password."""
     if type(error).__name__ == "ExitError":  # what waiting for too long ends with
         return "it did not answer in time"
     return str(getattr(error, "strerror", None) or _SECRET.sub("", one_line(error)))

@@ -1,4 +1,4 @@
-"""The words that name live streams: which they are, and what they open."""
+"""Open live streams by the words that name them on the command line."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _TIMEOUT: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class CameraKind:
-    """What a word KIND:ADDRESS opens.
+    """A kind of camera: how words KIND:ADDRESS are opened.
 
     Attributes:
         open: makes the camera of a word, KIND included, with the name of its stream; what it
@@ -105,7 +105,7 @@ def open_live(
     if "gym" in schemes:
         return _simulated(words, names, options)
     kinds = [CAMERAS[scheme] for scheme in schemes]
-    _refuse_vain(words, [kind.takes for kind in kinds], options)
+    _refuse_inapplicable(words, [kind.takes for kind in kinds], options)
     told = {"depth": options.depth, "fields": options.fields, "color": options.color, "say": say}
     cameras = [
         kind.open(word, name, **{key: told[key] for key in kind.takes})
@@ -137,10 +137,10 @@ def open_live(
     return source
 
 
-def _refuse_vain(
+def _refuse_inapplicable(
     words: Sequence[str], takes: Sequence[Sequence[str]], options: LiveOptions
 ) -> None:
-    """Refuse options that what words name cannot heed, given those that each takes."""
+    """Refuse options that do not apply to the named streams, given what each takes."""
     for word, taken in zip(words, takes, strict=True):
         if options.fields and "fields" not in taken:
             raise UsageError(f"{word} {_NO_FIELDS}")
@@ -158,7 +158,7 @@ def _simulated(words: Sequence[str], names: Sequence[str], options: LiveOptions)
         raise UsageError(
             "gym: is simulated as fast as it is watched, and cameras are not: record each apart"
         )
-    _refuse_vain(words, [("color",)] * len(words), options)
+    _refuse_inapplicable(words, [("color",)] * len(words), options)
     return GymSource(
         [word.partition(":")[2] for word in words],
         names=names,
@@ -176,7 +176,7 @@ def live_names(words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _stream_of(word: str) -> str:
-    """What of a word tells its stream from others."""
+    """The part of a word that names its stream."""
     scheme, _, rest = word.partition(":")
     place = urlsplit(word)
     if scheme == "foxglove":

@@ -1,4 +1,4 @@
-"""Messages of any type: what is taken of them, and when they were made.
+"""Messages of any type, decoded: their images or numbers, and the times in their headers.
 
 Messages are decoded by the definition that their channel states.
 """
@@ -15,12 +15,9 @@ from cdmisfa.core.clock import NANOSECONDS
 from cdmisfa.core.errors import CdmisfaError, one_line
 from cdmisfa.core.untrusted import parse_json
 from recorder.images.fields import Field, field_value, members, numbers_of
-from recorder.images.messages import SCHEMAS, foxglove_image, image_decoder, ros_stamp
+from recorder.images.messages import SCHEMAS, Decoder, foxglove_image, image_decoder, ros_stamp
 from recorder.images.options import Reading
-from recorder.images.pixels import MalformedImage, Shown
-
-Taken = Callable[[bytes | memoryview], Shown]
-"""Turns a message into what is taken of it; raises MalformedImage."""
+from recorder.images.pixels import MalformedImage
 
 Opened = Callable[[bytes], Any]
 """Turns a message into what has its fields; raises MalformedImage."""
@@ -34,7 +31,7 @@ _HEADER: Final = re.compile(r"(?:std_msgs/)?(?:msg/)?Header\s+\w+")
 
 
 class MessageKind(NamedTuple):
-    """Of what kind the messages of a channel are.
+    """The type and the encoding of a channel's messages.
 
     Attributes:
         schema: the name of their type.
@@ -49,8 +46,8 @@ class MessageKind(NamedTuple):
     language: str = ""
 
 
-def decoder_of(kind: MessageKind, reading: Reading) -> Taken | None:
-    """The decoder for what is taken of messages; None where they hold no such thing.
+def decoder_of(kind: MessageKind, reading: Reading) -> Decoder | None:
+    """The decoder of a kind of messages, of images or of fields; None where they hold none.
 
     Args:
         kind: of the messages.
@@ -70,7 +67,7 @@ def decoder_of(kind: MessageKind, reading: Reading) -> Taken | None:
 
 
 def message_decoder(kind: MessageKind) -> Opened | None:
-    """What opens messages of a type; None where their encoding or definition is not known."""
+    """The decoder of whole messages; None where their encoding or definition is not known."""
     if kind.encoding == "json":
         return _json
     if kind.encoding == "protobuf":
@@ -151,7 +148,7 @@ class _Ros:
 
 
 def stamp_of(kind: MessageKind) -> Stamp | None:
-    """What reads the times in messages of a kind; None where they are not known to hold any."""
+    """The reader of the times in messages of a kind; None where they hold none."""
     if kind.encoding in ("cdr", "ros1"):
         ros1 = kind.encoding == "ros1"
         lines = kind.definition.decode("utf-8", "replace").splitlines()

@@ -1,4 +1,4 @@
-"""Numbers within a message: named by a path, and taken out as a vector."""
+"""Numbers in a message: named by a path, and read as a vector."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Field:
         self.first = str(self._steps[0])
 
     def numbers(self, message: Any) -> list[float]:
-        """What stands there in a message; NaN where that is null.
+        """The numbers at the path in a message; NaN where it is null.
 
         Raises:
             UsageError: there is no such field, or what is there is no number.
@@ -137,7 +137,7 @@ def bounded(numbers: FloatArray, bounds: Depth | None) -> FloatArray:
 
 
 def rounded(fields: Sequence[str], numbers: FloatArray) -> str:
-    """What the user should know of numbers, (I,), that float64 may hold rounded; "" of others.
+    """A warning where float64 may round whole numbers, (I,); "" of others.
 
     Args:
         fields: what their fields are called.
@@ -151,7 +151,7 @@ def rounded(fields: Sequence[str], numbers: FloatArray) -> str:
 
 
 def members(value: Any) -> list[str]:
-    """The names of a message's fields, of whatever library it is; none of what is no message."""
+    """The names of a message's fields, whatever library decoded it; none of other values."""
     if isinstance(value, Mapping):
         return [str(name) for name in value]
     descriptor = getattr(value, "DESCRIPTOR", None)
@@ -161,7 +161,7 @@ def members(value: Any) -> list[str]:
 
 
 def field_value(value: Any, name: str) -> Any:
-    """What a field of a message holds, one of its `members`."""
+    """The value of a field of a message, one of its `members`."""
     return value[name] if isinstance(value, Mapping) else getattr(value, name)
 
 

@@ -1,4 +1,4 @@
-"""What of an image a frame shows: how large it is, and what is cut or added at its sides."""
+"""How images become frames: their size, and what is cropped, padded or stretched."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Framing:
         return np.hstack(shown if len(shown) == 3 else shown * 3)
 
     def change(self, image: tuple[int, ...]) -> str:
-        """What the user should know of an image of another shape; "" of one like the first."""
+        """A warning about an image of another shape; "" of one like the first."""
         size = image[0], image[1]
         if size == self.first:
             return ""
@@ -64,7 +64,7 @@ class Framing:
 
     @property
     def lossy(self) -> str:
-        """What a frame lacks of an image, or has besides it; see `cut_or_added`."""
+        """How images of another ratio are made to fit; see `cut_or_added`."""
         return cut_or_added(self.first, self.size, self.fit)
 
     def __str__(self) -> str:
@@ -115,7 +115,7 @@ class Vector:
 def framings(
     firsts: Sequence[Shown], size: Size | None, fit: Fit, *, color: bool = False
 ) -> Sequence[Framing | Vector]:
-    """How what streams show becomes frames, all of one shape.
+    """How the images or numbers of streams become frames, all of one shape.
 
     Args:
         firsts: what each stream shows first.
@@ -182,7 +182,7 @@ def fitted(image: ByteArray, size: Size, fit: Fit, *, enlarge: bool = False) -> 
 
 
 def cut_or_added(image: Size, size: Size, fit: Fit) -> str:
-    """What a frame lacks of an image, or has besides it, in words; "" if it is all of it."""
+    """How an image of another ratio was made to fit, in words; "" of one of the same ratio."""
     if fit == "crop":
         height, width = _largest_within(image, size)
         return "" if (height, width) == image else f"cropped to {width}x{height}"

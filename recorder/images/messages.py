@@ -23,14 +23,15 @@ from recorder.images.options import Depth
 from recorder.images.pixels import (
     DISTANCES,
     MalformedImage,
+    Shown,
     compressed_image,
     compressed_words,
     raw_image,
 )
 from recorder.images.videos import Packet, VideoPackets
 
-Decoder = Callable[[bytes | memoryview], ByteArray]
-"""Turns a message into a gray image, (height, width) uint8; raises MalformedImage.
+Decoder = Callable[[bytes | memoryview], Shown]
+"""Turns a message into an image or numbers; raises MalformedImage.
 
 One that is `VideoPackets` has to be called with the messages in their order.
 """
@@ -108,7 +109,7 @@ def holds_distances(schema: str, encoding: str, data: bytes | memoryview) -> boo
 
 
 def foxglove_image(schema: str, encoding: str) -> Callable[[bytes], Any] | None:
-    """What opens Foxglove's images, of which logs need not state a definition; None of others."""
+    """The parser of Foxglove's images in protobuf, which need no definition; None of others."""
     for kind in (RawImage, CompressedImage, CompressedVideo):
         if (schema, encoding) == (kind.DESCRIPTOR.full_name, "protobuf"):
             return partial(_protobuf, kind)
@@ -181,7 +182,7 @@ class _RosFields:
 
 
 def _foxglove(opened: Callable[[Any, bytes | memoryview], Any], kind: Any) -> Callable[..., Any]:
-    """What reads messages of Foxglove in protobuf, or in JSON."""
+    """The reader of messages of Foxglove in protobuf, or in JSON."""
 
     def read(data: bytes | memoryview) -> Pixels | Compressed | Packet:
         m = opened(kind, data)
@@ -189,9 +190,11 @@ def _foxglove(opened: Callable[[Any, bytes | memoryview], Any], kind: Any) -> Ca
             return Compressed(m.data)
         if kind is CompressedVideo:
             return Packet(m.data, str(m.format))
-        if not all(isinstance(n, int) and 0 <= n < 2**32 for n in (m.height, m.width, m.step)):
+        sizes = (m.height, m.width, m.step)
+        if not all(isinstance(n, int) and 0 <= n < 2**32 for n in sizes):
             raise MalformedImage("a JSON image needs whole height, width and step")
-        return Pixels(m.data, m.height, m.width, str(m.encoding), m.step)
+        height, width, step = map(int, sizes)
+        return Pixels(m.data, height, width, str(m.encoding), step)
 
     return read
 

@@ -1,4 +1,4 @@
-"""Pixels of any supported format, JPEG and PNG, as gray or coloured images; and made smaller."""
+"""Images of raw pixels, JPEG and PNG, decoded to gray or colours, and shrunk."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ _TURNS: Final = (
 
 
 class MalformedImage(LogDamagedError):  # noqa: N818 - says what is wrong with an image, not where
-    """What is no image that is read; who knows where it came from adds that."""
+    """No image that can be read; the caller adds where it was."""
 
 
 class UnknownPixels(MalformedImage):
@@ -246,7 +246,7 @@ def compressed_words(data: bytes) -> NDArray[np.uint16]:
 
 @contextmanager
 def _opened(data: bytes) -> Iterator[Image.Image]:
-    """A JPEG or PNG, upright; Pillow decodes it when it is asked for."""
+    """Open a JPEG or PNG, turned upright; Pillow decodes it when its pixels are read."""
     limit = f"more than {BUDGET >> 20} MiB of memory, the limit"
     try:
         with budget(), warnings.catch_warnings():
@@ -283,7 +283,7 @@ def picture_size(file: BinaryIO) -> tuple[int, int] | None:
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF's number for how the camera was held; 1, upright, where nothing whole says it."""
+    """EXIF's orientation, 1 to 8; 1, upright, where it is missing or broken."""
     if "exif" not in image.info:
         return 1
     try:

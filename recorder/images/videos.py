@@ -155,7 +155,7 @@ class VideoPackets:
         return bool(packet.data) and begins(packet.data)
 
     def forget(self) -> None:
-        """Be told that the next message does not follow the last."""
+        """Reset the decoder: the next message does not follow the last."""
         if self._context is not None:
             self._context.flush_buffers()
 
@@ -205,7 +205,7 @@ def most_pixels(form: Any, codec: Any) -> int:
 
 
 def pyav(what: str) -> Any:
-    """PyAV.
+    """Import PyAV.
 
     Raises:
         UsageError: it is missing.

@@ -157,7 +157,7 @@ _STAY_OPEN: Final[WeakSet[AppendOnlyFile]] = WeakSet()
 
 
 def write_error(path: Path, error: OSError) -> LogWriteError:
-    """That a disk does not take a file."""
+    """The error for a disk that does not take a file."""
     return LogWriteError(
         f"{path} cannot be written: {error.strerror or error}; "
         "check the free space and rights there, what was flushed is readable"

@@ -1,4 +1,4 @@
-"""What a recording states: of itself in the file of each view, and in RECORDING how it was started.
+"""The manifest of a recording: the metadata of each view's file, and RECORDING.
 
 RECORDING holds the command that started a recording, stored for --resume.
 """
@@ -229,7 +229,7 @@ class ViewMetadata:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpec:
-    """What is recorded: two recordings of which this is the same are one.
+    """What is recorded; attempts at one recording agree in it.
 
     Attributes:
         kind: name of what is recorded: a scene's, or the kind of a source.

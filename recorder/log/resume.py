@@ -1,4 +1,4 @@
-"""What an earlier attempt at a recording left, and where each view is resumed.
+"""Resume a recording: what an earlier attempt left of each view, and where to continue.
 
 The logs of an attempt are read in the order of the file, up to where they are damaged or torn. A
 log that is resumed is kept aside while its frames are copied into a new one, which so has the
@@ -35,7 +35,7 @@ _LEAST = 64
 
 
 class FramesHeld(NamedTuple):
-    """What an earlier log of a view holds.
+    """The frames in an earlier log of a view.
 
     Attributes:
         first: its first frame.
@@ -52,7 +52,7 @@ class FramesHeld(NamedTuple):
     frames: int = 0
 
     def stop_from(self, first: int) -> int:
-        """Up to before which frame all from a given one on are there."""
+        """The stop of the frames [first, stop) that are all there."""
         follows = self.first == first or (self.gaps and self.first > first)
         return self.stop if self.end and follows else first
 
@@ -120,7 +120,7 @@ class ViewResume:
 
 
 def begin_view(folder: Path, view: str, split: Split | None, first: int = 0) -> ViewResume:
-    """The place of a view of which nothing is there, and that begins with a frame."""
+    """Where a view begins of which nothing is there yet."""
     return ViewResume(folder / part_name(view, None if split is None else 0), first=first)
 
 
@@ -241,41 +241,24 @@ def _resume_view(
         later = [p for p, number in numbers.items() if number is not None and number > len(parts)]
         log = max(attempts, key=lambda p: there[p].stop_from(first), default=path)
         stop = there[log].stop_from(first) if attempts else first
-        follows = log == path and bool(later)
-        if stop == first and path in attempts:
+        if stop > first:
+            _refuse_other(log, recording.metadata(view, first))
+        elif path in attempts:
             raise UsageError(
                 f"{path} holds no frames of {view} from {first} on: overwrite with --force"
             )
+        follows = any(there[p].end or p.suffix == ".mcap" for p in later)
+        if stop > first and log == path and (follows or stop == frames or ended):
+            parts.append((path, there[path].frames))
+            stale += [kept] if kept in attempts else []
+            first = stop
+            if follows:
+                continue
+            return ViewResume(path, tuple(parts), first, stale=(*stale, *later), complete=True)
+        _refuse_finished(path, later)
         if stop > first:
-            _refuse_other(log, recording.metadata(view, first))
-            if split is not None and not recording.gaps:
-                _refuse_other_length(log, split.frames(recording.spec.fps), stop - first, follows)
-        complete = log == path and (stop == frames or ended) and not follows
-        if stop == first or not (follows or complete):
-            _refuse_finished(path, later)
-            if stop == first:
-                stale += [*attempts, *later]
-                return ViewResume(path, tuple(parts), first, stale=tuple(stale))
             return ViewResume(path, tuple(parts), first, log, stop, (*stale, *later))
-        if follows and stop >= frames:
-            raise UsageError(
-                f"{path} ends at frame {stop}, and more follow: ask for more frames, "
-                "or overwrite with --force"
-            )
-        stale += [kept] if kept in attempts else []
-        parts.append((path, there[path].frames))
-        first = stop
-        if complete:
-            return ViewResume(path, tuple(parts), first, stale=tuple(stale), complete=True)
-
-
-def _refuse_other_length(path: Path, length: int | None, frames: int, follows: bool) -> None:
-    """Refuse a part of more frames than --split says, or of fewer where another follows."""
-    if length is not None and (frames > length or (follows and frames != length)):
-        raise UsageError(
-            f"{path} has {frames} frames, with this --split it would have {length}: "
-            "use the same, or overwrite with --force"
-        )
+        return ViewResume(path, tuple(parts), first, stale=(*stale, *attempts, *later))
 
 
 def _refuse_finished(path: Path, later: Sequence[Path]) -> None:
@@ -306,25 +289,24 @@ def finished_logs(folder: Path) -> list[tuple[str, Path, int]]:
     Raises:
         LogDamagedError: the disk does not give a log.
     """
-    logs = logs_in(folder) if folder.is_dir() and not (folder / RECORDING).exists() else []
+    if not folder.is_dir() or (folder / RECORDING).exists():
+        return []
     found: list[tuple[str, Path, int]] = []
-    streams: set[str] = set()
-    count, gaps = "", False
     stops: dict[str, int] = {}
-    for path in sorted(logs, key=lambda path: (len(path.name), path.name)):
+    stated: ViewMetadata | None = None
+    for path in sorted(logs_in(folder), key=lambda path: (len(path.name), path.name)):
         record = _metadata(path)
         if path.suffix != ".mcap" or record is None or record.name != RECORDING_METADATA:
             return []
-        streams.update(filter(None, record.values.get("streams", "").split(",")))
-        count = record.values.get("stream_count", "")
-        gaps = record.values.get("gaps") == str(True)
-        there = frames_held(path, view := record.values.get("view", ""), gaps=gaps)
-        if there.stop_from(stops.get(view, 0)) != there.end or not there.end:
+        stated = ViewMetadata.parse(path, record.values)
+        there = frames_held(path, stated.view, gaps=stated.gaps)
+        if there.stop_from(stops.get(stated.view, 0)) != there.end or not there.end:
             return []
-        stops[view] = there.stop
-        found.append((view, path, there.frames))
-    every = stops.keys() == streams if streams else str(len(stops)) == count
-    return found if every and (gaps or len(set(stops.values())) == 1) else []
+        stops[stated.view] = there.stop
+        found.append((stated.view, path, there.frames))
+    if stated is None or len(stops) != (len(stated.streams) or stated.stream_count):
+        return []
+    return found if stated.gaps or len(set(stops.values())) == 1 else []
 
 
 def other_recordings(folder: Path, recording: RecordingSpec) -> list[Path]:
@@ -392,7 +374,7 @@ def _opened(path: Path) -> LogReader | None:
 
 
 def _metadata(path: Path) -> Metadata | None:
-    """What a log says of what it is, its first metadata record; None where it does not say it."""
+    """The first metadata record of a log, or None."""
     log = _opened(path)
     if log is None:
         return None

@@ -117,7 +117,7 @@ class Scenery:
     objects: tuple[Thing, ...]
 
     def gaze(self, view: str) -> Gaze | None:
-        """That of a view, None where there is no such view."""
+        """The gaze of a view, None where there is no such view."""
         return next((gaze for gaze in self.gazes if gaze.name == view), None)
 
 
@@ -196,7 +196,7 @@ def _gaze(name: str, yaw: float, eyes: Mapping[str, Any], neck: Place) -> Gaze:
 
 
 def times(first: Quaternion, second: Quaternion) -> Quaternion:
-    """The turn that makes the second one, then the first one."""
+    """Product of two quaternions: turn by the second, then by the first."""
     (a, b, c, w), (x, y, z, v) = first, second
     return (
         w * x + a * v + b * z - c * y,
@@ -207,13 +207,13 @@ def times(first: Quaternion, second: Quaternion) -> Quaternion:
 
 
 def inverse(turn: Quaternion) -> Quaternion:
-    """The turn back."""
+    """Inverse of a unit quaternion."""
     x, y, z, w = turn
     return -x, -y, -z, w
 
 
 def turned(turn: Quaternion, vector: Sequence[float]) -> NDArray[np.float64]:
-    """(3,) a vector after a turn."""
+    """Rotate a vector by a unit quaternion, (3,)."""
     axis, straight = np.array(turn[:3]), np.array(vector, dtype=np.float64)
     across = 2 * np.cross(axis, straight)
     return np.asarray(straight + turn[3] * across + np.cross(axis, across))

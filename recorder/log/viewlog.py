@@ -138,7 +138,7 @@ class ViewLog:
         self.t = stop
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write what is known only now into the last part, as a metadata record."""
+        """Add a metadata record to the last part."""
         self._file.add_metadata(name, values)
 
     def finish(self) -> None:
@@ -218,7 +218,7 @@ class ViewLog:
 
 
 def _world_encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Any]:
-    """What encodes the world of a scene that is described, by topic; nothing of others."""
+    """Encoders of the scene's world by topic; none for scenes that `scenery_of` does not know."""
     config = recording.config.get("scene")
     if pose is None or not isinstance(config, Mapping):
         return {}

@@ -1,4 +1,4 @@
-"""Streams of images on one clock: which image of each a frame shows, by their times alone."""
+"""Streams on one clock: which image of each a frame shows, by their times alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Rows = NDArray[np.int64]
 
 
 def counts(times: Times, rows: Rows, gaps: Sequence[Span] = ()) -> dict[str, int]:
-    """Images of a stream, frames that show one again, and images that no frame shows.
+    """Counts of a stream's images, of frames that repeat one, and of images in no frame.
 
     Frames within gaps, which are left out, are not counted.
     """
@@ -84,13 +84,13 @@ def overlap(streams: Sequence[Times]) -> tuple[int, int]:
 
 
 def of_other_rate(times: Times, fps: float) -> bool:
-    """Whether images tell a rate, and another one, by more than a hundredth."""
+    """Whether a stream has a rate that differs from another by more than a hundredth."""
     step = step_of(times)
     return step > 0 and abs(step * fps - 1) > _UNEVEN
 
 
 def unlike(first: Times, times: Times) -> str:
-    """Why the i-th images of two streams were not taken together, in words; "" if they were.
+    """Why the i-th images of two streams do not belong together, in words; "" if they do.
 
     They may be apart by half a step of the first stream.
     """
@@ -142,7 +142,7 @@ def _lacks(times: Times) -> NDArray[np.float64]:
 
 
 def retimed(times: Times, rows: Rows, fps: float) -> str:
-    """How frames that show images by their number are of other times than these, in words.
+    """A warning if frames taken by number are not at the times of their images.
 
     Args:
         times: of the images, nanoseconds.

@@ -208,7 +208,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
 
 
 def _bounded(chunk: Any) -> Any:
-    """A chunk of a ROS 1 bag that unpacks to no more than one of an MCAP log may."""
+    """A chunk of a ROS 1 bag with a limit on what it unpacks to."""
     from rosbags.rosbag1.reader import decompressors
 
     if chunk.datasize > MAX_CHUNK:

@@ -1,10 +1,10 @@
-"""Tables read by PyArrow; CSV as it is met, with other separators and words among numbers."""
+"""Tables read by PyArrow; CSV also with other separators, and words among numbers."""
 
 from __future__ import annotations
 
 import contextlib
 import csv as cells
-import mmap
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -47,7 +47,7 @@ _NUMBER: Final = r"^[ \t]*[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[iI
 
 
 class Words(NamedTuple):
-    """Words in a column of numbers: the first one's row, from 0, and text; all of it in words."""
+    """Words in a column of numbers: the row, from 0, and text of the first; and the warning."""
 
     row: int
     text: str
@@ -99,7 +99,7 @@ def read_table(path: Path) -> LoadedTable:
 
 
 def called(path: Path, row: int) -> str:
-    """What a row is called: the line of a CSV file, from 1; of others the row, from 0."""
+    """How warnings name a row: the line of a CSV file, from 1; of others the row, from 0."""
     return f"line {line_of(path, row)}" if path.suffix.lower() == ".csv" else f"row {row}"
 
 
@@ -157,11 +157,11 @@ def _read_csv(path: Path) -> LoadedTable:
         cut = _cut_line(path, separator)
         if cut is None:
             raise
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            size = max(data.rfind(b"\n"), data.rfind(b"\r")) + 1
+        with path.open("rb") as file:
+            size = sum(map(len, itertools.islice(file, cut[0] - 1)))
         with pyarrow.memory_map(str(path)) as data:
             table = csv.read_csv(pyarrow.BufferReader(data.read_buffer(size)), **options)
-        notes = [cut]
+        notes = [cut[1]]
     names = separator.join(table.column_names)
     if all(re.match(_NUMBER, name) for name in re.split("[,;\t]", names)):
         raise UsageError(
@@ -171,8 +171,8 @@ def _read_csv(path: Path) -> LoadedTable:
     return _with_numbers(LoadedTable(path, table, {}, notes), missing)
 
 
-def _cut_line(path: Path, separator: str) -> str | None:
-    """What the user should know of a last line that was cut; None where lines are alike.
+def _cut_line(path: Path, separator: str) -> tuple[int, str] | None:
+    """The last line and a warning, if it was cut; None where all lines have as many cells.
 
     Raises:
         UsageError: the file begins with a comment.
@@ -180,19 +180,19 @@ def _cut_line(path: Path, separator: str) -> str | None:
     """
     rows = _rows(path)
     _, names = next(rows)
-    for line, row in rows:
+    for place, (line, row) in enumerate(rows):
         if len(row) == len(names):
             continue
         text = separator.join(row)[:40]
         said = f"{path}: line {line} holds {_in_words(len(row))}, {text!r}, and the line of names "
         said += _in_words(len(names))
-        if names[0].startswith("#") and line == 2:
+        if names[0].startswith("#") and place == 0:
             raise UsageError(f"{said}: leave out the comment before it")
         with path.open("rb") as file:
             file.seek(-1, 2)
             ended = file.read() in (b"\n", b"\r")
         if next(rows, None) is None and not ended and len(row) < len(names):
-            return f"{said}: the file was cut there, and the line is left out"
+            return line, f"{said}: the file was cut there, and the line is left out"
         raise LogDamagedError(f"{said}: mend the line or leave it out")
     return None
 
@@ -202,7 +202,7 @@ def _in_words(count: int) -> str:
 
 
 def _written(path: Path, head: str) -> tuple[str, str]:
-    """What separates the columns of a CSV file, and what the decimals of its numbers."""
+    """The separator and the decimal sign of a CSV file."""
     names, *lines = head.splitlines() or [""]
     separator = _separator(names)
     if separator == ",":
@@ -219,7 +219,7 @@ def _written(path: Path, head: str) -> tuple[str, str]:
 
 
 def _separator(names: str) -> str:
-    """What separates the columns, by the line of their names."""
+    """The separator, by the line of names."""
     bare = _QUOTED.sub("", names)
     return next((s for s in (",", ";", "\t") if s in bare), ",")
 

@@ -1,4 +1,4 @@
-"""Camera logs of any kind opened: which logs paths mean, of what kind they are, what is there."""
+"""Camera logs of any format: found by path, opened, and described."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def log_format(path: Location) -> Format:
 
 
 def only_foreign(path: Location) -> bool:
-    """Whether a path can be no recording of ours, by its kind."""
+    """Whether a path cannot be one of our recordings, by its format."""
     return log_format(path) not in ("mcap", "split")
 
 
@@ -241,5 +241,5 @@ def named_streams(
 
 
 def fits_topic(name: str, topic: str) -> bool:
-    """Whether a topic is the one that is asked for, or of the pattern."""
+    """Whether a name is the topic that is asked for, or matches the pattern."""
     return name == topic or fnmatch.fnmatchcase(name, topic)

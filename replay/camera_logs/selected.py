@@ -291,7 +291,7 @@ class WholeImages(Selected):
             return True  # the image that would tell is broken
 
     def said(self) -> str | None:
-        """That images are broken, as far as they were met; None where none was."""
+        """A line that counts the broken images met so far; None if there were none."""
         if not self.broken:
             return None
         first = min(self.broken)

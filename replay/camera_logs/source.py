@@ -55,7 +55,7 @@ class UnequalError(UsageError):
 
 
 class ForeignSource(LoggedSource):
-    """What others logged, on one clock: images of cameras, gray and small, or numbers.
+    """Other people's logs on one clock: images of cameras, gray and small, or numbers.
 
     Args:
         paths: one log, or one log, video, table or folder of pictures a stream. Logs that follow
@@ -196,7 +196,7 @@ class ForeignSource(LoggedSource):
         }
 
     def plan(self) -> list[dict[str, Any]]:
-        """What would be read of each stream, as JSON values."""
+        """The plan of --dry-run: what would be read of each stream, as JSON values."""
         rows: list[dict[str, Any]] = []
         for name, images, times in zip(self._spec.streams, self._streams, self._times, strict=True):
             step = step_of(times)
@@ -209,12 +209,12 @@ class ForeignSource(LoggedSource):
         return rows
 
     def salvaged(self) -> list[str]:
-        """For each stream of which broken images were met a line that says so."""
+        """A line for each stream of which broken images were replaced so far."""
         whole = [s.said() for s in self._streams if isinstance(s, WholeImages)]
         return [line for line in whole if line is not None]
 
     def _changes_size(self, stream: int) -> bool | None:
-        """Whether a stream's images change their size, as far as that is known unread."""
+        """Whether a stream's images change their size; None where only decoding would tell."""
         if not self._spec.images:
             return False
         images, framing = self._streams[stream], self._framings[stream]
@@ -228,7 +228,7 @@ class ForeignSource(LoggedSource):
         return False
 
     def _chosen(self) -> dict[str, Any]:
-        """What of the options changed the frames, as JSON values."""
+        """The options that changed the frames, as JSON values."""
         options = self._options
         chosen: dict[str, Any] = {}
         if any(self._gaps):

@@ -1,4 +1,4 @@
-"""What a stream of images is, and which topic of a log it is."""
+"""Streams of images: their interface, the choice of a topic, and errors in one line."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from cdmisfa.core.errors import CdmisfaError, LogDamagedError, UsageError
 from cdmisfa.core.untrusted import BUDGET, budget
-from recorder.images.decoding import MessageKind, Stamp, Taken, decoder_of, stamp_of
-from recorder.images.messages import SCHEMAS, holds_distances
+from recorder.images.decoding import MessageKind, Stamp, decoder_of, stamp_of
+from recorder.images.messages import SCHEMAS, Decoder, holds_distances
 from recorder.images.options import Reading, Size
 from recorder.images.pixels import RECIPE, Shown
 from recorder.log.messages import VECTOR_SCHEMA
@@ -23,7 +23,7 @@ from replay.storage.location import Location
 
 
 class UnreadableError(LogDamagedError):
-    """What a library cannot read."""
+    """A library cannot read a file."""
 
 
 LAST_NS: Final = 2**62
@@ -79,7 +79,7 @@ class ImageStream(ABC):
     fields: Sequence[str] = ()
     warnings: Sequence[str] = ()
     told_rounded: bool = False
-    decode: Taken | None = None
+    decode: Decoder | None = None
 
     @property
     def count(self) -> int:
@@ -101,7 +101,7 @@ class ImageStream(ABC):
         """
 
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found:
-        """What a function takes of a message; raises as `image`."""
+        """Apply a function to the bytes of a message; raises as `image`."""
         raise NotImplementedError
 
     def stamp(self, row: int) -> int:
@@ -137,7 +137,7 @@ class MessageImages(ImageStream):
     """
 
     kind: MessageKind
-    decode: Taken
+    decode: Decoder
 
     @abstractmethod
     def taken(self, row: int, take: Callable[[Any], Found]) -> Found: ...
@@ -165,8 +165,8 @@ def choose_images(
     topic: str | None,
     channels: Iterable[tuple[str, MessageKind, Found]],
     reading: Reading,
-) -> tuple[list[Found], Taken]:
-    """Find the channels that are meant, of images or of fields, and their messages' decoder.
+) -> tuple[list[Found], Decoder]:
+    """Choose the channels of a topic, of images or of fields, and the decoder of their messages.
 
     They are of one topic and of one kind, as where its publisher began again.
 
@@ -179,7 +179,7 @@ def choose_images(
     Raises:
         UsageError: there is none, or not one topic, or its messages are of several kinds.
     """
-    readable: dict[str, dict[MessageKind, tuple[list[Found], Taken]]] = {}
+    readable: dict[str, dict[MessageKind, tuple[list[Found], Decoder]]] = {}
     others: dict[str, str] = {}
     for name, kind, channel in channels:
         decoder = decoder_of(kind, reading)
@@ -222,7 +222,7 @@ class NothingLoggedError(LogDamagedError):
 
 
 def holds_none(path: Location, reading: Reading) -> str:
-    """That a log has no topic with what is wanted, in words."""
+    """The error text for a log without images, or without fields."""
     if reading.fields:
         return f"{path}: it holds no messages whose fields are known"
     return f"{path}: it holds no images; numbers are taken with --field"
@@ -245,7 +245,7 @@ def sorted_times(where: str, times: Sequence[int] | NDArray[np.integer[Any]]) ->
 
 @contextmanager
 def explained(path: Location, program: str, *, held: int = 0, remedy: str = "") -> Iterator[None]:
-    """Say in one line what a library cannot read that lets any exception through, or any size.
+    """Turn any error of a library that reads a file into one line, within a memory budget.
 
     Args:
         path: what is read.
@@ -262,7 +262,7 @@ def explained(path: Location, program: str, *, held: int = 0, remedy: str = "") 
 
 @contextmanager
 def arrow_explained(path: Location, *, held: int = 0, remedy: str = "") -> Iterator[None]:
-    """Do as `explained` where PyArrow reads, which takes its memory of the system meanwhile.
+    """As `explained`, for PyArrow, whose memory is then the system's, which the budget counts.
 
     What its own pool has in reserve has no budget.
     """
@@ -275,7 +275,7 @@ def arrow_explained(path: Location, *, held: int = 0, remedy: str = "") -> Itera
 
 @contextmanager
 def in_one_line(path: Location, program: str, remedy: str = "") -> Iterator[None]:
-    """Say in one line what a library cannot read that lets any exception through.
+    """Turn any error of a library that reads a file into one line.
 
     Raises:
         UnreadableError: instead of each that is no CdmisfaError.

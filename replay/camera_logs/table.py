@@ -1,4 +1,4 @@
-"""Tables of numbers, CSV or Parquet, as a stream: a row is what an image is elsewhere."""
+"""Tables of numbers, CSV or Parquet, as streams: each row is a frame."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def table_channels(path: Path) -> list[ChannelFacts]:
 
 
 def table_notes(path: Path) -> list[str]:
-    """What the user should know of a table; raises as `TableNumbers`, and where it was cut."""
+    """What `verify` says of a table; raises as `TableNumbers`, and where it was cut."""
     table = read_table(path)
     if table.notes:
         raise LogDamagedError(table.notes[0])
@@ -156,7 +156,7 @@ def _said_of_columns(
     whole: NDArray[np.bool_],
     reading: Reading,
 ) -> Iterator[str]:
-    """What the user should know of the columns that are used, of their rows that are whole."""
+    """Warnings about the columns that are used."""
     yield from (words.said for name, words in table.words.items() if name in used)
     if not reading.fields:
         for name in table.columns.column_names:
@@ -169,7 +169,7 @@ def _said_of_columns(
 
 
 def _has_digits(table: LoadedTable, name: str) -> bool:
-    """Whether the file may hold a field more exactly than float64 does."""
+    """Whether the file may hold a field in more digits than float64."""
     import pyarrow.types as kinds
 
     if table.path.suffix.lower() == ".csv":
@@ -182,7 +182,7 @@ def _has_digits(table: LoadedTable, name: str) -> bool:
 
 
 def _lacking(table: LoadedTable, columns: Mapping[str, FloatArray], row: int) -> str:
-    """What a row lacks, in words."""
+    """Why a row is left out, in words."""
     for name, numbers in columns.items():
         words = table.words.get(name)
         if words is not None and words.row == row:
@@ -246,7 +246,7 @@ def _floats(column: Any) -> FloatArray:
 
 
 def _times(table: LoadedTable, named: str | None) -> tuple[IntArray | None, str]:
-    """When each row was, nanoseconds, -1 where that is missing; and the name of the column."""
+    """The time of each row, nanoseconds, -1 where it is missing; and the name of the column."""
     if named is None:
         return None, ""
     path, names = table.path, table.columns.column_names

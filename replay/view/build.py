@@ -28,7 +28,7 @@ from replay.runs.folders import MODULES_FILE, run_log
 from replay.runs.log import Frames, read_batches, read_header
 from replay.runs.modules import load_modules
 from replay.runs.run import Outline, Tally, read_outline, stated_source, states_whole
-from replay.view.columns import FRAME, MOST_STREAMS, frames_column, line_column
+from replay.view.columns import FRAME, MOST_STREAMS, Target
 from replay.view.labels import label, part
 from replay.view.layouts import blueprint, lines, time_axis
 from replay.view.panels import run_layout
@@ -217,22 +217,23 @@ def write_recording(
         first, count, spec = source.t, source.frames, source.spec
         ours = isinstance(source, RecordedSource)
         scenery = world_of_recording(paths[0]) if ours else None
-        scene = None if scenery is None else SceneView(recording, spec, scenery, every)
+        target = Target(recording, spec)
+        scene = None if scenery is None else SceneView(target, scenery, every)
         notes = [*source.warnings, *(scene.notes if scene is not None else ())]
-        write_views(recording, source, count, every, scene=scene)
+        write_views(target, source, count, every, scene=scene)
         for note in notes:
             recording.set_time(FRAME, sequence=first)
             recording.log("events", rr.TextLog(label(note), level="WARN"))
     properties: Any = {"frames": count, "streams": label(", ".join(spec.streams)), "fps": spec.fps}
     recording.send_property("recording", rr.AnyValues(**properties))
     poses = {name: pose for p in paths for name, pose in head_poses(p).items()} if ours else {}
-    head = write_heads(recording, spec.streams, poses)
+    head = write_heads(target, poses)
     layout = recording_layout(spec, first + count, head=head, scene=scene is not None, tab=tab)
     recording.send_blueprint(layout)
 
 
 def write_views(
-    recording: rr.RecordingStream,
+    target: Target,
     source: Logged,
     count: int,
     every: int,
@@ -242,7 +243,7 @@ def write_views(
     """Write every view of a recording, and what the world knows, from the source's t on.
 
     Args:
-        recording: where they go.
+        target: where they go.
         source: the recording.
         count: how many frames.
         every: show images of every this many frames.
@@ -250,8 +251,8 @@ def write_views(
         scene: where what the world knows is shown, too.
     """
     first, spec = source.t, source.spec
-    columns = [frames_column(recording, spec, view) for view in view_entities(spec)]
-    truth = line_column(recording, spec, "world/truth", spec.truth, every_frame=True)
+    columns = [target.frames(view) for view in view_entities(spec)]
+    truth = target.lines("world/truth", spec.truth, every_frame=True)
     has_truth = spec.truth and blocks is None
     for t in range(first, first + count, BLOCK):
         stop = min(t + BLOCK, first + count)
@@ -287,7 +288,7 @@ def write_unwatched(
         UsageError: the run learned from another recording, or from a live scene.
         LogDamagedError: it cannot be read.
     """
-    learned_from = stated_source(log)
+    learned_from, target = stated_source(log), Target(recording, outline.header.spec)
     with contextlib.closing(RecordedSource(path, loop=True)) as source:
         whole = states_whole(learned_from)
         described = source.describe() if whole else source.describe_at_once()
@@ -296,11 +297,11 @@ def write_unwatched(
                 f"{path} is not the recording that this run learned from: the SHA-256 of its "
                 "files are others"
             )
-        write_views(recording, source, outline.end - source.t, every, outline.blocks)
+        write_views(target, source, outline.end - source.t, every, outline.blocks)
     poses = head_poses(path)
-    if not write_heads(recording, outline.names(), poses):
+    if not write_heads(target, poses):
         return False
-    write_gaze(recording, outline, poses)
+    write_gaze(target, outline, poses)
     return True
 
 

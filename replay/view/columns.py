@@ -7,6 +7,7 @@ after the call: so an array is copied, but for images that nobody may write to.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -54,20 +55,6 @@ Encode = Callable[[NDArray[Any]], Any]
 """Makes Rerun's component columns of (n, ...) values."""
 
 
-def time_columns(
-    spec: SourceSpec, frames: IntArray, iterations: IntArray | None = None
-) -> list[rr.TimeColumn]:
-    """Where rows at these frames stand on each timeline."""
-    times = times_of(frames, spec.fps, spec.start_ns)
-    found = [
-        rr.TimeColumn(FRAME, sequence=frames.copy()),
-        rr.TimeColumn(LOG_TIME, timestamp=times.astype("datetime64[ns]")),
-    ]
-    if iterations is not None:
-        found.append(rr.TimeColumn(ITERATION, sequence=iterations.copy()))
-    return found
-
-
 def power_of_ten(values: FloatArray) -> FloatArray:
     """Logarithms of values, of any shape, to the base of ten; NaN of what has none."""
     return np.log10(np.where(values > 0, values, np.nan))
@@ -85,8 +72,7 @@ class Column:
     dropped: a signal that the run never has gets no entity.
 
     Args:
-        recording: where they go.
-        spec: of the source, for the log time of a frame.
+        target: where they go.
         path: the entity.
         style: what is said of it once.
         encode: how values are handed over.
@@ -96,16 +82,14 @@ class Column:
 
     def __init__(
         self,
-        recording: rr.RecordingStream,
-        spec: SourceSpec,
+        target: Target,
         path: str,
         style: Any = None,
         encode: Encode = scalars,
         *,
         every_frame: bool = False,
     ) -> None:
-        self.path = path
-        self._recording, self._spec = recording, spec
+        self.path, self._target = path, target
         self._style, self._encode, self._every_frame = style, encode, every_frame
         self._begun = False
         self._last: tuple[IntArray, IntArray | None] | None = None
@@ -136,7 +120,7 @@ class Column:
         missing = values.dtype.kind == "f" and bool(np.isnan(values).all())
         if self._begun or not missing:
             if self._style is not None and not self._begun:
-                self._recording.log(self.path, self._style, static=True)
+                self._target.log(self.path, self._style)
             self._begun = True
             frames = _joined(self._frames)
             iterations = _joined(self._iterations) if self._iterations else None
@@ -145,7 +129,7 @@ class Column:
             rows = max(MAX_BYTES // max(values[:1].nbytes, 1), 1)
             for part in (slice(i, i + rows) for i in range(0, len(values), rows)):
                 those = None if iterations is None else iterations[part]
-                self.send(time_columns(self._spec, frames[part], those), values[part])
+                self.send(self._target.times(frames[part], those), values[part])
         self._clear()
 
     def _ended_at_gaps(
@@ -166,71 +150,95 @@ class Column:
 
     def send(self, times: list[rr.TimeColumn], values: NDArray[Any]) -> None:
         """Hand (n, ...) values over as rows."""
-        self._recording.send_columns(self.path, times, self._encode(values))
+        self._target.recording.send_columns(self.path, times, self._encode(values))
 
 
 def _joined(parts: list[NDArray[Any]]) -> NDArray[Any]:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def line_column(
-    recording: rr.RecordingStream,
-    spec: SourceSpec,
-    path: str,
-    names: Sequence[str],
-    rgbs: Sequence[Rgb] | None = None,
-    width: float | None = None,
-    *,
-    steps: bool = False,
-    every_frame: bool = False,
-) -> Column:
-    """A column that is drawn as lines, whose names and colours are said once.
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A Rerun recording, and the source on whose clock its rows stand."""
 
-    Args:
-        recording: where they go.
-        spec: of the source.
-        path: the entity.
-        names: of the lines.
-        rgbs: their colours.
-        width: of a line.
-        steps: a value holds until the next one; there is nothing between two values.
-        every_frame: see `Column`.
-    """
-    modes = rr.components.InterpolationMode
-    style = rr.SeriesLines(
-        names=[label(name) for name in names],
-        colors=packed_all(rgbs or [pale(i) for i in range(len(names))]),
-        widths=None if width is None else [width] * len(names),
-        aggregation_policy=AGGREGATION,
-        interpolation_mode=modes.StepAfter if steps else modes.Linear,
-    )
-    return Column(recording, spec, path, style, every_frame=every_frame)
+    recording: rr.RecordingStream
+    spec: SourceSpec
 
+    def times(self, frames: IntArray, iterations: IntArray | None = None) -> list[rr.TimeColumn]:
+        """Where rows at these frames stand on each timeline."""
+        times = times_of(frames, self.spec.fps, self.spec.start_ns)
+        found = [
+            rr.TimeColumn(FRAME, sequence=frames.copy()),
+            rr.TimeColumn(LOG_TIME, timestamp=times.astype("datetime64[ns]")),
+        ]
+        if iterations is not None:
+            found.append(rr.TimeColumn(ITERATION, sequence=iterations.copy()))
+        return found
 
-def frames_column(
-    recording: rr.RecordingStream, spec: SourceSpec, path: str, width: float | None = None
-) -> Column:
-    """A column of a source's frames: images, or lines of values."""
-    if spec.images:
-        return image_column(recording, spec, path)
-    names = [f"value {i + 1}" for i in range(int(np.prod(spec.frame_shape)))]
-    return line_column(recording, spec, path, names, width=width, every_frame=True)
+    def send(self, path: str, frames: IntArray, iterations: IntArray, rows: Any) -> None:
+        """Hand rows over at once."""
+        self.recording.send_columns(path, self.times(frames, iterations), rows)
 
+    def log(self, path: str, value: Any) -> None:
+        """Say something of an entity that holds at all times."""
+        self.recording.log(path, value, static=True)
 
-def image_column(recording: rr.RecordingStream, spec: SourceSpec, path: str) -> Column:
-    """A column of images of a source, (n, height, width) grey."""
-    height, width = spec.frame_shape
-    form = rr.components.ImageFormat(
-        width=width, height=height, color_model="L", channel_datatype="U8"
-    )
-    return Column(recording, spec, path, rr.Image.from_fields(format=form), images)
+    def log_at(self, path: str, t: int, iteration: int, value: Any) -> None:
+        """Log something at a frame and iteration."""
+        self.recording.set_time(FRAME, sequence=t)
+        self.recording.set_time(ITERATION, sequence=max(iteration, 0))
+        at = np.datetime64(self.spec.time_ns(t), "ns")
+        self.recording.set_time(LOG_TIME, timestamp=at)
+        self.recording.log(path, value)
 
+    def lines(
+        self,
+        path: str,
+        names: Sequence[str],
+        rgbs: Sequence[Rgb] | None = None,
+        width: float | None = None,
+        *,
+        steps: bool = False,
+        every_frame: bool = False,
+    ) -> Column:
+        """A column that is drawn as lines, whose names and colours are said once.
 
-def tensor_column(
-    recording: rr.RecordingStream, spec: SourceSpec, path: str, names: Sequence[str]
-) -> Column:
-    """A column of tensors of one shape, with a name for each dimension."""
-    return Column(recording, spec, path, None, lambda values: named_tensors(values, names))
+        Args:
+            path: the entity.
+            names: of the lines.
+            rgbs: their colours.
+            width: of a line.
+            steps: a value holds until the next one; there is nothing between two values.
+            every_frame: see `Column`.
+        """
+        modes = rr.components.InterpolationMode
+        style = rr.SeriesLines(
+            names=[label(name) for name in names],
+            colors=packed_all(rgbs or [pale(i) for i in range(len(names))]),
+            widths=None if width is None else [width] * len(names),
+            aggregation_policy=AGGREGATION,
+            interpolation_mode=modes.StepAfter if steps else modes.Linear,
+        )
+        return Column(self, path, style, every_frame=every_frame)
+
+    def frames(self, path: str, width: float | None = None) -> Column:
+        """A column of the source's frames: images, or lines of values."""
+        if self.spec.images:
+            return self.images(path)
+        names = [f"value {i + 1}" for i in range(int(np.prod(self.spec.frame_shape)))]
+        return self.lines(path, names, width=width, every_frame=True)
+
+    def images(self, path: str) -> Column:
+        """A column of images of the source, (n, height, width) grey."""
+        height, width = self.spec.frame_shape
+        form = rr.components.ImageFormat(
+            width=width, height=height, color_model="L", channel_datatype="U8"
+        )
+        return Column(self, path, rr.Image.from_fields(format=form), images)
+
+    def tensors(self, path: str, names: Sequence[str]) -> Column:
+        """A column of tensors of one shape, with a name for each dimension."""
+        return Column(self, path, None, lambda values: named_tensors(values, names))
 
 
 class _Batch:

@@ -14,12 +14,11 @@ import numpy as np
 import rerun as rr
 
 from cdmisfa.core.arrays import IntArray
-from cdmisfa.core.blocks import SourceSpec
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay import palette
 from replay.palette import Rgb, colour, packed_all
 from replay.runs.columns import SignalColumns
-from replay.view.columns import time_columns
+from replay.view.columns import Target
 from replay.view.labels import label, part
 
 Names = Callable[[int], tuple[str, Rgb]]
@@ -51,8 +50,7 @@ class Lanes:
     """All lanes of a run.
 
     Args:
-        recording: where they go.
-        spec: of the source.
+        target: where they go.
         shown: the streams that get a lane of their own: of the policy, or of the stream's state.
         by_progress: the run is one of the progress learner, which has no gate.
         piece: blocks for which lanes of most blocks have one state; by default so many that they
@@ -61,15 +59,14 @@ class Lanes:
 
     def __init__(
         self,
-        recording: rr.RecordingStream,
-        spec: SourceSpec,
+        target: Target,
         shown: Sequence[int],
         *,
         by_progress: bool = False,
         piece: int | None = None,
     ) -> None:
         self._lanes: list[tuple[Codes, Lane]] = []
-        count = len(spec.streams)
+        spec, count = target.spec, len(target.spec.streams)
         self._known_by = np.zeros(count, dtype=np.int64)
 
         def attended(stream: int) -> tuple[str, Rgb]:
@@ -80,10 +77,10 @@ class Lanes:
             return (name, colour(code)) if code < count else (SWITCH, palette.GREY)
 
         def lane(path: str, codes: Codes, names: Names, mixed: str = "") -> None:
-            self._lanes.append((codes, Lane(recording, spec, path, names)))
+            self._lanes.append((codes, Lane(target, path, names)))
             if mixed:
                 place = f"{MOSTLY}/{path}"
-                mostly = MostlyLane(recording, spec, place, _or_mixed(names, mixed), piece)
+                mostly = MostlyLane(target, place, _or_mixed(names, mixed), piece)
                 self._lanes.append((codes, mostly))
 
         lane(ATTENDS, lambda c: c["stream"], attended, "switches")
@@ -131,16 +128,13 @@ class Lane:
     Between blocks there is no state: a bar ends where a gap begins.
 
     Args:
-        recording: where they go.
-        spec: of the source.
+        target: where they go.
         path: the entity.
         names: the states of the codes.
     """
 
-    def __init__(
-        self, recording: rr.RecordingStream, spec: SourceSpec, path: str, names: Names
-    ) -> None:
-        self._recording, self._spec, self._path, self._names = recording, spec, path, names
+    def __init__(self, target: Target, path: str, names: Names) -> None:
+        self._target, self._path, self._names = target, path, names
         self._state: str | None = None
         self._stop: int | None = None
         self._changes: list[tuple[int, int, str]] = []
@@ -174,11 +168,10 @@ class Lane:
             self._declared = len(self._colours)
             states, colours = list(self._colours), packed_all(list(self._colours.values()))
             known = rr.StateConfiguration(values=states, labels=states, colors=colours)
-            self._recording.log(self._path, known, static=True)
+            self._target.log(self._path, known)
         frames, iterations = (np.array([row[i] for row in self._changes]) for i in (0, 1))
-        times = time_columns(self._spec, frames, iterations)
         changes = rr.StateChange.columns(state=[state for *_, state in self._changes])
-        self._recording.send_columns(self._path, times, changes)
+        self._target.send(self._path, frames, iterations, changes)
         self._changes = []
 
 
@@ -186,22 +179,14 @@ class MostlyLane(Lane):
     """A lane with the state of most of the blocks of each piece of a run.
 
     Args:
-        recording: where they go.
-        spec: of the source.
+        target: where they go.
         path: the entity.
         names: the states of the codes.
         piece: blocks of a piece; by default a run has `PIECES`, known at its end.
     """
 
-    def __init__(
-        self,
-        recording: rr.RecordingStream,
-        spec: SourceSpec,
-        path: str,
-        names: Names,
-        piece: int | None,
-    ) -> None:
-        super().__init__(recording, spec, path, names)
+    def __init__(self, target: Target, path: str, names: Names, piece: int | None) -> None:
+        super().__init__(target, path, names)
         self._piece, self._tau = piece, 0
         self._waiting: list[tuple[IntArray, IntArray, IntArray]] = []
 

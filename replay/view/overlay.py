@@ -15,8 +15,8 @@ from replay.runs.columns import SignalColumns
 from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
-from replay.view.columns import ITERATION, MOST_STREAMS, Column, line_column, power_of_ten
-from replay.view.labels import label, part
+from replay.view.columns import ITERATION, MOST_STREAMS, Column, Target, power_of_ten
+from replay.view.labels import label, part, text_table
 from replay.view.layouts import blueprint, lines, time_axis
 
 CURVES = {
@@ -86,12 +86,10 @@ def build_overlay(
 
 def table_text(rows: Sequence[Row]) -> str:
     """The rows as a Markdown table."""
-    ruler = tuple("---" for _ in HEAD)
     short = [(*row.cells()[:-1], _shortly(row.difference)) for row in rows]
-    cells = [[cell.replace("|", "/") for cell in line] for line in (HEAD, ruler, *short)]
+    cells = [[cell.replace("|", "/") for cell in line] for line in short]
     forks = [line for row in rows if (line := _fork(row))]
-    table = [f"| {' | '.join(line)} |" for line in cells]
-    return "\n".join(["## Runs compared", "", *table, *(("", *forks) if forks else ())])
+    return "\n".join(["## Runs compared", "", *text_table(HEAD, cells), *forks])
 
 
 def _fork(row: Row) -> str:
@@ -119,6 +117,7 @@ def _shortly(difference: Difference | None) -> str:
 
 def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number: int) -> None:
     header, rgb = row.outline.header, colour(number)
+    target = Target(recording, header.spec)
     shown = row.outline.streams(MOST_STREAMS)
     lines: dict[str, Column] = {}
     fork, marked = header.forked_at, set[str]()
@@ -128,7 +127,7 @@ def _write(recording: rr.RecordingStream, run: Path, row: Row, root: str, number
             frames, iterations = columns.frames[kept], columns.iterations[kept]
             if path not in lines:
                 names, rgbs = [row.name] * values.shape[1], [rgb] * values.shape[1]
-                lines[path] = line_column(recording, header.spec, path, names, rgbs)
+                lines[path] = target.lines(path, names, rgbs)
             lines[path].add(frames, iterations, values)
             if fork is not None and entity not in marked and iterations[-1] >= fork:
                 marked.add(entity)

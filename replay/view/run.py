@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,19 +24,7 @@ from replay.palette import BRICK, GREY, MIST, Rgb, colour, darker, packed, packe
 from replay.runs.columns import Blocks, SignalColumns, has_values
 from replay.runs.log import Batch, RunHeader
 from replay.runs.run import Outline
-from replay.view.columns import (
-    FRAME,
-    ITERATION,
-    LOG_TIME,
-    TIMELINE_SIGNALS,
-    Column,
-    frames_column,
-    line_column,
-    power_of_ten,
-    tensor_column,
-    tensors,
-    time_columns,
-)
+from replay.view.columns import TIMELINE_SIGNALS, Column, Target, power_of_ten, tensors
 from replay.view.labels import label, line_labels, part
 from replay.view.lanes import Lanes
 from replay.view.summary import decision_text
@@ -119,7 +108,8 @@ class RunView:
         *,
         piece: int | None = None,
     ) -> None:
-        self._recording, self._spec, self._every = recording, header.spec, every
+        self._target, self._spec = Target(recording, header.spec), header.spec
+        self._every = every
         self._streams, self._by_progress = list(streams), header.by_progress
         self._thresholds = _thresholds(header)
         self._columns: dict[str, Column] = {}
@@ -127,9 +117,7 @@ class RunView:
         self._recent = np.zeros((0, len(streams)), dtype=bool)
         self._stream_of: dict[int, int] = {}
         self._named = -1
-        self._lanes = Lanes(
-            recording, self._spec, streams, by_progress=header.by_progress, piece=piece
-        )
+        self._lanes = Lanes(self._target, streams, by_progress=header.by_progress, piece=piece)
 
     def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
@@ -182,7 +170,7 @@ class RunView:
             one = len(set(curve.labels)) == 1
             rgbs = [pale(curve.number + (0 if one else i)) for i in range(len(curve.labels))]
         how = curve.labels, rgbs, curve.width
-        line = self._column(curve.path, line_column, *how, every_frame=curve.every_frame)
+        line = self._column(curve.path, self._target.lines, *how, every_frame=curve.every_frame)
         line.add(frames, iterations, curve.values.reshape(len(frames), -1))
 
     def _watched(self, at: IntArray, frames: NDArray[Any]) -> None:
@@ -192,7 +180,7 @@ class RunView:
             if not kept.all():
                 at, frames = at[kept], frames[kept]
         if len(at):
-            column = self._column("world/watched", frames_column, 1.5)
+            column = self._column("world/watched", self._target.frames, 1.5)
             column.add(at, self._blocks.iteration(at), frames)
 
     def weights(self, path: str, t: int, iteration: int, phi: FloatArray) -> None:
@@ -205,14 +193,12 @@ class RunView:
             shown = rr.BarChart(tensors(phi.reshape(1, -1)), color=packed(MIST))
         else:
             shown = rr.Tensor(phi.copy(), dim_names=("output", "input"))
-        self._set_time(t, iteration)
-        self._recording.log(path, shown)
+        self._target.log_at(path, t, iteration, shown)
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Say in words what happened."""
-        self._set_time(t, iteration)
         level = "WARN" if level == "WARNING" else level
-        self._recording.log("events", rr.TextLog(label(text), level=level))
+        self._target.log_at("events", t, iteration, rr.TextLog(label(text), level=level))
 
     def threshold(self, frames: IntArray, iterations: IntArray) -> None:
         """Draw the lines below which something is learned, through frames, (n,)."""
@@ -325,7 +311,7 @@ class RunView:
                 names = [AXES[d] for d in signal.dims]
                 if names.count("stream") > 1:
                     names[-1] = "next stream"
-                column = self._column(f"signals/{signal.name}", tensor_column, names)
+                column = self._column(f"signals/{signal.name}", self._target.tensors, names)
                 column.add(columns.frames[kept], columns.iterations[kept], value[kept])
 
     def _table(self, columns: SignalColumns) -> None:
@@ -350,7 +336,7 @@ class RunView:
         if self._named < 0:
             height, width = self._spec.frame_shape
             frame = rr.Boxes2D(mins=[[0, 0]], sizes=[[width, height]], show_labels=True)
-            self._recording.log(WATCHED_NAME, frame, static=True)
+            self._target.log(WATCHED_NAME, frame)
         streams = columns["stream"][turns].tolist()
         self._named = streams[-1]
         labels = [label(self._spec.streams[s]) for s in streams]
@@ -367,22 +353,16 @@ class RunView:
         style = rr.SeriesPoints(
             colors=[packed(BRICK)], markers="diamond", marker_sizes=[7.0], names=["module saved"]
         )
-        column = self._column(path, Column, style)
+        column = self._column(path, partial(Column, self._target), style)
         column.add(columns.frames[saved], columns.iterations[saved], stood)
 
     def _send(self, columns: SignalColumns, rows: IntArray, path: str, values: Any) -> None:
-        times = time_columns(self._spec, columns.frames[rows], columns.iterations[rows])
-        self._recording.send_columns(path, times, values)
-
-    def _set_time(self, t: int, iteration: int) -> None:
-        self._recording.set_time(FRAME, sequence=t)
-        self._recording.set_time(ITERATION, sequence=max(iteration, 0))
-        self._recording.set_time(LOG_TIME, timestamp=np.datetime64(self._spec.time_ns(t), "ns"))
+        self._target.send(path, columns.frames[rows], columns.iterations[rows], values)
 
     def _column(self, path: str, make: Callable[..., Column], *how: Any, **more: bool) -> Column:
         """The column of an entity, made when it is first needed."""
         if path not in self._columns:
-            self._columns[path] = make(self._recording, self._spec, path, *how, **more)
+            self._columns[path] = make(path, *how, **more)
         return self._columns[path]
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rerun.urdf import UrdfTree
 
 from cdmisfa.core.arrays import FloatArray, IntArray
-from cdmisfa.core.blocks import HeadPose, SourceSpec
+from cdmisfa.core.blocks import HeadPose
 from cdmisfa.core.errors import CdmisfaError
 from recorder.log.scenery import Eye, Gaze, Scenery, Thing
 from replay.palette import Rgb, colour, packed_all, pale
@@ -28,7 +28,7 @@ from replay.recordings.poses import yaw_of
 from replay.runs.columns import SignalColumns
 from replay.runs.log import Batch
 from replay.runs.run import Outline
-from replay.view.columns import Column, line_column, time_columns
+from replay.view.columns import Column, Target
 from replay.view.labels import label, part
 
 SCENE = "scene"
@@ -55,8 +55,7 @@ class SceneView:
     """Writes the world of a run, or of a recording, into a Rerun recording.
 
     Args:
-        recording: where it goes.
-        spec: what the source delivers.
+        target: where it goes.
         scenery: what stands where.
         every: show where things are at every so many frames.
         body: show the robot's, too.
@@ -65,34 +64,26 @@ class SceneView:
         notes: why the robot's body is not shown.
     """
 
-    def __init__(
-        self,
-        recording: rr.RecordingStream,
-        spec: SourceSpec,
-        scenery: Scenery,
-        every: int,
-        *,
-        body: bool = True,
-    ) -> None:
-        self._recording, self._spec, self._every = recording, spec, every
+    def __init__(self, target: Target, scenery: Scenery, every: int, *, body: bool = True) -> None:
+        self._target, self._every, spec = target, every, target.spec
         self.notes: list[str] = []
         self._watched, self._turned = -1, False
         self._neck: Any = None
-        recording.log(SCENE, rr.ViewCoordinates.BRU, static=True)
-        _write_thing(recording, f"{SCENE}/table", scenery.table, at_rest=True)
+        target.log(SCENE, rr.ViewCoordinates.BRU)
+        _write_thing(target, f"{SCENE}/table", scenery.table, at_rest=True)
         self._objects = [
-            (thing, Column(recording, spec, f"{SCENE}/{thing.name}", encode=_places))
+            (thing, Column(target, f"{SCENE}/{thing.name}", encode=_places))
             for thing in scenery.objects
             if set(thing.truth) <= set(spec.truth)
         ]
         for thing, column in self._objects:
-            _write_thing(recording, column.path, thing)
+            _write_thing(target, column.path, thing)
         self._gazes = [scenery.gaze(name) for name in spec.streams]
         for s, gaze in enumerate(self._gazes):
             if gaze is not None:
-                _write_pyramid(recording, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
+                _write_pyramid(target, f"{SCENE}/gaze/{part(spec.streams, s)}", gaze, colour(s))
         try:
-            self._neck = write_body(recording, SCENE, scenery.robot) if body else None
+            self._neck = write_body(target.recording, SCENE, scenery.robot) if body else None
         except CdmisfaError as error:
             self.notes.append(str(error))
 
@@ -108,7 +99,7 @@ class SceneView:
         kept = at % self._every == 0
         at, truth = at[kept], truth[kept]
         for thing, column in self._objects:
-            column.add(at, None, thing.places(self._spec.truth, truth))
+            column.add(at, None, thing.places(self._target.spec.truth, truth))
 
     def _turn(self, columns: SignalColumns) -> None:
         """Turn the head to what is watched."""
@@ -123,16 +114,15 @@ class SceneView:
         if not self._turned:  # the eyes are the same in every view
             self._turned = True
             thick = rr.LineStrips3D(pyramid(gazes[0].middle), radii=[THICK])
-            self._recording.log(f"{WATCHING}/edges", thick, static=True)
-        times = time_columns(self._spec, columns.frames[at], columns.iterations[at])
+            self._target.log(f"{WATCHING}/edges", thick)
+        when = columns.frames[at], columns.iterations[at]
         rgbs = [colour(int(s)) for s in streams[at]]
-        self._recording.send_columns(WATCHING, times, _poses(gazes))
-        self._recording.send_columns(
-            f"{WATCHING}/edges", times, rr.LineStrips3D.columns(colors=packed_all(rgbs))
-        )
+        self._target.send(WATCHING, *when, _poses(gazes))
+        edges = rr.LineStrips3D.columns(colors=packed_all(rgbs))
+        self._target.send(f"{WATCHING}/edges", *when, edges)
         if self._neck is not None:
             turned = self._neck.compute_transform_columns([math.radians(g.yaw) for g in gazes])
-            self._recording.send_columns(f"{SCENE}/neck", times, turned)
+            self._target.send(f"{SCENE}/neck", *when, turned)
 
     def flush(self) -> None:
         """Hand over what waits."""
@@ -151,26 +141,24 @@ def pyramid(eye: Eye) -> list[list[list[float]]]:
     return [*([[0.0, 0.0, 0.0], corner] for corner in corners), [*corners, corners[0]]]
 
 
-def _write_pyramid(recording: rr.RecordingStream, path: str, gaze: Gaze, rgb: Rgb) -> None:
+def _write_pyramid(target: Target, path: str, gaze: Gaze, rgb: Rgb) -> None:
     eye = gaze.middle
     placed = rr.Transform3D(translation=eye.place, quaternion=rr.Quaternion(xyzw=eye.turn))
-    recording.log(path, placed, static=True)
+    target.log(path, placed)
     edges = pyramid(eye)
     rgbs = packed_all([rgb] * EDGES)
-    recording.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]), static=True)
+    target.log(path, rr.LineStrips3D(edges, colors=rgbs, radii=[THIN]))
     end = np.mean(edges[-1][2:4], axis=0)
     name = rr.Points3D(
         [end], labels=[label(gaze.name)], colors=rgbs[:1], radii=[THICK], show_labels=True
     )
-    recording.log(f"{path}/name", name, static=True)
+    target.log(f"{path}/name", name)
 
 
-def _write_thing(
-    recording: rr.RecordingStream, path: str, thing: Thing, *, at_rest: bool = False
-) -> None:
+def _write_thing(target: Target, path: str, thing: Thing, *, at_rest: bool = False) -> None:
     """Show what a thing looks like; where it is, only of one that stands still."""
     if at_rest:
-        recording.log(path, rr.Transform3D(translation=thing.place), static=True)
+        target.log(path, rr.Transform3D(translation=thing.place))
     light = 0.0 if at_rest else LIGHT
     rgb = [round(255 * min(part + light, 1.0)) for part in thing.colour]
     solid = rr.components.FillMode.Solid
@@ -184,7 +172,7 @@ def _write_thing(
         shape = rr.Ellipsoids3D(half_sizes=[half], colors=[rgb], fill_mode=solid)
     else:
         shape = rr.Boxes3D(half_sizes=[half], colors=[rgb], fill_mode=solid)
-    recording.log(path, shape, static=True)
+    target.log(path, shape)
 
 
 def _poses(gazes: Sequence[Gaze]) -> Any:
@@ -272,9 +260,7 @@ ARROW = 0.25
 """Length of the arrow along a gaze, in metres."""
 
 
-def write_heads(
-    recording: rr.RecordingStream, names: Sequence[str], poses: Mapping[str, HeadPose]
-) -> bool:
+def write_heads(target: Target, poses: Mapping[str, HeadPose]) -> bool:
     """Show in 3D where the head looks for each view: an arrow along its gaze.
 
     Poses are in the robot's root frame: x to the back, y to the right, z up.
@@ -282,34 +268,31 @@ def write_heads(
     Returns:
         Whether there is a pose for every view; otherwise nothing is shown.
     """
+    names = target.spec.streams
     if not set(poses) >= set(names):
         return False
-    recording.log(POSES, rr.ViewCoordinates.BRU, static=True)
+    target.log(POSES, rr.ViewCoordinates.BRU)
     for s, name in enumerate(names):
         place, pose = f"{POSES}/{part(names, s)}", poses[name]
         turn = rr.Quaternion(xyzw=pose.quaternion)
-        recording.log(
-            place, rr.Transform3D(translation=pose.position, quaternion=turn), static=True
-        )
+        target.log(place, rr.Transform3D(translation=pose.position, quaternion=turn))
         arrow = rr.Arrows3D(
             vectors=[[-ARROW, 0, 0]],
             radii=[0.005],
             colors=packed_all([colour(s)]),
             labels=[label(name)],
         )
-        recording.log(place, arrow, static=True)
+        target.log(place, arrow)
     return True
 
 
-def write_gaze(
-    recording: rr.RecordingStream, outline: Outline, poses: Mapping[str, HeadPose]
-) -> None:
+def write_gaze(target: Target, outline: Outline, poses: Mapping[str, HeadPose]) -> None:
     """Show where a run turned the head: `/head/yaw` in degrees, and an arrow in 3D."""
-    spec, blocks = outline.header.spec, outline.blocks
-    watched = [poses[name] for name in spec.streams]
+    blocks = outline.blocks
+    watched = [poses[name] for name in target.spec.streams]
     yaws = np.array([yaw_of(pose) for pose in watched])
     names = ["head turned to the left [degrees]"]
-    column = line_column(recording, spec, YAW, names, [pale(0)], steps=True)
+    column = target.lines(YAW, names, [pale(0)], steps=True)
     column.add(blocks.starts, blocks.iterations, yaws[blocks.streams][:, None])
     turns = np.flatnonzero(np.diff(blocks.streams, prepend=-1))
     if len(turns):
@@ -317,12 +300,11 @@ def write_gaze(
             translation=[watched[s].position for s in blocks.streams[turns]],
             quaternion=[watched[s].quaternion for s in blocks.streams[turns]],
         )
-        times = time_columns(spec, blocks.starts[turns], blocks.iterations[turns])
-        recording.send_columns(GAZE, times, turned)
+        target.send(GAZE, blocks.starts[turns], blocks.iterations[turns], turned)
     column.flush()
     white = packed_all([(255, 255, 255)])
     arrow = rr.Arrows3D(vectors=[[-1.4 * ARROW, 0, 0]], radii=[0.003], colors=white)
-    recording.log(GAZE, arrow, static=True)
+    target.log(GAZE, arrow)
 
 
 def scene_view() -> rrb.View:

@@ -11,8 +11,8 @@ import rerun as rr
 from cdmisfa.core.signals import STATES
 from replay.palette import colour, packed_all
 from replay.runs.columns import SignalColumns
-from replay.runs.log import Batch, RunHeader
-from replay.view.columns import Column, image_column, time_columns
+from replay.runs.log import Batch
+from replay.view.columns import Column, Target
 from replay.view.labels import label, part
 from replay.view.layouts import Bounds
 
@@ -33,24 +33,22 @@ class WallView:
     is watched is framed.
 
     Args:
-        recording: where they go.
-        header: of the run's log.
+        target: where they go.
         streams: those that are shown.
+        by_progress: the run is one of the progress learner.
     """
 
-    def __init__(
-        self, recording: rr.RecordingStream, header: RunHeader, streams: Sequence[int]
-    ) -> None:
-        self._recording, self._spec, self._streams = recording, header.spec, list(streams)
-        self._by_progress = header.by_progress
+    def __init__(self, target: Target, streams: Sequence[int], *, by_progress: bool) -> None:
+        self._target, self._spec, self._streams = target, target.spec, list(streams)
+        self._by_progress = by_progress
         height, width = self._spec.frame_shape
         self._places = places_of(len(self._streams), width, height)
         self._pictures: dict[int, Column] = {}
         self._last, self._said = -1, dict.fromkeys(self._streams, "")
         for s, (x, y) in zip(self._streams, self._places, strict=True):
             path = f"{WALL}/{part(self._spec.streams, s)}"
-            recording.log(path, rr.Transform3D(translation=[x, y, 0.0]), static=True)
-            self._pictures[s] = image_column(recording, self._spec, path)
+            target.log(path, rr.Transform3D(translation=[x, y, 0.0]))
+            self._pictures[s] = target.images(path)
 
     def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
@@ -90,8 +88,7 @@ class WallView:
             colors=packed_all([colour(s) for s in watched]),
             radii=[height / 80] * len(watched),
         )
-        times = time_columns(self._spec, columns.frames[turns], columns.iterations[turns])
-        self._recording.send_columns(FRAME, times, boxes)
+        self._target.send(FRAME, columns.frames[turns], columns.iterations[turns], boxes)
 
     def _say(self, columns: SignalColumns) -> None:
         """Write below each picture its stream's name and what became of it."""
@@ -113,8 +110,7 @@ class WallView:
                 radii=[0.0] * len(rows),
                 show_labels=[True] * len(rows),
             )
-            times = time_columns(self._spec, columns.frames[rows], columns.iterations[rows])
-            self._recording.send_columns(path, times, words)
+            self._target.send(path, columns.frames[rows], columns.iterations[rows], words)
 
     def _states(self, columns: SignalColumns, s: int) -> list[tuple[int, str]]:
         """Where a stream's state may change, and how it is told from there on."""

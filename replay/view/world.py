@@ -23,7 +23,7 @@ from replay.recordings.poses import first_pose
 from replay.runs.log import Batch, Frames, RunHeader
 from replay.runs.run import Outline
 from replay.storage.opening import log_files, open_store
-from replay.view.columns import line_column
+from replay.view.columns import Target
 from replay.view.labels import label
 from replay.view.layouts import Lesson, WorldTab
 from replay.view.scene import SceneView
@@ -147,15 +147,16 @@ class WorldView:
         *,
         body: bool = True,
     ) -> None:
+        target = Target(recording, header.spec)
         scenery, unsure = world_of_run(header, run, learned_from)
         self._tab = world_tab(header, scenery, streams)
         self._view: SceneView | WallView | None = None
         self.notes: list[str] = [] if unsure is None else [unsure]
         if scenery is not None:
-            self._view = SceneView(recording, header.spec, scenery, every, body=body)
+            self._view = SceneView(target, scenery, every, body=body)
             self.notes += self._view.notes
         elif header.spec.images:
-            self._view = WallView(recording, header, streams)
+            self._view = WallView(target, streams, by_progress=header.by_progress)
 
     def take(self, batch: Batch) -> None:
         """Take what a log holds of some iterations."""
@@ -199,6 +200,7 @@ def write_learned(
         truth: what the world knew at each frame, piece after piece.
     """
     names, spec = outline.names(), outline.header.spec
+    target = Target(recording, spec)
     if not truth or not outline.saved:
         return []
     frames, values = (np.concatenate(part)[-MOST_FRAMES:] for part in zip(*truth, strict=True))
@@ -217,7 +219,7 @@ def write_learned(
             ("output", whose, colour(output.stream), NARROW, said),
         ):
             place, how = f"{root}/{path}", ([name], [rgb], width)
-            column = line_column(recording, spec, place, *how, every_frame=True)
+            column = target.lines(place, *how, every_frame=True)
             column.add(frames, iterations, line)
             column.flush()
         both = np.concatenate([followed, output.y])

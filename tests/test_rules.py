@@ -1,0 +1,109 @@
+"""Rules of the reference: rewards, their running mean, epsilon, actions, where a switch leads."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from reference.agent import (
+    add_reward,
+    choose,
+    curiosity_reward,
+    decay,
+    expert_reward,
+    other_stream,
+)
+
+from cdmisfa.core.config import LearnerConfig
+
+small = st.floats(-1, 1)
+unit = st.floats(0, 1, exclude_max=True)
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> tuple[int, list[tuple[int, int, int, float]]]:
+    n = draw(st.integers(1, 6))
+    stream = st.integers(0, n - 1)
+    reward = st.tuples(stream, st.integers(0, 1), stream, small)
+    return n, draw(st.lists(reward, min_size=1, max_size=40))
+
+
+def test_rewards_of_the_expert_and_of_curiosity() -> None:
+    assert expert_reward(0.0, 0.01, 0.3) == 0.3
+    assert expert_reward(0.01, 0.01, 0.3) == pytest.approx(0.3 * math.exp(-0.5))
+    assert expert_reward(-0.02, 0.01, 0.3) == pytest.approx(0.3 * math.exp(-2.0))
+    assert expert_reward(1e6, 0.01, 0.3) == 0.0
+    assert expert_reward(0.0, 0.0, 0.3) == 0.0  # sigma 0 is none
+    assert curiosity_reward(0.2, 0.5) == pytest.approx(0.3)  # of a falling change
+    assert curiosity_reward(0.5, 0.2) == pytest.approx(-0.3)
+
+
+def test_beta_is_the_papers_unless_set() -> None:
+    assert LearnerConfig(nu=0.05).reward_beta(3) == pytest.approx(0.05 * math.log(2) / 4)
+    assert LearnerConfig(nu=0.05).reward_beta(1) == pytest.approx(0.05 * math.log(2) / 2)
+    assert LearnerConfig(beta=0.0).reward_beta(3) == 0.0
+
+
+@given(histories())
+def test_the_mean_reward_is_the_papers_recursion(
+    history: tuple[int, list[tuple[int, int, int, float]]],
+) -> None:
+    """R <- R~/t + (1 - 1/t) R, literally, against sums divided by t."""
+    n, rewards = history
+    stay, switch, dense = np.zeros(n), np.zeros(n), np.zeros((n, 2, n))
+    R = np.zeros((n, 2, n))
+    for t, (s, a, s_next, r) in enumerate(rewards, start=1):
+        instantaneous = np.zeros((n, 2, n))
+        instantaneous[s, a, s_next] = r
+        R = instantaneous / t + (1 - 1 / t) * R
+        add_reward(stay, switch, dense, s, a, s_next, r)
+        np.testing.assert_allclose(dense / t, R, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(stay / t, R[:, 0].sum(1), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(switch / t, R[:, 1].sum(1), rtol=1e-9, atol=1e-12)
+
+
+def test_epsilon_decays_slowly_to_the_knee_and_fast_below() -> None:
+    epsilon, slow = 1.2, 0
+    while epsilon > 0.8:
+        epsilon = decay(epsilon, 0.999, 0.8, 0.95)
+        slow += 1
+    assert slow == np.ceil(np.log(0.8 / 1.2) / np.log(0.999))
+    assert decay(epsilon, 0.999, 0.8, 0.95) == epsilon * 0.95
+    assert decay(0.8, 0.999, 0.8, 0.95) == 0.8 * 0.95
+
+
+@given(st.floats(1, 1.2), unit, unit, st.integers(0, 1))
+def test_epsilon_of_one_and_more_is_certainty(
+    epsilon: float, coin: float, draw: float, greedy: int
+) -> None:
+    action, explored = choose(epsilon, greedy, coin, draw)
+    assert explored
+    assert action == (draw >= 0.5)
+
+
+def test_the_coin_is_compared_with_epsilon() -> None:
+    assert choose(0.3, 0, 0.29, 0.9) == (1, True)
+    assert choose(0.3, 0, 0.3, 0.9) == (0, False)
+    assert choose(0.0, 1, 0.0, 0.2) == (1, False)
+
+
+@given(st.integers(2, 10_000), st.data())
+def test_a_switch_never_stays(n: int, data: st.DataObject) -> None:
+    stream = data.draw(st.integers(0, n - 1))
+    following = other_stream(stream, n, data.draw(unit))
+    assert 0 <= following < n
+    assert following != stream
+    assert other_stream(2, 3, np.nextafter(1.0, 0.0)) == 1
+    assert other_stream(0, 1, 0.7) == 0
+
+
+@pytest.mark.parametrize("n", [2, 3, 7])
+def test_a_switch_is_uniform_over_the_others(n: int) -> None:
+    draws = (np.arange(6 * (n - 1) * 100) + 0.5) / (6 * (n - 1) * 100)
+    for stream in range(n):
+        hits = np.bincount([other_stream(stream, n, d) for d in draws], minlength=n)
+        assert hits[stream] == 0
+        assert set(np.delete(hits, stream)) == {600}
