@@ -248,10 +248,10 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "and how many times as fast as mcap's reader. First the reader alone: every message of "
         "one topic by log time with its payload, as `bytes` as mcap's reader gives it, or as a "
         "view of its chunk, which is what frames are made of. Both check the CRC of every chunk, "
-        "mcap's but for the last column; ours compares each chunk and its message indexes with "
-        "the summary, too. Then gray frames: mcap's reader with the same decoder and Pillow. CPU "
+        "mcap's but for the last column; ours compares each chunk with the summary, "
+        "too. Then gray frames: mcap's reader with the same decoder and Pillow. CPU "
         "of all threads, and by the wall's clock, which counts whatever else runs: of compressed "
-        "chunks the next two are decompressed while one is looked at. What limits reading is "
+        "chunks the next one is decompressed while one is looked at. What limits reading is "
         "decompressing (zstd takes 300 us of a raw image of 640x480, LZ4 130), which both do with "
         "the same libraries, and of JPEG decoding.",
         [

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.report import save
 from cdmisfa.core.blocks import Block, SourceSpec
 from recorder.config import RecordConfig
+from recorder.log.files import partial_path
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
 
@@ -28,10 +29,11 @@ def write(folder: Path, frames: NDArray[np.uint8], *, size: int = 0, **keys: str
     """Record frames as one view, again and again until its file has `size` bytes; the file."""
     spec = SourceSpec(("left",), frames.shape[1:], "uint8", ("x", "y"), 50.0, 10**18)
     log = ViewLog(folder, "left", RecordingSpec("plain", 0, spec, {}), RecordConfig(**keys))
-    while not log.t or log.file.size < size:
+    file = folder / "left.mcap"
+    while not log.t or partial_path(file).stat().st_size < size:
         log.write(Block(0, log.t, frames, np.zeros((len(frames), 2))))
     log.finish()
-    return log.file.path
+    return file
 
 
 def write_long(folder: Path, size: int) -> Path:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from cdmisfa.core.blocks import told_apart
+from cdmisfa.core.blocks import distinct_names
 from cdmisfa.core.clock import RECORDED_FPS, START_NS
 from cdmisfa.core.config import in_range
 from cdmisfa.core.errors import UsageError
@@ -133,4 +133,4 @@ def view_names(streams: Sequence[str]) -> tuple[str, ...]:
         letters = unicodedata.normalize("NFKD", stream)
         bare = "".join(c for c in letters if not unicodedata.combining(c))
         names.append(re.sub(r"[^\w.-]+", "_", bare).strip("._-") or "stream")
-    return told_apart(names)
+    return distinct_names(names)

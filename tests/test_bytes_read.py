@@ -16,7 +16,6 @@ from cdmisfa.experiments.session import run
 from recorder.config import RecordConfig
 from recorder.log.manifest import RecordingSpec
 from recorder.log.viewlog import ViewLog
-from recorder.mcap.reader import LogReader
 from recorder.world.oscillatory import OscillatorySource
 from replay.integrity.verify import check_log
 from replay.recordings.source import RecordedSource
@@ -86,25 +85,6 @@ def test_a_run_is_verified_in_one_pass(tmp_path: Path) -> None:
     run(OscillatorySource(), never, tmp_path / "run", max_iterations=600, rerun=False)
     log = tmp_path / "run" / "run.mcap"
     assert share_read(log, "check_log(path)") <= 1.1 + 25_000 / log.stat().st_size  # its header
-
-
-def test_a_damaged_chunk_is_told_when_it_is_reached(noise: Path, tmp_path: Path) -> None:
-    with LogReader(noise) as reader:
-        assert reader.by_index
-        chunk = reader.segments[len(reader.segments) // 2]
-    raw = bytearray(noise.read_bytes())
-    raw[chunk.data_offset + chunk.stored // 2] ^= 4
-    path = tmp_path / "left.mcap"
-    path.write_bytes(raw)
-    whole, source = RecordedSource(noise), RecordedSource(path)
-    before = (chunk.start - source.spec.start_ns) // 20_000_000
-    assert 0 < before < FRAMES - 1
-    assert np.array_equal(source.take(0, before).frames, whole.take(0, before).frames)
-    with pytest.raises(LogDamagedError, match=rf"left\.mcap.*{chunk.start} to {chunk.end}"):
-        source.take(0, 1)
-    with pytest.raises(LogDamagedError, match=rf"left\.mcap.*{chunk.start} to {chunk.end}"):
-        RecordedSource(path).describe()
-    assert any("data section" in problem.where for problem in check_log(path).problems)
 
 
 def test_a_changed_fact_is_found_by_who_reads_all(noise: Path, tmp_path: Path) -> None:

@@ -248,6 +248,15 @@ def test_bytes_that_are_no_image_are_refused(data: bytes, which: tuple[str, str]
     assert image.dtype == np.uint8
 
 
+def test_sizes_in_json_are_whole_numbers() -> None:
+    kind = ("foxglove.RawImage", "json")
+    for height in ("2", 2.5, -1, None):
+        with pytest.raises(MalformedImage, match="needs whole height, width and step"):
+            shown(kind, json.dumps({"height": height, "width": 1, "step": 1}).encode())
+    fields = {"height": True, "width": 1, "step": 1, "encoding": "mono8", "data": "AA=="}
+    assert shown(kind, json.dumps(fields).encode()).tolist() == [[0]]
+
+
 def test_an_image_is_averaged_over_areas() -> None:
     image = RANDOM.integers(0, 256, (96, 256), np.uint8)
     expected = image.reshape(48, 2, 128, 2).mean(axis=(1, 3))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cdmisfa.agents.learner import CuriousLearner
-from cdmisfa.cli.progress import Bar, Reporter
+from cdmisfa.cli.printing import Bar, Reporter
 from cdmisfa.core.blocks import Block
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import struct
+import tracemalloc
 from pathlib import Path
 
 import mcap_files as files
@@ -198,5 +199,7 @@ def test_a_long_file_is_read_in_little_memory(tmp_path: Path) -> None:
             writer.add_message(channel, i, block, i, i)
         writer.finish()
     with LogReader(path) as reader:
+        tracemalloc.start()
         assert sum(len(m.data) for m in reader.messages()) == 200_000_000
-        assert reader._chunks._cached <= 32 * 1024 * 1024
+        assert tracemalloc.get_traced_memory()[1] <= 32 * 1024 * 1024
+        tracemalloc.stop()

@@ -29,7 +29,7 @@ from conftest import Cdmisfa
 from engine_tasks import trace
 from waiting import wait_for
 
-from cdmisfa.cli.commands.sweep import parse_grid, parse_seeds, results_command, sweep_command
+from cdmisfa.cli.commands.trials import parse_grid, parse_seeds, results_command, sweep_command
 from cdmisfa.core import processes
 from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogDamagedError, UsageError

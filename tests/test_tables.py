@@ -141,7 +141,7 @@ def test_semicolons_tabs_and_decimal_commas_are_read(
         ("t,a\n0,1\n1,2,3", {}, LogDamagedError, "line 3 holds 3 cells, '1,2,3', and .* 2 cells"),
         ("t,a\n0,1\n1\n", {}, LogDamagedError, "line 3 holds a cell, '1', and .*: mend the line"),
         ("t,a\n0,1\n\xff,2,3\n", {}, LogDamagedError, "line 3 holds 3 cells, '\ufffd,2,3', and"),
-        ("# a log\nt,a\n0,1\n", {}, UsageError, "line 2 holds 2 cells.*: leave out the comment"),
+        ("# a log\n\nt,a\n0,1\n", {}, UsageError, "line 3 holds 2 cells.*: leave out the comment"),
         ("t,a\n0,\n1,\n", {"fields": ["a"]}, UsageError, "a is empty in every row: leave it out"),
         ("t,a\n0,1\n1,2\n2,3\n", {"time": "t:ns"}, UsageError, "1e.09 rows a second.*--time COL"),
         ("t,a\n0,1\n.1,2\n.2,3\n", {"time": "t:ns"}, UsageError, "say what its times count, as"),
@@ -156,15 +156,18 @@ def test_what_is_wrong_with_a_table_is_said(
         taken(path, **options)
 
 
-def test_a_last_line_that_was_cut_is_left_out_and_said(cdmisfa: Cdmisfa, tmp_path: Path) -> None:
+@pytest.mark.parametrize("cell", ["1", '"two\nlin'])
+def test_a_last_line_that_was_cut_is_left_out_and_said(
+    cdmisfa: Cdmisfa, tmp_path: Path, cell: str
+) -> None:
     path = written(tmp_path, {}, names="\ufefft,a,\xb5")
-    path.write_text(path.read_text() + "1.2,1")
+    path.write_text(path.read_text() + f"1.2,{cell}")
     frames, said = taken(path)
     assert frames == [[i, 2 * i + 0.5] for i in range(ROWS)]
     (line,) = said
     assert line.endswith(
-        "t.csv: line 14 holds 2 cells, '1.2,1', and the line of names 3 cells: the file was cut "
-        "there, and the line is left out"
+        f"t.csv: line 14 holds 2 cells, {'1.2,' + cell.strip(chr(34))!r}, and the line of names 3 "
+        "cells: the file was cut there, and the line is left out"
     )
     checked = cdmisfa("verify", path)
     assert (checked.code, "line 14 holds 2 cells" in checked.out) == (3, True)

@@ -49,18 +49,18 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "Write a run's signals as a table or arrays, a recording as images, videos or a dataset.",
     ),
     "upload": ("logs", "Upload a result to an S3 bucket, as `-o s3://...` does."),
-    "sweep": ("sweep", "Learn from a source many times, over a grid of settings and seeds."),
+    "sweep": ("trials", "Learn from a source many times, over a grid of settings and seeds."),
     "results": (
-        "sweep",
+        "trials",
         "Print mean and standard deviation over seeds at each point of a sweep.",
     ),
     "signals": ("logs", "List every signal that a run records."),
     "reproduce": (
-        "studies",
+        "trials",
         "Reproduce an experiment of the paper: numbers, tables and figures.",
     ),
-    "arena": ("studies", "Compare learners on sets of streams: what they learn, and how soon."),
-    "demo": ("studies", "Record, learn, check and show: the whole story in minutes."),
+    "arena": ("trials", "Compare learners on sets of streams: what they learn, and how soon."),
+    "demo": ("trials", "Record, learn, check and show: the whole story in minutes."),
     "doctor": ("doctor", "Say what this machine has and what it lacks."),
 }
 """Each command with its module in this package and its line of help."""

@@ -13,8 +13,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.making import Command
-from cdmisfa.cli.printing import quoted
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.printing import bar, quoted
 from cdmisfa.core.errors import CdmisfaError, LogExhaustedError, UsageError
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The types of arrays that everybody shares."""
+"""Types of arrays."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -261,8 +261,8 @@ def description(
     return described
 
 
-def told_apart(names: Iterable[str]) -> tuple[str, ...]:
-    """Names of streams, those like an earlier one with a number behind: cam, cam-2.
+def distinct_names(names: Iterable[str]) -> tuple[str, ...]:
+    """Distinct names of streams: a number behind those like an earlier one, as cam-2.
 
     One with which an earlier one begins, as cam after cam-left, counts as like it.
     """

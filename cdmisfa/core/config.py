@@ -51,7 +51,7 @@ _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 8
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = SHOWN
 
 FORMER = ("learner.portable",)
-"""Keys that had an effect once: runs and scripts that state them stay readable."""
+"""Keys of earlier versions: they are accepted, and ignored."""
 
 MAX_TAU = 100_000
 """A block of more frames than this does not fit into memory beside its images."""
@@ -59,7 +59,7 @@ MAX_TAU = 100_000
 
 @dataclass(frozen=True, slots=True)
 class LearnerConfig:
-    """Everything the learner can be told (keys `learner.*`).
+    """Configuration of the paper's learners, 2.0 and 1.0 (keys `learner.*`).
 
     The defaults are those of the oscillatory experiment; the presets hold every
     value again with its source.
@@ -372,7 +372,7 @@ _SCALARS: Mapping[Any, tuple[str, Callable[[Any], Any]]] = {
     float: ("a number", _number),
     str: ("a text", _text),
 }
-"""What a value of a type is in words, and how it is made of a value or text."""
+"""For each type of a key: its words in errors, and its conversion from a value or text."""
 
 
 def section_table(section: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What can go wrong, in words a user can act on.
+"""Errors whose message a user can act on.
 
 The message is built where the fact is known and names the file or key and the
 remedy. Only the command line turns these into exit codes.
@@ -42,7 +42,7 @@ class NotReproducedError(CdmisfaError):
 
 
 def are_for(options: Sequence[str], what: str) -> str:
-    """That options, one at least, are for something else, in words."""
+    """The text "--a and --b are for WHAT", for an error."""
     *others, last = options
     return f"{', '.join(others)} and {last} are for {what}" if others else f"{last} is for {what}"
 

@@ -1,4 +1,4 @@
-"""What learns, and what is told about it: `Learner` and `Sink`.
+"""The interfaces of learners and of sinks, which take what a run computes.
 
 `cdmisfa.experiments.loop.learn` brings a source, a learner and sinks together, and knows no more
 of them than is said here.
@@ -36,7 +36,7 @@ class LearnerState:
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """Where a run stood after some iterations, from which it can go on.
+    """The state of a run after some iterations, from which it can be resumed.
 
     Attributes:
         iteration: iterations done.
@@ -127,7 +127,7 @@ def arithmetic_of(learner: Learner) -> int:
 
 @runtime_checkable
 class Sink(Protocol):
-    """Takes what happens in a run, in order: a log, a view, a hash, a progress bar.
+    """Takes the iterations and events of a run, in order: a log, a view, a hash, a progress bar.
 
     A class that derives from it needs `block`, and of the others what it has a use for.
     """

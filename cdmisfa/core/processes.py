@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from cdmisfa.core.errors import CdmisfaError, UsageError, one_line
 from cdmisfa.core.registry import did_you_mean
@@ -66,26 +66,18 @@ class Workers:
 
     Args:
         jobs: how many.
-        start: called first in each process; importable by name, as is all that they compute.
-        arguments: of `start`.
         environment: variables of the processes, set before they import anything.
     """
 
-    def __init__(
-        self,
-        jobs: int,
-        start: Callable[..., None] | None = None,
-        arguments: tuple[Any, ...] = (),
-        environment: Mapping[str, str] | None = None,
-    ) -> None:
-        self._setup = dict(environment or {}), start, arguments
+    def __init__(self, jobs: int, environment: Mapping[str, str] | None = None) -> None:
+        self._environment = dict(environment or {})
         self._threads = ThreadPoolExecutor(jobs)
         self._own = threading.local()
         self._processes: list[BaseProcess] = []
         self._closed = False
 
     def submit(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
-        """Have one of them call a function."""
+        """Have one of them call a function, which is importable by name."""
         return self._threads.submit(self._call, function, arguments)
 
     def close(self) -> None:
@@ -122,7 +114,7 @@ class Workers:
             if self._closed:
                 raise BrokenProcessPool("the worker processes were closed")
             ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, *self._setup), daemon=True)
+            process = context.Process(target=_serve, args=(theirs, self._environment), daemon=True)
             process.start()
             self._processes.append(process)
         theirs.close()
@@ -147,20 +139,13 @@ def _without_main_and_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(
-    pipe: Connection,
-    environment: Mapping[str, str],
-    start: Callable[..., None] | None,
-    arguments: tuple[Any, ...],
-) -> None:
+def _serve(pipe: Connection, environment: Mapping[str, str]) -> None:
     """Answer calls from a pipe until its other end is gone; the main function of a worker."""
     os.environ.update(environment)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            message = pipe.recv_bytes()
-            pipe.send_bytes(_answer(message, start, arguments))
-            start = None
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
 
 
 def _end_with_parent() -> None:
@@ -169,11 +154,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _answer(message: bytes, start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> bytes:
+def _answer(message: bytes) -> bytes:
     """The pickled pair (failed, result or exception) of a pickled call."""
     try:
-        if start is not None:
-            start(*arguments)
         function, given = pickle.loads(message)
         return pickle.dumps((False, function(*given)))
     except BaseException as error:
@@ -193,24 +176,23 @@ class WorkerDied:
     what: str
 
 
-class Pool(Protocol):
-    """What an engine gives `run_all`."""
+@dataclass(frozen=True, slots=True)
+class _Pool:
+    """Workers, as `run_all` uses them.
 
-    died: tuple[type[BaseException], ...]
-    """What a future raises when its worker died."""
+    Attributes:
+        submit: has a worker call a function with a task.
+        width: how many tasks to hand out at a time.
+        died: what a future raises when its worker died.
+        attempts: how often a task is handed out whose worker died.
+        close: lets the workers go.
+    """
 
+    submit: Callable[..., Future[Any]]
+    width: Callable[[], int]
+    died: type[BaseException]
     attempts: int
-    """How often a task is handed out whose worker died."""
-
-    @property
-    def width(self) -> int:
-        """How many tasks to hand out at a time."""
-
-    def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
-        """Have a worker compute function(task)."""
-
-    def close(self) -> None:
-        """Let the workers go."""
+    close: Callable[[], None]
 
 
 def run_all(
@@ -247,7 +229,7 @@ def run_all(
         for index, task in enumerate(tasks):
             yield index, function(task)
         return
-    pool: Pool = DaskPool(jobs, scheduler) if engine == "dask" else LocalPool(jobs)
+    pool = _dask_pool(jobs, scheduler) if engine == "dask" else _local_pool(jobs)
     with contextlib.closing(pool):
         left: Iterable[int] = range(len(tasks))
         for attempt in range(1, pool.attempts + 1):
@@ -263,7 +245,7 @@ def run_all(
 
 
 def _spread(
-    pool: Pool,
+    pool: _Pool,
     function: Callable[[Task], Result],
     tasks: Sequence[Task],
     indices: Iterable[int],
@@ -273,7 +255,7 @@ def _spread(
     """Hand out some tasks, once each, as many at a time as keep the workers busy."""
     waiting, running = deque(indices), dict[Future[Result], int]()
     while waiting or running:
-        width = 1 if alone else pool.width if waiting else 0
+        width = 1 if alone else pool.width() if waiting else 0
         while waiting and len(running) < width:
             index = waiting.popleft()
             running[pool.submit(function, tasks[index])] = index
@@ -289,69 +271,45 @@ def _spread(
             yield running.pop(future), result
 
 
-class LocalPool(Workers):
+def _local_pool(jobs: int) -> _Pool:
     """Processes of this machine."""
-
-    died: tuple[type[BaseException], ...] = (BrokenProcessPool,)
-    attempts = ATTEMPTS
-
-    def __init__(self, jobs: int) -> None:
-        super().__init__(jobs, environment=ONE_THREAD)
-        self.width = jobs + 1
+    workers = Workers(jobs, ONE_THREAD)
+    return _Pool(workers.submit, lambda: jobs + 1, BrokenProcessPool, ATTEMPTS, workers.close)
 
 
-class DaskPool:
+def _dask_pool(jobs: int, scheduler: str | None) -> _Pool:
     """A dask cluster, or one started here for the while; it tries other workers by itself."""
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError as error:
+        raise UsageError(
+            "--engine dask needs a package that is not installed: pip install 'cdmisfa[dask]'"
+        ) from error
+    # It tells of every lost connection with a traceback; what matters is raised.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    how: dict[str, Any] = {"address": scheduler, "timeout": CONNECT_SECONDS}
+    if scheduler is None:
+        how = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
+    try:
+        client = distributed.Client(**how, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise EngineError(f"no dask scheduler answers at {scheduler}: {one_line(error)}") from error
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_SECONDS)
+    except TimeoutError as error:
+        client.close()
+        raise EngineError(
+            f"the dask scheduler at {scheduler} has no workers: start some with "
+            f"dask worker {scheduler}"
+        ) from error
 
-    attempts = 1
-
-    def __init__(self, jobs: int, scheduler: str | None) -> None:
+    def width() -> int:
+        """Two for each thread of the workers that are there now."""
         try:
-            distributed: Any = importlib.import_module("distributed")
-        except ImportError as error:
-            raise UsageError(
-                "--engine dask needs a package that is not installed: pip install 'cdmisfa[dask]'"
-            ) from error
-        # It tells of every lost connection with a traceback; what matters is raised.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        self.died: tuple[type[BaseException], ...] = (distributed.KilledWorker,)
-        how: dict[str, Any] = {"address": scheduler, "timeout": CONNECT_SECONDS}
-        if scheduler is None:
-            how = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None}
-        try:
-            self._client = distributed.Client(**how, set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            raise EngineError(
-                f"no dask scheduler answers at {scheduler}: {one_line(error)}"
-            ) from error
-        try:
-            self._client.wait_for_workers(1, timeout=CONNECT_SECONDS)
-        except TimeoutError as error:
-            self._client.close()
-            raise EngineError(
-                f"the dask scheduler at {scheduler} has no workers: start some with "
-                f"dask worker {scheduler}"
-            ) from error
-        self._executor = self._client.get_executor(pure=False)
-
-    @property
-    def width(self) -> int:
-        """Two for each thread of the workers that are there now.
-
-        Raises:
-            EngineError: the scheduler went away.
-        """
-        try:
-            threads: int = sum(self._client.ncores().values())
+            threads: int = sum(client.ncores().values())
         except OSError as error:
             raise EngineError(WENT_AWAY) from error
         return max(2 * threads, 1)
 
-    def submit(self, function: Callable[[Task], Result], task: Task) -> Future[Result]:
-        """See `Pool`."""
-        future: Future[Result] = self._executor.submit(function, task)
-        return future
-
-    def close(self) -> None:
-        """See `Pool`."""
-        self._client.close()
+    submit = client.get_executor(pure=False).submit
+    return _Pool(submit, width, distributed.KilledWorker, 1, client.close)

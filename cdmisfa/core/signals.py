@@ -1,4 +1,4 @@
-"""`BlockSignals`: the one record of everything the learner thought in one iteration.
+"""`BlockSignals`: the record of every signal of one iteration.
 
 Every consumer walks over its fields: the schema of run.mcap, Rerun's entities and
 layout, the columns of an export, the table of signals in the docs. Adding a signal is
@@ -28,16 +28,16 @@ from cdmisfa.core.arrays import FloatArray, IntArray
 Show = Literal["line", "lane", "heat", "text", "hidden"]
 
 ACTIONS = ("stay", "switch")
-"""What each code of an action, or of a policy, says to do."""
+"""Names of the codes of actions and policies."""
 
 STATES = ("learning", "learned", "known", "given_up")
-"""What each code of a stream's state says has become of it."""
+"""Names of the codes of a stream's state."""
 
 NO_STATE = -1
-"""State of a stream where a learner, or a run of a version without it, tells none."""
+"""Code of a stream's state where the learner, or a run of an earlier version, has none."""
 
 MISSING: Mapping[str, float | int] = {"float64": math.nan, "int64": NO_STATE}
-"""What stands for a value that there is not, by the type of the signal."""
+"""Value of a signal that is missing, by its type."""
 
 SCHEMA_VERSION = 3
 """Rises whenever a field of `BlockSignals` is added, dropped or changes its meaning."""

@@ -32,7 +32,7 @@ MAX_LIST: Final = 16 * 1024 * 1024
 _STATM: Final = Path("/proc/self/statm")
 _PAGE: Final = os.sysconf("SC_PAGE_SIZE") if sys.platform == "linux" else 0
 _DATA: Final = 5
-"""Which number of `_STATM` counts the pages that `RLIMIT_DATA` limits."""
+"""Column of `_STATM`: the pages that `RLIMIT_DATA` limits."""
 _LOCK: Final = threading.Lock()
 _THREAD: Final = threading.local()
 _threads = 0
@@ -41,7 +41,7 @@ _before = (0, 0)
 
 @contextlib.contextmanager
 def budget(size: int = BUDGET) -> Iterator[None]:
-    """Give this process so much more memory than it has, and no more, while the body runs.
+    """Limit this process to so much more memory than it has while the body runs.
 
     What asks for more gets a MemoryError, as where there is no more, and before it takes any. A
     body within another has what is left of the other's. Of bodies in several threads the largest
@@ -63,7 +63,7 @@ def budget(size: int = BUDGET) -> Iterator[None]:
 
 
 def data_bytes() -> int:
-    """What of this process's memory `budget` counts, in bytes; 0 where there is no budget."""
+    """Bytes of this process's memory that `budget` limits; 0 where there is no such limit."""
     if sys.platform != "linux":
         return 0
     return int(os.pread(_statm(os.getpid()), 200, 0).split()[_DATA]) * _PAGE
@@ -122,7 +122,7 @@ def _free() -> None:
 
 
 def check_regular(path: Path, limit: int | None = None) -> None:
-    """Refuse what is no regular file, or too large, by looking at it only.
+    """Refuse a path that is no regular file, or a file that is too large, without opening it.
 
     Raises:
         UsageError: so it is; or it cannot be looked at.

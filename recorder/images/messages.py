@@ -190,9 +190,11 @@ def _foxglove(opened: Callable[[Any, bytes | memoryview], Any], kind: Any) -> Ca
             return Compressed(m.data)
         if kind is CompressedVideo:
             return Packet(m.data, str(m.format))
-        if not all(isinstance(n, int) and 0 <= n < 2**32 for n in (m.height, m.width, m.step)):
+        sizes = (m.height, m.width, m.step)
+        if not all(isinstance(n, int) and 0 <= n < 2**32 for n in sizes):
             raise MalformedImage("a JSON image needs whole height, width and step")
-        return Pixels(m.data, m.height, m.width, str(m.encoding), m.step)
+        height, width, step = map(int, sizes)
+        return Pixels(m.data, height, width, str(m.encoding), step)
 
     return read
 

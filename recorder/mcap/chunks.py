@@ -6,9 +6,11 @@ A chunk may lie about its size and hold anything: no more memory is asked for th
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Final
 
 import lz4.frame
@@ -26,7 +28,7 @@ from recorder.mcap.records import (
     Segment,
     crc32,
 )
-from recorder.mcap.store import OnePass, Store
+from recorder.mcap.store import FileStore, OnePass, Store
 from recorder.mcap.tables import MessageTable, Pairs, walked_table
 
 UNUSED: Final = "(the index is not used)"
@@ -39,6 +41,12 @@ Few, because reading moves forward, and memory that is used again is still in th
 _WINDOW: Final = MAX_CHUNK // 2
 """Most memory that zstd may take for its window, in bytes."""
 _PIECE: Final = 1 << 17
+_LONG: Final = 64 * 1024
+"""Fewest stored bytes of a chunk that is decoded ahead, as handing less over takes as long."""
+_LARGE: Final = 8 * 1024 * 1024
+"""Most bytes of one, because of the memory that this takes."""
+_PACKED: Final = 0.9
+"""How small what is stored is against them: what is hardly compressed is decoded at once."""
 
 
 class _Zstd(threading.local):
@@ -76,7 +84,14 @@ class Chunks:
         self._without_crc = without_crc
         self._cache: OrderedDict[int, MessageTable] = OrderedDict()
         self._cached = 0
-        self._stored = np.empty(0, np.uint8)
+        self._following: dict[int, Segment] = {}
+        self._last = -1
+        self._ahead: tuple[int, Future[ByteArray]] | None = None
+        self._thread: ThreadPoolExecutor | None = None
+
+    def expect(self, segments: Sequence[Segment]) -> None:
+        """Announce the chunks that are asked for one after the other: one is decoded ahead."""
+        self._following = {one.offset: two for one, two in itertools.pairwise(segments)}
 
     def table(self, segment: Segment) -> MessageTable:
         """The messages of a chunk in file order.
@@ -125,12 +140,24 @@ class Chunks:
         """Drop the decoded chunks, except those at some places of the file."""
         for key in self._cache.keys() - set(but):
             self._drop(key)
+        self._ahead = None
+
+    def close(self) -> None:
+        """Drop all, and end the thread; harmless when called twice."""
+        self.forget()
+        if self._thread is not None:
+            self._thread.shutdown()
 
     def _drop(self, key: int) -> None:
         self._cached -= len(self._cache.pop(key).data)
 
     def _decoded(self, segment: Segment) -> MessageTable:
-        raw = self._records(segment)
+        ahead, self._ahead = self._ahead, None
+        self._look_ahead(segment)
+        known = ahead is not None and ahead[0] == segment.offset
+        raw = ahead[1].result() if ahead is not None and known else self._records(segment)
+        if not (segment.crc or segment.cut):
+            self._without_crc()
         table, definitions = walked_table(raw, cut=segment.cut)
         times = table.log_time
         if len(times) and not segment.cut:
@@ -142,17 +169,25 @@ class Chunks:
             self._definitions.add(opcode, content, segment.name)
         return table
 
+    def _look_ahead(self, segment: Segment) -> None:
+        """Begin to decode the chunk after one that was asked for in order, if that takes long."""
+        in_order = self._following.get(self._last) is segment
+        self._last = segment.offset
+        following = self._following.get(segment.offset)
+        if following is None or not in_order or not isinstance(self._file, FileStore):
+            return
+        slow = following.compression and _LONG <= following.stored < _PACKED * following.size
+        if slow and following.size <= _LARGE and not following.cut:
+            self._thread = self._thread or ThreadPoolExecutor(1)
+            future = self._thread.submit(self._records, following)
+            self._ahead = following.offset, future
+
     def _records(self, segment: Segment) -> ByteArray:
-        """The records of a chunk, whose CRC matches."""
+        """The records of a chunk, whose CRC matches; another thread may call it."""
         compression, size, begin = segment.compression, segment.size, segment.offset
         check_size(compression, 0 if segment.cut else size)
         held = min(segment.data_end, self._file.size) - begin
-        if not compression:
-            raw = np.empty(held, np.uint8)  # a table refers to it
-        else:
-            if len(self._stored) < held:
-                self._stored = np.empty(held + held // 8, np.uint8)
-            raw = self._stored[:held]
+        raw = np.empty(held, np.uint8)
         self._file.read_into(begin, raw.data)
         if segment.stated:
             confirm(segment, raw.data)
@@ -162,8 +197,6 @@ class Chunks:
             return records
         if segment.crc and crc32(records.data) != segment.crc:
             raise MalformedRecord("its CRC does not match: damaged")
-        if not segment.crc:
-            self._without_crc()
         return freeze(records)
 
 

@@ -252,6 +252,7 @@ class LogReader:
 
     def expect(self, segments: Sequence[Segment], *, indexes: bool = False) -> None:
         """Say which chunks, or only `indexes` of them, will be read one after the other."""
+        self._chunks.expect(() if indexes else segments)
         spans = ((s.data_end if indexes else s.offset, s.stop) for s in segments)
         self._file.expect(list(spans))
 
@@ -310,7 +311,7 @@ class LogReader:
 
     def close(self) -> None:
         """Close the file; harmless when called twice."""
-        self._chunks.forget()
+        self._chunks.close()
         self._file.close()
 
     def __enter__(self) -> Self:

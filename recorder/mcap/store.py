@@ -119,15 +119,6 @@ class Store(ABC):
             yield part
             offset += len(part)
 
-    def pieces(self, offset: int, stop: int, memory: memoryview) -> Iterator[memoryview]:
-        """Give the bytes [offset, stop) in the same memory, one piece after the other."""
-        while offset < stop:
-            count = self.read_into(offset, memory[: stop - offset])
-            if not count:
-                raise self._was_cut()
-            yield memory[:count]
-            offset += count
-
     def crc(self, offset: int, stop: int) -> int:
         """CRC-32 of the bytes [offset, stop)."""
         value = 0

@@ -36,6 +36,7 @@ from recorder.mcap.store import Store
 FOOTER_BYTES: Final = RECORD_HEADER.size + 20
 _BEFORE_PLACES: Final = 36
 """Bytes of a chunk index before the places of its message indexes."""
+_LENGTH: Final = struct.Struct("<I")
 _FIXED: Final = CHUNK_HEADER.size + 12
 """Bytes of a chunk before its records, without the name of its compression."""
 _INDEXES: Final = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
@@ -149,21 +150,22 @@ def read_summary(file: Store, definitions: Definitions, refuse: Refuse) -> Summa
 
 
 def _take_records(data: memoryview, summary: Summary, definitions: Definitions) -> None:
-    at, content = 0, data
+    at = 0
     while at < len(data):
-        if len(data) - at >= RECORD_HEADER.size:
-            opcode, length = RECORD_HEADER.unpack_from(data, at)
-            content = data[at + RECORD_HEADER.size :][:length]
-        if len(data) - at < RECORD_HEADER.size or opcode == 0 or len(content) < length:
+        if len(data) - at < RECORD_HEADER.size:
             raise MalformedRecord(f"no record at byte {summary.begin + at}")
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        opcode, length = RECORD_HEADER.unpack_from(data, at)
+        content = data[at + RECORD_HEADER.size : at + RECORD_HEADER.size + length]
+        if opcode == 0 or len(content) < length:
+            raise MalformedRecord(f"no record at byte {summary.begin + at}")
+        if (indexes := summary.indexes.get(opcode)) is not None:
+            indexes.append(content)
+            if opcode == Opcode.CHUNK_INDEX and length >= 24:
+                summary.named += struct.unpack_from("<Q", content, 16)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             definitions.add(opcode, bytes(content), "summary")
         elif opcode == Opcode.STATISTICS:
             summary.statistics = statistics(content)
-        elif opcode in _INDEXES:
-            summary.indexes[opcode].append(content)
-            if opcode == Opcode.CHUNK_INDEX and length >= 24:
-                summary.named.append(int.from_bytes(content[16:24], "little"))
         elif opcode <= Opcode.DATA_END and opcode != Opcode.SUMMARY_OFFSET:
             raise MalformedRecord(f"a {Opcode(opcode).name} record among the summary")
         at += RECORD_HEADER.size + length
@@ -171,33 +173,38 @@ def _take_records(data: memoryview, summary: Summary, definitions: Definitions) 
 
 def _segment(content: memoryview) -> Segment | None:
     """The chunk of a chunk index, or None where only the chunk tells what it holds."""
-    mapped = int.from_bytes(content[_BEFORE_PLACES - 4 : _BEFORE_PLACES], "little")
-    named = _BEFORE_PLACES + mapped + 8
-    name = int.from_bytes(content[named : named + 4], "little")
-    if len(content) < named + 4 + name + 16 or mapped % 10 or mapped > 10 * 2**16:
-        raise MalformedRecord("a chunk index is cut short")
-    fields = _layout(mapped // 10, name).unpack_from(content)
-    start, end, offset, length, _, *places, index_size, _, raw, stored, size = fields
     try:
+        (mapped,) = _LENGTH.unpack_from(content, _BEFORE_PLACES - 4)
+        (name,) = _LENGTH.unpack_from(content, _BEFORE_PLACES + mapped + 8)
+        if mapped % 10 or mapped > 10 * 2**16 or name > len(content):
+            raise MalformedRecord("a chunk index is cut short")
+        fields = _layout(mapped // 10, name).unpack_from(content)
+        start, end, offset, length, _, *places, index_size, _, raw, stored, size = fields
         compression = raw.decode()
+    except struct.error:
+        raise MalformedRecord("a chunk index is cut short") from None
     except UnicodeDecodeError:
         raise MalformedRecord("a chunk index holds a text that is not UTF-8") from None
-    data = offset + _FIXED + name
+    data, after = offset + _FIXED + name, offset + length
     if length != data - offset + stored:
         raise MalformedRecord("a chunk index lies about its chunk's length")
     if not places:
         return None
-    parts = sorted(zip(places[1::2], places[::2], strict=True))
-    if parts[0][0] != offset + length:
+    parts = sorted(zip(places[1::2], places[::2], strict=True), reverse=True)
+    if parts[-1][0] != after:
         raise MalformedRecord("a chunk index lies about its message indexes")
-    indexes, counts = [], dict.fromkeys(places[::2], 0)
-    edges = [*parts, (offset + length + index_size, 0)]
-    for (place, channel), (after, _) in itertools.pairwise(edges):
-        count, rest = divmod(after - place - INDEX_HEADER.size, 16)
+    indexes: list[IndexPart] = []
+    counts: dict[int, int] = {}
+    after += index_size
+    for place, channel in parts:
+        first = place + INDEX_HEADER.size
+        count, rest = divmod(after - first, 16)
         if rest or count < 0:
             return None
-        indexes.append(IndexPart(channel, place + INDEX_HEADER.size, count))
-        counts[channel] += count
+        indexes.append(IndexPart(channel, first, count))
+        counts[channel] = counts.get(channel, 0) + count
+        after = place
+    indexes.reverse()
     whole = offset, data, stored, size, compression, 0, start, end, True, indexes, counts
     return Segment(*whole, stated=True)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterator, MutableMapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -200,10 +201,11 @@ def render_in_processes(
         CdmisfaError: a process died, or could not open the scene.
     """
     pending: deque[Future[list[Block]]] = deque()
-    workers = Workers(jobs, _start, (SCENES[scene.name].open, scene.config, scene.record))
+    workers = Workers(jobs)
+    opened = SCENES[scene.name].open, scene.config, scene.record
     try:
         for request in requests(starts, frames):
-            pending.append(workers.submit(_render, request))
+            pending.append(workers.submit(_render, opened, request))
             if len(pending) > _AHEAD * jobs:
                 yield from pending.popleft().result()
         while pending:
@@ -217,18 +219,15 @@ def render_in_processes(
         workers.close()
 
 
-_source: SeekableSource
-"""The world of a rendering process."""
+@cache
+def _source(opener: Opener, config: SceneConfig, record: RecordConfig) -> SeekableSource:
+    """The world of a rendering process, opened once."""
+    return opener(config, record)
 
 
-def _start(opener: Opener, config: SceneConfig, record: RecordConfig) -> None:
-    """Open a world in a rendering process."""
-    global _source
-    _source = opener(config, record)
-
-
-def _render(request: Request) -> list[Block]:
-    return list(_take(_source, request))
+def _render(opened: tuple[Opener, SceneConfig, RecordConfig], request: Request) -> list[Block]:
+    """Render a block; what a rendering process is asked for."""
+    return list(_take(_source(*opened), request))
 
 
 def _take(source: SeekableSource, request: Request) -> Iterator[Block]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv as cells
-import mmap
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -157,11 +157,11 @@ def _read_csv(path: Path) -> LoadedTable:
         cut = _cut_line(path, separator)
         if cut is None:
             raise
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            size = max(data.rfind(b"\n"), data.rfind(b"\r")) + 1
+        with path.open("rb") as file:
+            size = sum(map(len, itertools.islice(file, cut[0] - 1)))
         with pyarrow.memory_map(str(path)) as data:
             table = csv.read_csv(pyarrow.BufferReader(data.read_buffer(size)), **options)
-        notes = [cut]
+        notes = [cut[1]]
     names = separator.join(table.column_names)
     if all(re.match(_NUMBER, name) for name in re.split("[,;\t]", names)):
         raise UsageError(
@@ -171,8 +171,8 @@ def _read_csv(path: Path) -> LoadedTable:
     return _with_numbers(LoadedTable(path, table, {}, notes), missing)
 
 
-def _cut_line(path: Path, separator: str) -> str | None:
-    """A warning that the last line was cut; None where all lines have as many cells.
+def _cut_line(path: Path, separator: str) -> tuple[int, str] | None:
+    """The last line and a warning, if it was cut; None where all lines have as many cells.
 
     Raises:
         UsageError: the file begins with a comment.
@@ -180,19 +180,19 @@ def _cut_line(path: Path, separator: str) -> str | None:
     """
     rows = _rows(path)
     _, names = next(rows)
-    for line, row in rows:
+    for place, (line, row) in enumerate(rows):
         if len(row) == len(names):
             continue
         text = separator.join(row)[:40]
         said = f"{path}: line {line} holds {_in_words(len(row))}, {text!r}, and the line of names "
         said += _in_words(len(names))
-        if names[0].startswith("#") and line == 2:
+        if names[0].startswith("#") and place == 0:
             raise UsageError(f"{said}: leave out the comment before it")
         with path.open("rb") as file:
             file.seek(-1, 2)
             ended = file.read() in (b"\n", b"\r")
         if next(rows, None) is None and not ended and len(row) < len(names):
-            return f"{said}: the file was cut there, and the line is left out"
+            return line, f"{said}: the file was cut there, and the line is left out"
         raise LogDamagedError(f"{said}: mend the line or leave it out")
     return None
 

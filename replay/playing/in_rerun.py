@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-import rerun as rr
 
 from replay.playing.feed import Playback, Played, frames_feed, opened_source, paced
 from replay.view.build import recording_layout, view_entities
 from replay.view.columns import Target
 from replay.view.labels import label
-from replay.view.properties import APPLICATION
 from replay.viewer.broadcast import Broadcast
-
-NAME: Final = "played.rrd"
 
 PER_SECOND: Final = 60
 """Most times a second that viewers are handed what they show."""
@@ -49,10 +44,9 @@ def play_in_rerun(
     with contextlib.ExitStack() as stack:
         source = stack.enter_context(opened_source(paths, how))
         spec, first, feed = source.spec, source.t, frames_feed(source)
-        recording = rr.RecordingStream(APPLICATION, recording_id=f"played-{os.getpid()}")
-        recording.set_log_time_enabled(False)
-        broadcast = Broadcast(recording, NAME, port)
+        broadcast = Broadcast("played", port)
         stack.callback(broadcast.close)
+        recording = broadcast.recording
         recording.send_recording_name(label(paths[0].resolve().stem))
         recording.send_blueprint(recording_layout(spec, first + source.frames))
         target = Target(recording, spec)

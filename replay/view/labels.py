@@ -5,7 +5,7 @@ The viewer ends at once, with everything in it, on a letter its font has not got
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from cdmisfa.core.signals import Signal
@@ -53,3 +53,9 @@ def line_labels(signal: Signal, module: int, outputs: int) -> list[str]:
     if "J" not in signal.dims or outputs == 1:
         return [f"{text}{unit}"]
     return [f"{text} output {j + 1}{unit}" for j in range(outputs)]
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """Lines of a table, and an empty one behind it."""
+    lines = [head, ["---"] * len(head), *rows]
+    return [*(f"| {' | '.join(map(str, line))} |" for line in lines), ""]

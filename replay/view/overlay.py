@@ -16,7 +16,7 @@ from replay.runs.compare import HEAD, Difference, Row
 from replay.runs.log import read_columns
 from replay.view.build import recording_to
 from replay.view.columns import ITERATION, MOST_STREAMS, Column, Target, power_of_ten
-from replay.view.labels import label, part
+from replay.view.labels import label, part, text_table
 from replay.view.layouts import blueprint, lines, time_axis
 
 CURVES = {
@@ -86,12 +86,10 @@ def build_overlay(
 
 def table_text(rows: Sequence[Row]) -> str:
     """The rows as a Markdown table."""
-    ruler = tuple("---" for _ in HEAD)
     short = [(*row.cells()[:-1], _shortly(row.difference)) for row in rows]
-    cells = [[cell.replace("|", "/") for cell in line] for line in (HEAD, ruler, *short)]
+    cells = [[cell.replace("|", "/") for cell in line] for line in short]
     forks = [line for row in rows if (line := _fork(row))]
-    table = [f"| {' | '.join(line)} |" for line in cells]
-    return "\n".join(["## Runs compared", "", *table, *(("", *forks) if forks else ())])
+    return "\n".join(["## Runs compared", "", *text_table(HEAD, cells), *forks])
 
 
 def _fork(row: Row) -> str:

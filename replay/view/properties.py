@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +27,6 @@ APPLICATION = "cdmisfa"
 
 Sections = dict[str, dict[str, Any]]
 """Values by section of the configuration; those of `result` are what the run came to."""
-
-Cells = dict[tuple[str, str, Any], pa.Array]
-"""Single values as Rerun stores them, by section, name, type and value."""
 
 
 def recording_id(name: str, source: Path) -> str:
@@ -106,13 +103,15 @@ def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
         for section, values in row.items():
             for name, value in values.items():
                 types.setdefault((section, name), set()).add(type(value))
-    columns = {column: _joint(found) for column, found in types.items()}
-    cells: Cells = {}
     files = []
     for i, (run, row) in enumerate(zip(runs, rows, strict=True)):
         out = folder / f"{i:05d}.rrd"
+        alike = {
+            section: {name: _joint(types[section, name])(v) for name, v in values.items()}
+            for section, values in row.items()
+        }
         try:
-            stream = ChunkStore.from_chunks(property_chunks(row, columns, cells)).stream()
+            stream = ChunkStore.from_chunks(property_chunks(alike)).stream()
             stream.write_rrd(str(out), APPLICATION, run_identity(run))
         except (RuntimeError, OSError, OverflowError, ValueError) as error:
             raise CdmisfaError(f"{out} cannot be written: {error}") from error
@@ -120,41 +119,21 @@ def write_rows(runs: Sequence[Path], folder: Path) -> list[Path]:
     return files
 
 
-def property_chunks(
-    sections: Sections,
-    columns: Mapping[tuple[str, str], type] | None = None,
-    cells: Cells | None = None,
-) -> list[Chunk]:
-    """The properties of one run as Rerun's chunks.
-
-    Args:
-        sections: the properties.
-        columns: the type of each column, where the run is a row of a table.
-        cells: those that were made already: runs of a sweep share most.
-    """
-    made = {} if cells is None else cells
-
-    def cell(section: str, name: str, value: Any) -> pa.Array:
-        key = section, name, (type(value), value)
-        if key not in made:
-            made[key] = pa.array([columns[section, name](value) if columns else value])
-        return made[key]
-
+def property_chunks(sections: Sections) -> list[Chunk]:
+    """The properties of one run as Rerun's chunks."""
     return [
         Chunk.from_property(
-            section,
-            {ComponentDescriptor(name): cell(section, name, v) for name, v in values.items()},
+            section, {ComponentDescriptor(name): pa.array([v]) for name, v in values.items()}
         )
         for section, values in sections.items()
     ]
 
 
-def _joint(types: Iterable[type]) -> type:
+def _joint(types: set[type]) -> type:
     """The type that holds values of all these."""
-    found = set(types)
-    if len(found) == 1:
-        return found.pop()
-    return float if found == {int, float} else str
+    if len(types) == 1:
+        return next(iter(types))
+    return float if types == {int, float} else str
 
 
 def _configuration(manifest: Mapping[str, Any]) -> Sections:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cdmisfa.core.signals import ACTIONS, STATES
 from replay.runs.run import Outline
 from replay.view.columns import MOST_STREAMS
+from replay.view.labels import text_table
 
 ENDED = "ended:"
 """How the event begins that says why a run ended."""
@@ -39,11 +40,12 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
     reasons = [text.removeprefix(ENDED).strip() for text in events if text.startswith(ENDED)]
     lines += [f"It ended: {reason}.\n" for reason in reasons[-1:] if reason]
     if not header.by_progress:
-        lines += ["| stream | watched |", "|---|---|"]
-        for s in outline.streams(MOST_STREAMS):
-            share = outline.visits[s] / max(outline.frames, 1)
-            lines.append(f"| {outline.names()[s]} | {outline.visits[s]} frames, {share:.0%} |")
-        lines.append("")
+        names, visits, frames = outline.names(), outline.visits, max(outline.frames, 1)
+        watched = [
+            (names[s], f"{visits[s]} frames, {visits[s] / frames:.0%}")
+            for s in outline.streams(MOST_STREAMS)
+        ]
+        lines += text_table(("stream", "watched"), watched)
     settings = [("seed", header.manifest.get("seed"))]
     keys = TOLD_OF_PROGRESS if header.by_progress else TOLD
     settings += [(key, header.setting("learner", key)) for key in keys]
@@ -56,19 +58,13 @@ def summary_text(outline: Outline, name: str, events: Sequence[str] = ()) -> str
 
 def _of_modules(outline: Outline) -> list[str]:
     """The modules of a run of CD-MISFA, and the one that was not saved."""
-    spec, lines = outline.header.spec, []
-    if outline.saved:
-        lines += [
-            "| module | stream | iteration | η [1/frame] | policy |",
-            "|---|---|---|---|---|",
-        ]
-        for save in outline.saved:
-            eta = ", ".join(f"{value:.4f}" for value in save.eta)
-            lines.append(
-                f"| {save.module} | {spec.streams[save.stream]} | {save.iteration} | {eta} "
-                f"| {policy_text(save.policy, spec.streams)} |"
-            )
-        lines.append("")
+    streams, rows = outline.names(), []
+    for save in outline.saved:
+        eta = ", ".join(f"{value:.4f}" for value in save.eta)
+        policy = policy_text(save.policy, streams)
+        rows.append((save.module, streams[save.stream], save.iteration, eta, policy))
+    head = "module", "stream", "iteration", "η [1/frame]", "policy"
+    lines = text_table(head, rows) if rows else []
     unfinished = _unfinished(outline)
     return [*lines, unfinished, ""] if unfinished else lines
 
@@ -103,16 +99,17 @@ def decision_text(
         reward: (S, A, S) R from a stream, by an action, to a stream.
         value: (S, A) Q.
     """
-    head, rule = " | ".join(names), "|".join(["---"] * (len(names) + 1))
-    lines = []
-    for action, row in enumerate(ACTIONS):
-        lines += [f"**R to {row}** [1/1000]", "", f"| from, to | {head} |", f"|{rule}|"]
-        for name, rewards in zip(names, reward[:, action].tolist(), strict=True):
-            lines.append(f"| {name} | {' | '.join(f'{1000 * r:.3f}' for r in rewards)} |")
-        lines.append("")
-    lines += ["**Q** [1/1000]", "", f"| in | {' | '.join(ACTIONS)} |", "|---|---|---|"]
-    for name, (stay, switch) in zip(names, value.tolist(), strict=True):
-        lines.append(f"| {name} | {1000 * stay:.3f} | {1000 * switch:.3f} |")
+    tables = [
+        (f"R to {name}", ("from, to", *names), reward[:, action])
+        for action, name in enumerate(ACTIONS)
+    ]
+    lines: list[str] = []
+    for title, head, values in (*tables, ("Q", ("in", *ACTIONS), value)):
+        rows = [
+            (name, *(f"{1000 * v:.3f}" for v in row))
+            for name, row in zip(names, values.tolist(), strict=True)
+        ]
+        lines += [f"**{title}** [1/1000]", "", *text_table(head, rows)]
     return "\n".join(lines)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from http.server import BaseHTTPRequestHandler
 import rerun as rr
 
 from cdmisfa.core.errors import CdmisfaError
+from replay.view.properties import APPLICATION
 from replay.viewer.web import served
 
 FIRST = 2
@@ -24,28 +26,30 @@ MEMORY = 1 << 30
 
 
 class Broadcast:
-    """Serves what a recording is given, piece by piece.
+    """A new Rerun recording, and what it is given served piece by piece.
 
     Args:
-        recording: ended by `close`.
-        name: of the file that viewers see.
+        kind: of recording, a word for its name.
         port: to listen at; by default a free one.
 
     Attributes:
+        recording: what is served; ended by `close`.
         address: where viewers find it.
 
     Raises:
         CdmisfaError: the port is taken, or Rerun is switched off.
     """
 
-    def __init__(self, recording: rr.RecordingStream, name: str, port: int | None = None) -> None:
-        if not rr.is_enabled(recording):
+    def __init__(self, kind: str, port: int | None = None) -> None:
+        self.recording = rr.RecordingStream(APPLICATION, recording_id=f"{kind}-{os.getpid()}")
+        if not rr.is_enabled(self.recording):
             raise CdmisfaError("no live view: Rerun is switched off, unset the variable RERUN")
-        self._recording, self._name = recording, name
-        self._encoded = rr.binary_stream(recording)
+        self.recording.set_log_time_enabled(False)
+        self._name = f"{kind}.rrd"
+        self._encoded = rr.binary_stream(self.recording)
         self._pieces = Pieces(MEMORY)
         self._serving = contextlib.ExitStack()
-        self.address = f"{self._serving.enter_context(served(self._answer, port))}{name}"
+        self.address = f"{self._serving.enter_context(served(self._answer, port))}{self._name}"
 
     def _answer(self, request: BaseHTTPRequestHandler, path: str) -> None:
         if path != self._name:
@@ -68,7 +72,7 @@ class Broadcast:
         self.hand_over()
         self._pieces.end(LAST_SECONDS)
         self._serving.close()
-        self._recording.disconnect()
+        self.recording.disconnect()
 
 
 class Pieces:

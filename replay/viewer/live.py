@@ -6,7 +6,6 @@ learner hardly waits for it. Only who was given the address can connect, from th
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -26,7 +25,6 @@ from replay.runs.log import Batch, Frames, RunHeader, read_batches
 from replay.runs.run import LINES, Outline
 from replay.view.columns import MOST_STREAMS
 from replay.view.panels import MOST_MODULES, run_layout
-from replay.view.properties import APPLICATION
 from replay.view.run import RunView
 from replay.view.world import WorldView
 from replay.viewer.broadcast import Broadcast
@@ -44,8 +42,6 @@ MOST_BLOCKS = 500
 
 PIECE = 10
 """Blocks of which lanes say what was mostly the case: how many there will be is not known."""
-
-NAME = "live.rrd"
 
 
 class LiveView(Sink):
@@ -74,10 +70,8 @@ class LiveView(Sink):
         port: int | None = None,
     ) -> None:
         outline = _nothing_yet(RunHeader(SCHEMA_VERSION, spec, manifest), tau, outputs)
-        self._recording = rr.RecordingStream(APPLICATION, recording_id=f"live-{os.getpid()}")
-        self._recording.set_log_time_enabled(False)
-        self._broadcast = Broadcast(self._recording, NAME, port)
-        self.address = self._broadcast.address
+        self._broadcast = Broadcast("live", port)
+        self._recording, self.address = self._broadcast.recording, self._broadcast.address
         self._recording.send_recording_name("live")
         self._recording.log("summary", rr.TextDocument(SUMMARY), static=True)
         streams = outline.streams(MOST_STREAMS)

@@ -15,6 +15,7 @@ from cdmisfa.cli import options, uploads
 from cdmisfa.cli.making import flag, grouped, number, option, word
 from cdmisfa.cli.printing import (
     announce,
+    learning,
     print_plan,
     print_result,
     quoted,
@@ -23,7 +24,6 @@ from cdmisfa.cli.printing import (
     say_counts,
     tell,
 )
-from cdmisfa.cli.progress import learning
 from cdmisfa.core.errors import UsageError
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ import click
 
 from cdmisfa.cli import options
 from cdmisfa.cli.making import number, option, word
-from cdmisfa.cli.printing import outcome_line, print_document, print_result, quoted, tell
-from cdmisfa.cli.progress import learning
+from cdmisfa.cli.printing import learning, outcome_line, print_document, print_result, quoted, tell
 from cdmisfa.core.errors import NotReproducedError, UsageError
 
 source = word(

@@ -12,8 +12,7 @@ import click
 from cdmisfa.cli import options
 from cdmisfa.cli.interrupts import stoppable
 from cdmisfa.cli.making import flag, grouped, number, option, options_of, word
-from cdmisfa.cli.printing import announce, print_document, say_about, tell
-from cdmisfa.cli.progress import bar
+from cdmisfa.cli.printing import announce, bar, print_document, say_about, tell
 from cdmisfa.core.errors import UsageError
 from replay.camera_logs.options import CameraOptions
 

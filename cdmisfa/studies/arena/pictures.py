@@ -88,7 +88,7 @@ Maker = Callable[[Rng, int], Footage]
 
 
 def stateless(frames: NDArray[Any]) -> Footage:
-    """Frames, (n, *frame_shape), behind which there is nothing to be known."""
+    """Frames, (n, *frame_shape), without a state of the world."""
     return Footage(frames, np.zeros((len(frames), 0)))
 
 

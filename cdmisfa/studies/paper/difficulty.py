@@ -86,10 +86,9 @@ class Difficulty(Experiment):
     def conditions(self, request: Request) -> list[Settings]:
         """Each stream; the iCub's views, too, where there is a recording."""
         scenes: list[Settings] = [{"scene": "oscillatory", "recording": None, "identity": None}]
-        recording = request.recording
-        if recording is None or str(recording) == icub.LIVE:
-            made = icub.made_recording(request)
-            recording = made.parent if made.exists() and not request.quick else None
+        recording, made = request.recording, icub.made_recording(request)
+        if recording is None and made.exists() and not request.quick:
+            recording = made.parent
         if recording is not None:
             path = str(recording)
             take_view(path, 0, 1)

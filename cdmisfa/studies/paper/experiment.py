@@ -1,4 +1,4 @@
-"""What the experiments of the paper share: run a trial, judge all, draw."""
+"""The interface of the paper's experiments, and what their results consist of."""
 
 from __future__ import annotations
 

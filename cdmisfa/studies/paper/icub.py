@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from cdmisfa.core.config import LearnerConfig
 from cdmisfa.core.errors import LogExhaustedError
 from cdmisfa.core.learning import Learner, Sink
 from cdmisfa.core.signals import BlockSignals
-from cdmisfa.experiments.documents import write_json
+from cdmisfa.experiments.documents import plain, write_json
 from cdmisfa.experiments.loop import learn
 from cdmisfa.experiments.statistics import correlation
 from cdmisfa.studies import pages
@@ -48,9 +47,6 @@ DRAWN = 200
 OBJECTS = ("object1_y", "object3_y")
 """What each module should encode."""
 
-LIVE = "live"
-"""In place of a recording: render what each trial looks at."""
-
 LEARNERS = (("2.0", 0.1), ("1.0", 0.1), ("1.0", 0.6))
 """Algorithm and 1.0's threshold of the clustering error: that of decision 0014, and a looser one.
 
@@ -66,15 +62,14 @@ class Icub(Experiment):
 
     def conditions(self, request: Request) -> list[Settings]:
         """Each learner, on one recording; it is made where none is given."""
-        live = str(request.recording) == LIVE
-        path = LIVE if live else str(request.recording or make_recording(request))
-        source = {"recording": path, "identity": None if live else describe_recording(path)}
+        path = str(request.recording or make_recording(request))
+        source = {"recording": path, "identity": describe_recording(path)}
         return [{**source, "algorithm": a, "roc_error": error} for a, error in LEARNERS]
 
     def run(self, settings: Settings) -> Output:
         """One trial: 1400 iterations, or as many as the recording has."""
         keys = {key: settings[key] for key in ("algorithm", "roc_error")}
-        with contextlib.closing(_open_world(settings)) as source:
+        with contextlib.closing(RecordedSource(settings["recording"])) as source:
             return learn_curves(source, paper_config("icub", **keys), settings["seed"], ITERATIONS)
 
     def evaluate(self, trials: Sequence[Trial], found: Findings) -> None:
@@ -156,17 +151,8 @@ def make_recording(request: Request) -> Path:
 def describe_recording(path: str) -> dict[str, Any]:
     """What a recording is, wherever it lies."""
     with contextlib.closing(RecordedSource(path)) as source:
-        return dict(json.loads(json.dumps(source.describe(), default=str)))
-
-
-def _open_world(settings: Settings) -> FrameSource:
-    """The recording, or a live scene of the trial's own seed."""
-    if settings["recording"] == LIVE:
-        from recorder.world.icub.config import IcubConfig
-        from recorder.world.scenes import open_scene
-
-        return open_scene("icub", IcubConfig(seed=settings["seed"]))
-    return RecordedSource(settings["recording"])
+        described: dict[str, Any] = plain(source.describe())
+    return described
 
 
 def _in_order(trials: Sequence[Trial]) -> int:
