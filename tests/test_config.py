@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import os
 import re
 from dataclasses import dataclass, field
@@ -89,34 +88,16 @@ def test_values_of_the_wrong_type(make: Any, key: str, value: Any, words: str) -
         make(**{key: value})
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("nu", 0.0),
-        ("nu", -1.0),
-        ("nu", math.inf),
-        ("nu", 1.01),
-        ("nu", 1e300),
-        ("delta", 0.0),
-        ("sigma", -1e-9),
-        ("beta", math.inf),
-        ("beta", -0.1),
-        ("tau", 2),
-        ("components", 0),
-        ("outputs", 6),
-        ("gamma", 1.0),
-        ("gamma", -0.1),
-        ("epsilon_decay", 1.01),
-        ("epsilon_knee", math.inf),
-        ("novel_share", 1.5),
-        ("gate_window", 0),
-        ("warm_up", -1),
-        ("patience", 0),
-    ],
-)
-def test_values_out_of_range_name_the_key(key: str, value: float) -> None:
-    with pytest.raises(UsageError, match=rf"learner\.{key} is"):
-        learner(**{key: value})
+OUT_OF_RANGE = """nu=0 nu=-1 nu=inf nu=1.01 nu=1e300 delta=0 sigma=-1e-9 beta=inf beta=-0.1 tau=2
+components=0 outputs=6 gamma=1 gamma=-0.1 epsilon_decay=1.01 epsilon_knee=inf novel_share=1.5
+gate_window=0 warm_up=-1 patience=0"""
+
+
+@pytest.mark.parametrize("word", OUT_OF_RANGE.split())
+def test_values_out_of_range_name_the_key(word: str) -> None:
+    sections = parse_settings([f"learner.{word}"])
+    with pytest.raises(UsageError, match=rf"learner\.{word.partition('=')[0]} is"):
+        build(LearnerConfig, "learner", sections["learner"])
 
 
 def test_an_infinite_value_is_told_to_be_finite() -> None:
