@@ -56,7 +56,7 @@ def turned(own: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.f
 
 
 @given(stream=streams())
-@settings(max_examples=100)
+@settings(max_examples=60)
 def test_equals_the_reference(
     stream: tuple[RecursiveSFA, list[NDArray[Any]], list[bool]],
 ) -> None:

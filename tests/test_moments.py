@@ -220,19 +220,21 @@ def test_a_keyframe_that_lies_is_found_out(
     assert cdmisfa("check", tmp_path / "run", "--from", 10, "--json").code == 4
 
 
-@pytest.mark.parametrize("k", [131, 10**9])
-def test_there_is_no_moment_after_the_end(place: Path, k: int) -> None:
-    with pytest.raises(UsageError, match="holds 130 iterations"):
-        Run(place / "2.0-live").at(k)
-    with pytest.raises(UsageError, match="holds 130 iterations"):
-        Session.check(place / "2.0-live", start=k)
-    with pytest.raises(UsageError, match="holds 130 iterations"):
-        Session.check(place / "2.0-live", stop=k)
-
-
-def test_no_part_ends_before_it_begins(place: Path) -> None:
-    with pytest.raises(UsageError, match="from 20 to 10 there is nothing to check"):
-        Session.check(place / "2.0-live", start=20, stop=10)
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        (lambda run: Run(run).at(131), "holds 130 iterations"),
+        (lambda run: Run(run).at(-1), "a run begins after 0"),
+        (lambda run: Session.check(run, start=10**9), "holds 130 iterations"),
+        (lambda run: Session.check(run, stop=131), "holds 130 iterations"),
+        (lambda run: Session.check(run, start=20, stop=10), "from 20 to 10 there is nothing"),
+    ],
+)
+def test_a_moment_that_is_not_there_is_refused(
+    place: Path, asked: Callable[[Path], object], why: str
+) -> None:
+    with pytest.raises(UsageError, match=why):
+        asked(place / "2.0-live")
 
 
 def test_without_its_source_a_run_has_its_keyframes(tmp_path: Path, cdmisfa: Cdmisfa) -> None:
@@ -320,38 +322,28 @@ def test_a_fork_at_the_beginning_is_one_too(place: Path, tmp_path: Path, cdmisfa
     )
 
 
-def test_a_fork_of_a_recording_is_resumed_with_another_seed(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
-) -> None:
-    fork, told = tmp_path / "fork", ("--keyframes", 15, "--no-rerun")
-    begun = ("fork", place / "2.0-loop", "--at", 31, "--seed", 9, *told, "-o", fork)
-    assert cdmisfa(*begun, "--max-iterations", 60).code == 0
-    resumed = cdmisfa("learn", "--resume", "-o", fork, "--max-iterations", 70, "--no-rerun")
-    assert (resumed.code, Session.check(fork).difference) == (0, None)
-
-
+@pytest.mark.parametrize(
+    ("parent", "key"), [("2.0-loop", "learner.nu=0.03"), ("progress-live", "learner.settled=0.1")]
+)
 def test_forks_of_forks_are_resumed_and_checked(
-    place: Path, tmp_path: Path, cdmisfa: Cdmisfa
+    place: Path, tmp_path: Path, cdmisfa: Cdmisfa, parent: str, key: str
 ) -> None:
-    for algorithm, key in (("2.0", "learner.nu=0.03"), ("progress", "learner.settled=0.1")):
-        one, two, straight = (tmp_path / f"{algorithm}-{n}" for n in ("one", "two", "straight"))
-        told = ("--no-rerun", "--keyframes", 15)
-        fork = ("fork", place / f"{algorithm}-live", "--at", 31, "--set", key, *told, "-o", one)
-        assert cdmisfa(*fork, "--max-iterations", 60).code == 0
-        again = ("fork", one, "--at", 52, "--seed", 9, *told)
-        assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
-        assert cdmisfa(*again, "-o", straight, "--max-iterations", 110).code == 0
-        resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")
-        assert resumed.code == 0, resumed.err
-        assert first_difference(two, straight) is None
-        assert Session.check(two).difference is None
-        assert Session.check(two, start=40, stop=100).difference is None
-        keyframe = read_keyframe(two, 52)
-        assert keyframe is not None
-        assert keyframe.iteration == 52
-        found = first_difference(one, two)
-        assert found is not None
-        assert found.iteration >= 52
+    one, two, straight = (tmp_path / n for n in ("one", "two", "straight"))
+    told = ("--no-rerun", "--keyframes", 15)
+    fork = ("fork", place / parent, "--at", 31, "--set", key, *told, "-o", one)
+    assert cdmisfa(*fork, "--max-iterations", 60).code == 0
+    again = ("fork", one, "--at", 52, "--seed", 9, *told)
+    assert cdmisfa(*again, "-o", two, "--max-iterations", 70).code == 0
+    assert cdmisfa(*again, "-o", straight, "--max-iterations", 110).code == 0
+    resumed = cdmisfa("learn", "--resume", "-o", two, "--max-iterations", 110, "--no-rerun")
+    assert resumed.code == 0, resumed.err
+    assert first_difference(two, straight) is None
+    assert Session.check(two).difference is None
+    assert Session.check(two, start=40, stop=100).difference is None
+    keyframe, found = read_keyframe(two, 52), first_difference(one, two)
+    assert keyframe is not None
+    assert found is not None
+    assert (keyframe.iteration, found.iteration >= 52) == (52, True)
 
 
 @pytest.mark.parametrize(

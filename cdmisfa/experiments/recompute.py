@@ -176,6 +176,18 @@ class Recomputation:
         """Version of the log's arithmetic, and of the learner's here."""
         return self.header.arithmetic, arithmetic_of(self.learner)
 
+    @property
+    def source(self) -> SeekableSource:
+        """What the run learned from, at frame `t`; opened when it is first needed.
+
+        Raises:
+            UsageError: it is not there.
+        """
+        if self._source is None:
+            self._source = self._open()
+            self._source.seek(self.t)
+        return self._source
+
     def steps(self, count: int) -> Iterator[BlockSignals]:
         """Learn so many blocks again.
 
@@ -184,12 +196,9 @@ class Recomputation:
             LogExhaustedError: it ended.
         """
         for _ in range(count):
-            if self._source is None:
-                self._source = self._open()
-                self._source.seek(self.t)
-            block = self._source.take(self.learner.stream, self.learner.tau)
+            block = self.source.take(self.learner.stream, self.learner.tau)
             signals = self.learner.step(block)
-            self.t = self._source.t
+            self.t = self.source.t
             if self._later and self._later[0].start == self.learner.iteration:
                 try:
                     span = self._later.pop(0)

@@ -31,7 +31,6 @@ from cdmisfa.experiments.resume import (
     refuse_difference,
     restore,
     restore_from,
-    source_of,
 )
 from cdmisfa.experiments.run_folder import (
     OpenLog,
@@ -205,14 +204,13 @@ class Session:
                 "learn it anew, and fork that"
             )
         with cls.at(log, at, source) as stopped:
-            manifest, t = stopped.header.manifest, stopped.t
+            manifest = stopped.header.manifest
             span, state = continued(stopped, settings, seed)
-        sections = {name: part for name, part in manifest["config"].items() if name != "learner"}
-        words, options = command_of_fork(log.parent, source, sections, settings)
-        options |= {"seed": span.seed, **(limits or {})}
-        with contextlib.closing(source_of(log.parent, source)) as frames:
+            sections = {k: part for k, part in manifest["config"].items() if k != "learner"}
+            words, options = command_of_fork(log.parent, source, sections, settings)
+            options |= {"seed": span.seed, **(limits or {})}
             session = cls(
-                frames,
+                stopped.source,
                 span.config,
                 folder,
                 seed=span.seed,
@@ -228,9 +226,9 @@ class Session:
                 "changed": changes(manifest, span),
                 "before": {k: manifest[k] for k in ("config", "seed", FORK) if k in manifest},
             }
-            session.before, session.keyframe = log, Keyframe(at, t, state, session._versions)
+            session.before = log
+            session.keyframe = Keyframe(at, stopped.t, state, session._versions)
             restore(session.learner, session.keyframe)
-            frames.seek(t)
             yield session
 
     at = staticmethod(Recomputation.after)
@@ -331,7 +329,7 @@ class Session:
         keyframe, self.keyframe = self.keyframe, None  # as large as what the learner holds
         if keyframe is not None:
             at, t, fork = keyframe.iteration, keyframe.t, self.manifest.get(FORK, {})
-            for signals in log.take_over(before, at):
+            for signals in log.copy_log(before, at):
                 digest.add(signals)
             if self._resumed:
                 then, now = keyframe.versions, self._versions
