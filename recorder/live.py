@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Self
 
-from cdmisfa.core.blocks import Block, FrameSource, SourceSpec, check_request, take_unbroken
+from cdmisfa.core.blocks import Block, ForwardSource, FrameSource, check_request, take_unbroken
 from cdmisfa.core.errors import LogExhaustedError
 from recorder.config import RecordConfig, Split
 from recorder.log.files import folder_here, prepared_folder, refuse_existing
@@ -20,7 +20,7 @@ COUNTS: Final = "cdmisfa.live"
 """Name of the metadata record that says what became of a live stream's pictures."""
 
 
-class RecordedWhileWatched:
+class RecordedWhileWatched(ForwardSource):
     """A source whose every stream is recorded, whichever is watched.
 
     What `take` gives can be taken again from the recording, to the bit: `learn` from both gives
@@ -56,7 +56,7 @@ class RecordedWhileWatched:
     ) -> None:
         self.files: list[ViewRecording] = []
         self.ended = ""
-        self._source = source
+        self._source, self._spec, self._t = source, source.spec, source.t
         self.folder = folder_here(folder)
         self.gaps = bool(getattr(source, "gaps", False))
         refuse_existing(self.folder, force=force, goes_on=False)
@@ -72,16 +72,6 @@ class RecordedWhileWatched:
             )
             stack.callback(self._logs.abandon)
             self._open = stack.pop_all()
-
-    @property
-    def spec(self) -> SourceSpec:
-        """What the source delivers."""
-        return self._source.spec
-
-    @property
-    def t(self) -> int:
-        """Global counter of the next frame."""
-        return self._source.t
 
     @property
     def alignment(self) -> Mapping[str, Mapping[str, int]]:
@@ -112,6 +102,7 @@ class RecordedWhileWatched:
             raise
         for block in blocks:
             self._logs.write(block)
+        self._t = self._source.t
         return blocks
 
     def describe(self) -> Mapping[str, Any]:

@@ -13,13 +13,12 @@ from replay.runs.writer import RunWriter
 
 
 def write_changed(path, iteration, name, change):
-    writer = RunWriter(path, VECTOR, {})
-    for signals, block in run_of(VECTOR, 8, seed=3):
-        if signals.iteration == iteration:
-            value = change(np.array(getattr(signals, name)))
-            signals = dataclasses.replace(signals, **{name: value})
-        writer.block(block, signals, having(np.zeros((1, 2))))
-    writer.finish()
+    def edit(signals):
+        if signals.iteration != iteration:
+            return signals
+        return dataclasses.replace(signals, **{name: change(np.array(getattr(signals, name)))})
+
+    write_run(path, VECTOR, 8, seed=3, edit=edit)
 
 
 def test_equal_runs_have_no_difference(tmp_path):

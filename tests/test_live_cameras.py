@@ -90,10 +90,10 @@ EACH_TICK = {
         [(0, 0, [*range(31), 30, 30]), (0, 60, [*range(60, 70)]), (1, 0, [*range(70)])],
         {"left missing": 27, "left repeated": 2},
     ),
-    # it waits 0.21 s for picture 10, 11 ... of which those are late whose ticks had to be decided
+    # it waits 0.2 s for picture 10, 11 ... of which those are late whose ticks had to be decided
     "too late a picture changes no tick and keeps its time": (
         [late(), steady(1, 0, 60)],
-        {"hold": 0.02, "patience": 0.21},
+        {"hold": 0.02},
         [(0, 0, [*range(10)]), (0, 19, [*range(19, 40)]), (1, 0, [*range(40)])],
         {"left late": 9, "left missing": 9},
     ),

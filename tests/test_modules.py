@@ -77,6 +77,8 @@ def test_values_are_values_even_as_uint8() -> None:
 def test_what_is_neither_pixel_nor_value_is_refused(kind: str) -> None:
     with pytest.raises(UsageError, match=r"frames of \S+ given: give uint8 pixels or float"):
         with_width(2).transform(np.ones((3, 2)).astype(kind))
+    with pytest.raises(UsageError, match="given"):
+        SlowFeatures(with_width(2)).transform(np.zeros((5, 11)))
 
 
 def test_a_single_frame_is_not_read_as_many() -> None:

@@ -53,12 +53,6 @@ def test_pixels_count_one_255th(tmp_path):
     assert features.transform(images[:0]).shape == (0, 2)
 
 
-@pytest.mark.parametrize("frames", [np.zeros((5, 11)), np.zeros(12), np.full((2, 12), "x")])
-def test_other_frames_are_refused(frames):
-    with pytest.raises(UsageError, match="given"):
-        SlowFeatures(image_module()).transform(frames)
-
-
 def test_it_cannot_be_fitted():
     with pytest.raises(UsageError, match="cdmisfa learn"):
         SlowFeatures(image_module()).fit(np.zeros((3, 12)))

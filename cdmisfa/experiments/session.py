@@ -329,7 +329,7 @@ class Session:
         keyframe, self.keyframe = self.keyframe, None  # as large as what the learner holds
         if keyframe is not None:
             at, t, fork = keyframe.iteration, keyframe.t, self.manifest.get(FORK, {})
-            for signals in log.take_over(before, at):
+            for signals in log.copy_log(before, at):
                 digest.add(signals)
             if self._resumed:
                 then, now = keyframe.versions, self._versions

@@ -95,7 +95,6 @@ class LiveSource(ForwardSource):
         about: what identifies the cameras.
         rate: ticks a second; by default the first camera's rate, stated or measured.
         hold: seconds for which a picture stands for those that are missing.
-        patience: seconds for which a tick waits for pictures that are on their way.
         stop: asked while waiting; true ends the wait as if the cameras had ended.
 
     Attributes:
@@ -115,12 +114,11 @@ class LiveSource(ForwardSource):
         *,
         rate: float | None = None,
         hold: float = HOLD,
-        patience: float = PATIENCE,
         stop: Callable[[], bool] = lambda: False,
     ) -> None:
         self.stop = stop
         self._readers = readers
-        self._hold, self._patience = round(hold * NANOSECONDS), round(patience * NANOSECONDS)
+        self._hold = round(hold * NANOSECONDS)
         self._streams = [_Stream() for _ in names]
         self._tick, self._decided = 0, -1
         self._ahead: deque[list[Shown | None]] = deque()
@@ -194,7 +192,7 @@ class LiveSource(ForwardSource):
     def _next_tick(self) -> list[Shown | None]:
         """What every stream shows at the next tick, waited for."""
         tick = time_of(self._tick, self._spec.fps, self._spec.start_ns)
-        deadline = tick + self._patience
+        deadline = tick + round(PATIENCE * NANOSECONDS)
         while True:
             now = self._readers.now()  # before the look: what came until then is seen
             waiting = [self._take_in(number, tick) for number in range(len(self._streams))]

@@ -111,7 +111,7 @@ class RunWriter(Sink):
             },
         )
         self._last_keyframe = -1
-        self._unweighed: tuple[int, int, int] | None = None
+        self._without_weights: tuple[int, int, int] | None = None
         self._channels: dict[str, int] = {}
         matrix = MATRIX_SCHEMA, MATRIX_DEFINITION
         self._add_channel(SIGNALS_TOPIC, SIGNALS_SCHEMA, SIGNALS_DEFINITION)
@@ -131,39 +131,32 @@ class RunWriter(Sink):
     def block(self, block: Block, signals: BlockSignals, learner: Learner) -> None:
         """Write what one iteration gave; see `Sink`."""
         at, k, t = signals.log_time, signals.iteration, block.t
-        number = k & 0xFFFFFFFF
-        messages = [(self._channels[SIGNALS_TOPIC], at, encode_signals(signals), at, number)]
+        messages = [(SIGNALS_TOPIC, at, encode_signals(signals))]
         if block.truth.shape[1]:
-            truth = encode_matrix(t, block.truth)
-            messages.append((self._channels[TRUTH_TOPIC], at, truth, at, number))
-        watched = self._channels[WATCHED_TOPIC]
+            messages.append((TRUTH_TOPIC, at, encode_matrix(t, block.truth)))
         if self._images:
             encode, every = self._images[block.stream], self._watched_every
-            first = -t % every
-            times = map(self.spec.time_ns, range(t + first, t + len(block), every))
-            messages += [
-                (watched, shown, encode(shown, frame), shown, number)
-                for shown, frame in zip(times, block.frames[first::every], strict=True)
-            ]
+            for i in range(-t % every, len(block), every):
+                shown = self.spec.time_ns(t + i)
+                messages.append((WATCHED_TOPIC, shown, encode(shown, block.frames[i])))
         else:
             frames = block.frames.reshape(len(block), -1)
-            messages.append((watched, at, encode_matrix(t, frames), at, number))
-        other = self._by_progress and signals.action == 1
-        self._unweighed = at, k, t
-        if k % self._phi_every == 0 or signals.saved or other:
-            phi = encode_matrix(t, weights_after(signals, learner))
-            messages.append((self._channels[PHI_TOPIC], at, phi, at, number))
-            self._unweighed = None
-        self._log.write_all(messages)
+            messages.append((WATCHED_TOPIC, at, encode_matrix(t, frames)))
+        leaves = self._by_progress and signals.action == 1
+        self._without_weights = at, k, t
+        if k % self._phi_every == 0 or signals.saved or leaves:
+            messages.append((PHI_TOPIC, at, encode_matrix(t, weights_after(signals, learner))))
+            self._without_weights = None
+        self._write(k, *messages)
         if time.monotonic() >= self._next_flush:
             self.flush()
 
     def weights(self, learner: Learner) -> None:
         """Write the weights that the run ended with, where they were not after its last block."""
-        if self._unweighed is not None:
-            at, k, t = self._unweighed
-            self._write(PHI_TOPIC, at, k, encode_matrix(t, learner.phi))
-            self._unweighed = None
+        if self._without_weights is not None:
+            at, k, t = self._without_weights
+            self._write(k, (PHI_TOPIC, at, encode_matrix(t, learner.phi)))
+            self._without_weights = None
 
     def event(self, t: int, iteration: int, text: str, level: str = "INFO") -> None:
         """Write in words what happened at frame t; see `Sink`."""
@@ -172,7 +165,7 @@ class RunWriter(Sink):
         )
         at = self.spec.time_ns(t)
         entry.timestamp.FromNanoseconds(at)
-        self._write(EVENT_TOPIC, at, iteration, entry.SerializeToString())
+        self._write(iteration, (EVENT_TOPIC, at, entry.SerializeToString()))
 
     @property
     def size(self) -> int:
@@ -190,11 +183,11 @@ class RunWriter(Sink):
         if again or at != self._last_keyframe:
             self.flush()
             time_ns = self.spec.time_ns(keyframe.t)
-            self._write(KEYFRAME_TOPIC, time_ns, at, encode_keyframe(keyframe))
+            self._write(at, (KEYFRAME_TOPIC, time_ns, encode_keyframe(keyframe)))
             self._last_keyframe = at
             self.flush()
 
-    def take_over(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
+    def copy_log(self, log: Path, iterations: int) -> Iterator[BlockSignals]:
         """Copy the first iterations of another log of the same run, and yield their signals.
 
         Messages are copied as they are, so a run that is resumed keeps its past bit for bit.
@@ -238,8 +231,11 @@ class RunWriter(Sink):
         schema = self._log.add_schema(name, ENCODING, definition)
         self._channels[topic] = self._log.add_channel(topic, schema)
 
-    def _write(self, topic: str, at: int, iteration: int, data: bytes) -> None:
-        self._log.write(self._channels[topic], at, data, iteration & 0xFFFFFFFF)
+    def _write(self, iteration: int, *messages: tuple[str, int, bytes]) -> None:
+        """Write messages of an iteration: topic, log time and data of each."""
+        number, channels = iteration & 0xFFFFFFFF, self._channels
+        found = [(channels[topic], at, data, at, number) for topic, at, data in messages]
+        self._log.write_all(found)
 
 
 def _records(messages: Sequence[bytes], where: str) -> Iterator[BlockSignals]:
