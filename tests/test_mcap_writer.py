@@ -59,10 +59,7 @@ def test_the_bytes_are_those_of_the_mcap_package(seed, monkeypatch):
                 messages.append((rng.choice(channels), time, data, time + 1, number))
                 theirs.add_message(*messages[-1])
                 data = rng.randbytes(rng.randrange(300))
-            if len(messages) == 1:
-                ours.add_message(*messages[0])
-            else:
-                ours.add_messages(messages)
+            ours.add_messages(messages)
     theirs.finish()
     ours.finish()
     assert two.getvalue() == one.getvalue()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import struct
 import tracemalloc
 from pathlib import Path
@@ -43,18 +42,6 @@ def read(path: Path, **options: object) -> list[tuple[str, int, int, int, bytes]
         assert not reader.missing
         assert not reader.problems
         return found
-
-
-def test_the_variants_are_every_combination() -> None:
-    """Of what applies: without chunks no indexes, without a schema none that is repeated."""
-    found = set(files.variants())
-    assert len(found) == len(list(files.variants())) == 8 + 2 * 16 + 2 * (32 + 128) + (16 + 64)
-    for kind in ("one", "ten"):
-        for chosen in itertools.product([False, True], repeat=len(files.FEATURES)):
-            features = {f for f, on in zip(files.FEATURES, chosen, strict=True) if on}
-            if not features & {"ax", "mdx"} and ("ch" in features or not features & {"chx", "mx"}):
-                assert (kind, frozenset(features)) in found
-    assert len({files.variant(*v, "zstd") for v in found}) > 400
 
 
 @pytest.mark.parametrize("crc", [False, True])

@@ -75,11 +75,12 @@ def test_trial_is_the_learner_across_a_swap() -> None:
 
 
 def test_curves_change_nothing() -> None:
-    with_curves = run_trial(QUICK, seed=2, max_iterations=700, curves=True)
-    without = run_trial(QUICK, seed=2, max_iterations=700)
-    assert without.curves is None
-    assert [m.iteration for m in with_curves.modules] == [m.iteration for m in without.modules]
-    assert with_curves.epsilon == without.epsilon
+    one, other = (
+        run_trial(QUICK, seed=2, max_iterations=700, curves=kept) for kept in (True, False)
+    )
+    assert other.curves is None
+    assert [m.iteration for m in one.modules] == [m.iteration for m in other.modules]
+    assert one.epsilon == other.epsilon
 
 
 def test_trial_ends_for_the_reason_it_gives() -> None:

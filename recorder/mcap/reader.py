@@ -6,7 +6,7 @@ order), and never one whose checksum does not match. Memory holds a few chunks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -355,9 +355,9 @@ class LogReader:
 
     def _channel(self, number: int, segment: Segment) -> Channel | None:
         known = self._structure.definitions
-        looks: list[Callable[[], None]] = [lambda: None, self._define, self._search]
-        for look in looks:
-            look()
+        for search in (False, True):
+            if search:
+                self._search()
             channel = known.channels.get(number)
             if channel and (not channel.schema_id or channel.schema_id in known.schemas):
                 return channel

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import re
-import struct
 from bisect import bisect_left
 from typing import Final
 
 from mcap.opcode import Opcode
 
-from recorder.mcap.records import MAX_CHUNK, RECORD_HEADER, MalformedRecord, Segment
+from recorder.mcap.records import CHUNK_HEADER, MAX_CHUNK, RECORD_HEADER, MalformedRecord, Segment
 from recorder.mcap.store import Store
 
-_FIXED: Final = struct.Struct("<BQQQQI")
-"""A chunk's opcode, length, log times, size and CRC."""
 _CHUNK: Final = re.compile(
     rb"(?=\x06[\s\S]{4}\0{4}[\s\S]{20}\0{4}[\s\S]{4}(\0{4}|\x03\0{3}lz4|\x04\0{3}zstd)[\s\S]{4}\0{4})"
     # Opcode, length, times and the low half of the size, its high half, CRC, compression, bytes.
@@ -65,8 +62,8 @@ def next_chunk(file: Store, at: int, stop: int) -> int | None:
         block = file.read(at, min(_BLOCK + _OVERLAP, stop - at))
         for found in _CHUNK.finditer(block):
             place = found.start()
-            _, length, start, end, size, _ = _FIXED.unpack_from(block, place)
-            name = place + _FIXED.size
+            _, length, start, end, size, _ = CHUNK_HEADER.unpack_from(block, place)
+            name = place + CHUNK_HEADER.size
             after = name + len(found[1])
             stored = int.from_bytes(block[after : after + 8], "little")
             agrees = place + RECORD_HEADER.size + length == after + 8 + stored

@@ -124,14 +124,8 @@ class McapWriter:
         self._define(channel)
         return channel.id
 
-    def add_message(
-        self, channel: int, log_time: int, data: bytes, publish_time: int, sequence: int
-    ) -> None:
-        """Add a message to the chunk; times in nanoseconds."""
-        self.add_messages(((channel, log_time, data, publish_time, sequence),))
-
     def add_messages(self, messages: Iterable[tuple[int, int, bytes, int, int]]) -> None:
-        """Add messages, each as `add_message` takes it."""
+        """Add messages to the chunk: channel, log time, data, publish time and sequence of each."""
         for channel, log_time, data, publish_time, sequence in messages:
             length, at = len(data), self._size
             start = at + _MESSAGE_SIZE

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,17 +76,6 @@ class Played:
     stopped: bool = False
 
 
-class Timed(Protocol):
-    """Something with a log time."""
-
-    @property
-    def time_ns(self) -> int:
-        """The log time, in nanoseconds."""
-
-
-Item = TypeVar("Item", bound=Timed)
-
-
 @dataclass(frozen=True, slots=True)
 class Topic:
     """What messages are on, and how they are decoded."""
@@ -112,6 +101,9 @@ class Frame(NamedTuple):
     time_ns: int
     shown: tuple[NDArray[Any] | None, ...]
     truth: NDArray[np.float64] | None
+
+
+Item = TypeVar("Item", DueMessage, Frame)
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,9 +69,8 @@ def screenshot(
             tab, or no such size.
         CdmisfaError: no driver, or the viewer failed.
     """
-    _refuse(out, window, force=force)
     frame = None if at is None else frame_at(path, str(at))
-    _refuse_without_driver(out)
+    _refuse(out, window, force=force)
     with view_of(path, every, all_views, tab) as view, headless_viewer(window) as viewer:
         viewer.ask(lambda client: client.open(str(view)))
         viewer.ask(lambda client: _painted(client.get_state()))
@@ -98,7 +97,6 @@ def draw_table(folder: Path, out: Path, *, force: bool = False, window: str = WI
         CdmisfaError: no driver, or the viewer or the server failed.
     """
     _refuse(out, window, force=force)
-    _refuse_without_driver(out)
     with served_table(folder) as table, headless_viewer(window) as viewer:
         if table is None:
             raise CdmisfaError(f"{out} cannot be drawn: the server of runs has ended")
@@ -111,9 +109,6 @@ def _refuse(out: Path, window: str, *, force: bool) -> None:
     refuse_unless_png(out)
     refuse_taken(out, force=force)
     check_window(window)
-
-
-def _refuse_without_driver(out: Path) -> None:
     if missing_driver():
         raise CdmisfaError(f"{out} cannot be drawn, {missing_driver()}")
 
