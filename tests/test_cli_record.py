@@ -29,7 +29,9 @@ PNG = b"\x89PNG"
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
-def test_a_signal_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> None:
+def test_a_signal_says_how_to_go_on(
+    cdmisfa: Cdmisfa, tmp_path: Path, number: int, code: int
+) -> None:
     folder = tmp_path / "rec"
     words = ["record", "oscillatory", "-o", str(folder), "--frames", "100000000"]
     recorder = subprocess.Popen(
@@ -46,6 +48,7 @@ def test_a_signal_says_how_to_go_on(tmp_path: Path, number: int, code: int) -> N
     line = f"cdmisfa: interrupted: {folder} is not finished: go on with --resume\n"
     assert error.lstrip("\n") == line  # behind the terminal's ^C
     assert not list(folder.glob("*.mcap"))
+    assert cdmisfa("info", folder, "--json").json["complete"] is False
 
 
 @pytest.mark.parametrize("jobs", [1, 2])

@@ -11,8 +11,6 @@ from pathlib import Path
 import pytest
 from conftest import Cdmisfa
 from lying_server import Exchange, lying
-from server_cases import CAMERAS, CASES, Case, Given, check, prepare
-from server_lies import LIES
 
 from cdmisfa.core.errors import CdmisfaError
 from recorder.mcap.reader import LogReader
@@ -20,6 +18,8 @@ from replay.storage import servers
 from replay.storage.location import Limits, Url, limited, limits
 from replay.storage.remote import RemoteStore
 from replay.storage.servers import UnreachableError, backoff, retry_seconds
+from tools.torture.server_cases import CAMERAS, CASES, Case, Given, check, prepare
+from tools.torture.server_lies import LIES
 
 pytest.importorskip("aiohttp")
 

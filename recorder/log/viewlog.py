@@ -84,19 +84,13 @@ class ViewLog:
         self._length = split.frames(spec.fps) if split else None
         self._stream = spec.streams.index(view)
         self._topic = view_topic(view)
-        self._pose, self._pose_every = pose, max(round(spec.fps), 1)
-        self._encoders: dict[str, Any] = {self._topic: VectorEncoder()}
-        if spec.images:
-            height, width = spec.frame_shape
-            self._encoders[self._topic] = ImageEncoder(height, width, frame_id=view)
-        if spec.truth:
-            self._encoders[TRUTH_TOPIC] = TruthEncoder(spec.truth)
+        self._encoders = _encoders(view, recording, pose)
+        self._moving = [t for t in (OBJECTS_TOPIC, TRUTH_TOPIC) if t in self._encoders]
+        still = [t for t in self._encoders if t not in (self._topic, *self._moving)]
+        self._still: dict[str, tuple[Any, ...]] = dict.fromkeys(still, ())
         if pose is not None:
-            self._encoders[POSE_TOPIC] = PoseEncoder(ROOT_FRAME)
-        world = _world_encoders(view, recording, pose)
-        self._encoders |= world
-        self._standing = tuple(topic for topic in world if topic != OBJECTS_TOPIC)
-        self._moving = OBJECTS_TOPIC in world
+            self._still[POSE_TOPIC] = pose.position, pose.quaternion
+        self._second = max(round(spec.fps), 1)
         self._channels: dict[str, int] = {}
         self._first, self._frames = first, 0
         self._file = self._begin_part()
@@ -201,15 +195,11 @@ class ViewLog:
         aside_path(full.path).unlink(missing_ok=True)
 
     def _write_frame(self, frame: Any, truth: Any) -> None:
-        pose = self._pose
-        if pose is not None and (self.t % self._pose_every == 0 or self.t == self._first):
-            self._write(POSE_TOPIC, pose.position, pose.quaternion)
-            for topic in self._standing:
-                self._write(topic)
-        if self._moving:
-            self._write(OBJECTS_TOPIC, truth)
-        if self._spec.truth:
-            self._write(TRUTH_TOPIC, truth)
+        if self.t % self._second == 0 or self.t == self._first:
+            for topic, values in self._still.items():
+                self._write(topic, *values)
+        for topic in self._moving:
+            self._write(topic, truth)
         self._write(self._topic, frame)
 
     def _write(self, topic: str, *values: Any) -> None:
@@ -217,20 +207,26 @@ class ViewLog:
         self._file.write(self._channels[topic], time, self._encoders[topic](time, *values), self.t)
 
 
-def _world_encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Any]:
-    """Encoders of the scene's world by topic; none for scenes that `scenery_of` does not know."""
+def _encoders(view: str, recording: RecordingSpec, pose: HeadPose | None) -> dict[str, Any]:
+    """Encoders by topic of a view's frames and truth, and of its scene's world where it has one."""
+    spec = recording.spec
+    found: dict[str, Any] = {view_topic(view): VectorEncoder()}
+    if spec.images:
+        height, width = spec.frame_shape
+        found[view_topic(view)] = ImageEncoder(height, width, frame_id=view)
+    if spec.truth:
+        found[TRUTH_TOPIC] = TruthEncoder(spec.truth)
+    if pose is None:
+        return found
+    found[POSE_TOPIC] = PoseEncoder(ROOT_FRAME)
     config = recording.config.get("scene")
-    if pose is None or not isinstance(config, Mapping):
-        return {}
-    scenery = scenery_of(config, pose.position)
-    gaze = scenery.gaze(view) if scenery is not None else None
+    scenery = scenery_of(config, pose.position) if isinstance(config, Mapping) else None
+    gaze = None if scenery is None else scenery.gaze(view)
     if scenery is None or gaze is None:
-        return {}
-    found: dict[str, Any] = {
-        calibration_topic(view, side): CalibrationEncoder(eye, f"{view}/{side}")
-        for side, eye in zip(SIDES, gaze.eyes, strict=True)
-    }
+        return found
+    for side, eye in zip(SIDES, gaze.eyes, strict=True):
+        found[calibration_topic(view, side)] = CalibrationEncoder(eye, f"{view}/{side}")
     found[TRANSFORMS_TOPIC] = TransformsEncoder(gaze, ROOT_FRAME)
-    if all(set(thing.truth) <= set(recording.spec.truth) for thing in scenery.objects):
-        found[OBJECTS_TOPIC] = ObjectsEncoder(scenery, recording.spec.truth, ROOT_FRAME)
+    if all(set(thing.truth) <= set(spec.truth) for thing in scenery.objects):
+        found[OBJECTS_TOPIC] = ObjectsEncoder(scenery, spec.truth, ROOT_FRAME)
     return found

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from server_cases import CASES, Given, WrongError, check
-from server_cases import prepare as made
-
 from replay.storage import servers
 
 from .outcomes import CLEAR_ERROR, RIGHT, Defect, Job, Limits, Outcome
+from .server_cases import CASES, Given, WrongError, check
+from .server_cases import prepare as made
 
 LIMITS = Limits(seconds=60, megabytes=512)
 

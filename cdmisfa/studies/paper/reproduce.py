@@ -222,16 +222,6 @@ def _numbers(line: Mapping[str, Any], *names: str) -> list[str]:
     return ["-" if v is None else f"{v:.{line['digits']}f}" for v in values]
 
 
-INTRODUCTION = """\
-# The paper, reproduced
-
-Made by `cdmisfa reproduce --page`; do not edit. Numbers are means over trials; SD is the
-standard deviation, n the number of trials. The paper's values are those that its tables
-print; (text) marks what its text says, (equation) what follows from its equations,
-(figure) what was read from a figure. Where the paper leaves something open, the readings
-are in [decisions](decisions/)."""
-
-
 def write_paper_page(root: Path, path: Path) -> None:
     """Write a Markdown page of every experiment below a folder.
 
@@ -243,7 +233,7 @@ def write_paper_page(root: Path, path: Path) -> None:
     if not documents:
         raise UsageError(f"{root} has no results: run cdmisfa reproduce all -o {root} first")
     page = Page(path)
-    page.add(INTRODUCTION)
+    page.add(Path(__file__).with_name("introduction.md").read_text("utf-8").rstrip())
     for document in documents:
         name = document["experiment"]
         command = f"cdmisfa reproduce {name}{' --quick' if document['quick'] else ''}"

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from camera_files import write_cameras
 from lying_server import lying
-from server_lies import LIES
 
 from cdmisfa.cli import run
 from replay.recordings.source import RecordedSource
+
+from .server_lies import LIES
 
 TIMES = ("--timeout", "1.5", "--read-timeout", "0.5")
 LIMIT = 6.5
