@@ -131,7 +131,7 @@ def main(*, quick: bool = False, full: bool = False) -> None:
         "reader",
         "Reading a recording",
         "Blocks of 40 frames (48 x 128) with ground truth, zstd, every CRC checked, CPU of all "
-        "threads. Decompression is mcap's chunk reader and zstd alone, without a checksum; in memory, "
-        "zstd alone.",
+        "threads. Decompression is mcap's chunk reader and zstd alone, without a checksum; in "
+        "memory, zstd alone.",
         [(header, rows)],
     )
